@@ -1,0 +1,65 @@
+# `make demo` first, `make test` second; `make help` lists the rest.
+# A machine with Python 3.11 or newer is enough; everything else goes into .venv and .venv-wheel.
+
+PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+SAMPLE := tools/csplat_tools/data/sample.ply
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format spec sample bench fuzz clean
+
+help: ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
+
+demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
+	@mkdir -p out
+	$(BIN)/csplat encode $(SAMPLE) out/sample.csplat --force
+	$(BIN)/csplat verify out/sample.csplat
+	$(BIN)/csplat decode out/sample.csplat out/sample.ply --force
+	$(BIN)/csplat info out/sample.csplat
+	@ls -l $(SAMPLE) out/sample.csplat out/sample.ply
+
+test: $(VENV)/.dev ## everything that must hold: lint, types, contracts, vectors, fuzzing, tests
+	tests/run.sh
+
+lint: $(VENV)/.dev ## style, types and import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(VENV)/.dev ## bring the code into its one layout
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+spec: $(VENV)/.dev ## write constants and tables from the registry
+	$(BIN)/python spec/generate.py
+
+sample: $(VENV)/.core ## make the sample scene again
+	$(BIN)/python tools/sample/make_sample.py
+
+bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
+	$(BIN)/python tools/benchmarks/codec.py
+
+fuzz: $(VENV)/.dev ## ten minutes of malformed files
+	$(BIN)/python tests/fuzz.py --seconds 600
+
+clean: ## remove what the commands above made
+	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+		.import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "csplat needs Python 3.11 or newer" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.core: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $(VENV)/.core $@

@@ -1,0 +1,151 @@
+"""What a block of a tile holds once its streams are read: integers, not yet values.
+
+Two kinds of block, one interface: `rows(start, stop, dtype)` gives the lattice integers or
+levels of a run of splats, `bound` the largest magnitude that can occur on the way to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder.streams import Ints
+
+if TYPE_CHECKING:
+    from csplat.decoder.codebooks import Codebook
+
+__all__ = ["Block", "Coded", "Columns", "Indices", "runs", "work_dtype"]
+
+_RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
+_RUN_SPLATS = 1 << 14
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A block whose integers stand in the stream: offset plus element.
+
+    Attributes:
+        elements: [C, n], as narrow as they came.
+        offsets: C summands, one per column.
+        exponent: the block's lattice is coarser by 2^exponent.
+        at: where the stream begins in the file.
+        lows: smallest integer of each column, offset included.
+        highs: largest integer of each column.
+        bound: largest magnitude of an offset, an element or a sum.
+    """
+
+    elements: Ints
+    offsets: tuple[int, ...]
+    exponent: int
+    at: int
+    lows: tuple[int, ...] = field(init=False)
+    highs: tuple[int, ...] = field(init=False)
+    bound: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        low = [int(value) for value in self.elements.min(axis=1)]
+        high = [int(value) for value in self.elements.max(axis=1)]
+        lows = tuple(a + b for a, b in zip(low, self.offsets, strict=True))
+        highs = tuple(a + b for a, b in zip(high, self.offsets, strict=True))
+        object.__setattr__(self, "lows", lows)
+        object.__setattr__(self, "highs", highs)
+        object.__setattr__(self, "bound", max(map(abs, (*low, *high, *lows, *highs, *self.offsets))))
+
+    def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
+        """Return the integers of splats `start` to `stop`, [C, stop − start], a new array.
+
+        Args:
+            start: first splat.
+            stop: the splat after the last.
+            dtype: signed, wide enough for `bound`.
+        """
+        out = self.elements[:, start:stop].astype(dtype)
+        if any(self.offsets):
+            out += np.array(self.offsets, dtype)[:, None]
+        return out
+
+
+@dataclass(frozen=True)
+class Indices:
+    """The indices of a tile's first block of a codebook, which its other blocks use too.
+
+    Attributes:
+        book: the codebook.
+        attribute: of the first block.
+        stages: [n] for each stage.
+        escaped: places of the splats that no entry serves, ascending.
+    """
+
+    book: Codebook
+    attribute: int
+    stages: tuple[Ints, ...]
+    escaped: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A block coded CODEBOOK: the integers are sums of entries (spec 6.4.5).
+
+    Attributes:
+        indices: which entries.
+        entries: for each stage [size, C], the columns of this block's attribute.
+        escapes: the integers of the escaped splats.
+        summand: of the kind SHAPE, scales: one column, added to all three.
+        at: where the block begins in the file.
+        exponent: 0; blocks coded CODEBOOK are on the file's lattice.
+        bound: largest magnitude of an integer, or of a part of a sum.
+    """
+
+    indices: Indices
+    entries: tuple[Ints, ...]
+    escapes: Columns | None
+    summand: Columns | None
+    at: int
+    exponent: int = 0
+    bound: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        total = sum(max(abs(int(stage.min())), abs(int(stage.max()))) for stage in self.entries)
+        total += self.summand.bound if self.summand else 0
+        object.__setattr__(self, "bound", max(total, self.escapes.bound if self.escapes else 0))
+
+    def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
+        """Return the integers of splats `start` to `stop`, as `Columns.rows` does."""
+        total: Ints | None = None
+        for entries, index in zip(self.entries, self.indices.stages, strict=True):
+            # An escaped splat's index is the size of stage 0: `clip` gives it the last entry for now.
+            part = np.take(entries, index[start:stop], axis=0, mode="clip")
+            if total is None:
+                total = part.astype(dtype)
+            else:
+                total += part
+        assert total is not None
+        out = np.ascontiguousarray(total.T)
+        if self.summand:
+            out += self.summand.rows(start, stop, dtype)
+        if self.escapes:
+            first, last = np.searchsorted(self.indices.escaped, (start, stop))
+            places = self.indices.escaped[first:last] - start
+            out[:, places] = self.escapes.rows(int(first), int(last), dtype)
+        return out
+
+
+Block = Columns | Coded
+
+
+def work_dtype(bound: int) -> np.dtype[np.signedinteger]:
+    """Return the narrowest signed type, of two bytes at least, that holds ±bound."""
+    if bound < 1 << 15:
+        return np.dtype(np.int16)
+    return np.dtype(np.int32) if bound < 1 << 31 else np.dtype(np.int64)
+
+
+def runs(count: int, columns: int) -> Iterator[tuple[int, int]]:
+    """Cut `count` splats into runs whose integers fit the cache."""
+    step = min(_RUN_SPLATS, max(1, _RUN_ELEMENTS // columns))
+    for start in range(0, count, step):
+        yield start, min(count, start + step)

@@ -1,0 +1,169 @@
+"""Codebooks: tables of integer vectors that tiles refer to (spec 5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder.blocks import Columns
+from csplat.decoder.container import open_chunk
+from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.reconstruct import write_colour
+from csplat.decoder.streams import Ints, read_stream
+from csplat.errors import FormatError
+
+__all__ = [
+    "Codebook",
+    "attribute_columns",
+    "check_unnamed_codebooks",
+    "layer_columns",
+    "read_codebooks",
+    "table_bytes",
+]
+
+_ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
+_ATTRIBUTE_OF = {name: attribute for attribute, name in _spec.ATTRIBUTE_NAMES.items()}
+
+
+@dataclass
+class Codebook:
+    """One codebook, as far as it was asked for.
+
+    Attributes:
+        record: its record in the index.
+        entries: for each layer (0, or an SH band) the entries of each stage, [size, C] integers.
+        values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
+            on, for SH codebooks of one stage.
+        values_finite: whether all of `values` are.
+    """
+
+    record: _spec.CodebookRecord
+    entries: dict[int, tuple[Ints, ...]] = field(default_factory=dict)
+    values: NDArray[np.float32] | None = None
+    values_finite: bool = True
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Entries of each stage."""
+        return self.record.sizes[: self.record.stage_count]
+
+
+def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:
+    """Return C of a CODB chunk: columns of the band, or of the kind's attributes together."""
+    if record.kind == _spec.CODEBOOK_KIND_SH:
+        return _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH0 + layer]
+    names = _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind]
+    return sum(_spec.ATTRIBUTE_COLUMNS[_ATTRIBUTE_OF[name]] for name in names)
+
+
+def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | None:
+    """Return the columns of an attribute in its layer's entries, `None` where CBK-1 refuses it."""
+    if record.kind == _spec.CODEBOOK_KIND_SH:
+        band = attribute - _spec.ATTRIBUTE_SH0
+        legal = 1 <= band <= _spec.SH_DEGREE_MAX and record.band_first <= band <= record.band_last
+        return slice(0, _spec.ATTRIBUTE_COLUMNS[attribute]) if legal else None
+    first = 0
+    for name in _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind]:
+        columns = _spec.ATTRIBUTE_COLUMNS[_ATTRIBUTE_OF[name]]
+        if _ATTRIBUTE_OF[name] == attribute:
+            return slice(first, first + columns)
+        first += columns
+    return None
+
+
+def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whole: bool) -> int:
+    """Return a bound of the memory that codebooks take, from the index alone.
+
+    Args:
+        header: the scene.
+        tiles: what is to be decoded.
+        degree: highest SH band wanted.
+        whole: count the codebooks that no tile names, too: a whole decode reads and checks them.
+    """
+    books = {book.codebook_id: book for book in header.codebooks}
+    elements = 0
+    for record in _codebook_chunks(header) if whole else _wanted(header, tiles, degree):
+        book = books[record.id]
+        elements += sum(book.sizes) * layer_columns(book, record.layer)
+    return elements * (_ENTRY_WIDTH_MAX + 4)  # an integer, and a float32 in `values`
+
+
+def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile], degree: int) -> dict[int, Codebook]:
+    """Read the codebooks that some tiles name, their bands up to `degree`."""
+    records = {book.codebook_id: book for book in header.codebooks}
+    books: dict[int, Codebook] = {}
+    for record in _wanted(header, tiles, degree):
+        book = books.setdefault(record.id, Codebook(records[record.id]))
+        book.entries[record.layer] = _read_chunk(view, header.profile, record, book.record)
+    for book in books.values():
+        if book.record.kind == _spec.CODEBOOK_KIND_SH and book.record.stage_count == 1:
+            _fill_values(book, header)
+    return books
+
+
+def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
+    """Read the codebooks that no tile names, one after the other, and forget them."""
+    records = {book.codebook_id: book for book in header.codebooks}
+    named = {table for tile in header.tiles for table in tile.tables}
+    for record in _codebook_chunks(header):
+        if record.id not in named:
+            _read_chunk(view, header.profile, record, records[record.id])
+
+
+def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
+    return [record for record in header.directory if record.type == _spec.CHUNK_CODEBOOK]
+
+
+def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_spec.DirectoryRecord]:
+    ids = {table for tile in tiles for table in tile.tables}
+    chunks = [record for record in _codebook_chunks(header) if record.id in ids and record.layer <= degree]
+    return sorted(chunks, key=lambda record: (record.id, record.layer))
+
+
+def _read_chunk(
+    view: memoryview, profile: str, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
+) -> tuple[Ints, ...]:
+    cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "CDB-2")
+    at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
+    head = _spec.unpack_codebook_head(view, at)
+    for name, found, wanted in (
+        ("codebook_id", head.codebook_id, book.codebook_id),
+        ("layer", head.layer, record.layer),
+        ("stage_count", head.stage_count, book.stage_count),
+    ):
+        if found != wanted:
+            raise FormatError(
+                _spec.ERROR_INDEX,
+                at + _spec.CODEBOOK_HEAD_OFFSETS[name],
+                "CDB-1",
+                name,
+                found=found,
+                wanted=wanted,
+            )
+    columns = layer_columns(book, record.layer)
+    stages = []
+    for size in book.sizes[: book.stage_count]:
+        elements = read_stream(cursor, profile, size * columns, _ENTRY_WIDTH_MAX, signed=True)
+        # Rows of one entry: a gather then copies whole rows.
+        stages.append(np.ascontiguousarray(elements.reshape(columns, size).T))
+    cursor.finish()
+    return tuple(stages)
+
+
+def _fill_values(book: Codebook, header: SceneHeader) -> None:
+    """Compute the coefficients of each entry once, so that splats copy them."""
+    (size,) = book.sizes
+    count = sum(2 * band + 1 for band in book.entries)
+    book.values = np.empty((size, count, 3), np.float32)
+    row = 0
+    for band in sorted(book.entries):
+        columns = Columns(book.entries[band][0].T, (0,) * (3 * (2 * band + 1)), 0, 0)
+        record = header.attribute(_spec.ATTRIBUTE_SH0 + band)
+        # An entry that overflows is at fault only if a splat uses it (CBK-6): no check here.
+        write_colour(columns, record, book.values[:, row : row + 2 * band + 1], check=False)
+        row += 2 * band + 1
+    book.values_finite = bool(np.isfinite(book.values).all())

@@ -1,0 +1,172 @@
+"""The coding CODEBOOK (spec 6.4.5), and what the blocks of a tile share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from csplat import _spec
+from csplat.decoder.blocks import Coded, Columns, Indices, runs
+from csplat.decoder.codebooks import Codebook, attribute_columns
+from csplat.decoder.container import Cursor, check_reserved
+from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.lattice import (
+    check_lattice_range,
+    check_level,
+    read_block_head,
+    read_columns,
+    read_exponent,
+    read_offsets,
+)
+from csplat.decoder.streams import read_stream
+from csplat.errors import FormatError
+
+__all__ = ["TileContext", "read_coded"]
+
+_ESCAPE_CODINGS = {
+    _spec.ATTRIBUTE_OPACITIES: (_spec.CODING_LEVELS,),
+    _spec.ATTRIBUTE_QUATS: (_spec.CODING_SIGNED,),
+}
+_WIDE = np.dtype(np.int64)
+
+
+@dataclass
+class TileContext:
+    """What the blocks of one tile may refer to.
+
+    Attributes:
+        header: the scene.
+        tile: the tile.
+        books: the codebooks that were read.
+        first: indices of the tile's first block of each codebook, by codebook id.
+    """
+
+    header: SceneHeader
+    tile: Tile
+    books: Mapping[int, Codebook]
+    first: dict[int, Indices] = field(default_factory=dict)
+
+
+def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) -> Coded:
+    """Read what follows the block head at `at`: indices, summand, escape block; CBK-1 to CBK-6."""
+    params_at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
+    params = _spec.unpack_codebook_params(cursor.view, params_at)
+    check_reserved(params, params_at, _spec.CODEBOOK_PARAMS_OFFSETS)
+    book = context.books.get(params.codebook_id)
+    columns = attribute_columns(book.record, attribute) if book else None
+    if book is None or columns is None or params.codebook_id not in context.tile.tables:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            params_at,
+            "CBK-1",
+            f"codebook {params.codebook_id} is not of the tile or not for {_spec.ATTRIBUTE_NAMES[attribute]}",
+        )
+    indices = _indices(cursor, context, attribute, book, params, params_at)
+    summand = None
+    if book.record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
+        summand = _read_summand(cursor, context, attribute)
+    escapes = None
+    if params.escape_count:
+        legal = _ESCAPE_CODINGS.get(attribute, (_spec.CODING_OFFSET, _spec.CODING_SIGNED))
+        coding = read_block_head(cursor, attribute, legal)
+        escapes = read_columns(cursor, context.header, attribute, coding, params.escape_count, escape=True)
+    layer = _spec.ATTRIBUTE_LAYER[attribute]
+    entries = tuple(stage[:, columns] for stage in book.entries[layer])
+    block = Coded(indices, entries, escapes, summand, at)
+    _check_sums(block, context, attribute)
+    return block
+
+
+def _indices(
+    cursor: Cursor,
+    context: TileContext,
+    attribute: int,
+    book: Codebook,
+    params: _spec.CodebookParams,
+    at: int,
+) -> Indices:
+    """Read the indices, or find those of the tile's first block of the codebook (CBK-4)."""
+    name = _spec.ATTRIBUTE_NAMES[attribute]
+    if book.record.kind == _spec.CODEBOOK_KIND_SH:
+        first = attribute == _spec.ATTRIBUTE_SH0 + book.record.band_first
+    else:
+        first = name == _spec.CODEBOOK_KIND_ATTRIBUTES[book.record.kind][0]
+    if first:
+        indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
+        context.first[params.codebook_id] = indices
+        return indices
+    known = context.first.get(params.codebook_id)
+    if known is None or len(known.escaped) != params.escape_count:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            at,
+            "CBK-4",
+            f"{name} follows no block of the codebook's first attribute with as many escapes",
+            found=params.escape_count,
+            wanted=None if known is None else len(known.escaped),
+        )
+    return known
+
+
+def _read_indices(
+    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, at: int
+) -> Indices:
+    count = context.tile.splat_count
+    stages = []
+    for stage, size in enumerate(book.sizes):
+        stream_at = cursor.at
+        index = read_stream(cursor, context.header.profile, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
+        largest = int(index.max())
+        if largest >= size + (stage == 0):
+            raise FormatError(
+                _spec.ERROR_CODEBOOK,
+                stream_at,
+                "CBK-2",
+                f"index of stage {stage}",
+                found=largest,
+                wanted=f"{'at most' if stage == 0 else 'below'} {size}",
+            )
+        stages.append(index)
+    escaped = np.flatnonzero(stages[0] == book.sizes[0])
+    if len(escaped) != escape_count:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            at + _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"],
+            "CBK-3",
+            "escape_count",
+            found=escape_count,
+            wanted=len(escaped),
+        )
+    return Indices(book, attribute, tuple(stages), escaped)
+
+
+def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Columns:
+    """The common summand of the kind SHAPE, on the file's lattice of scales as its entries are."""
+    read_exponent(cursor, context.header.attribute(attribute), fixed=True)
+    offsets = read_offsets(cursor, 1)
+    at = cursor.at
+    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
+    elements = read_stream(cursor, context.header.profile, count, width_max)
+    return Columns(elements.reshape(1, count), offsets, 0, at)
+
+
+def _check_sums(block: Coded, context: TileContext, attribute: int) -> None:
+    """CBK-6: the sums obey what LEV-1, QUA-1 and LAT-4 ask of integers that stand in a stream."""
+    record = context.header.attribute(attribute)
+    levels = record.levels
+    if levels == 0 and block.bound << record.chroma_shift <= _spec.COLUMN_MAX:
+        return
+    for start, stop in runs(context.tile.splat_count, 3):
+        rows = block.rows(start, stop, _WIDE)
+        lows = tuple(int(value) for value in rows.min(axis=1))
+        highs = tuple(int(value) for value in rows.max(axis=1))
+        if levels == 0:
+            check_lattice_range(lows, highs, record, block.at)
+        elif attribute == _spec.ATTRIBUTE_OPACITIES:
+            check_level(highs[0], levels, block.at, "LEV-1")
+            if lows[0] < 0:
+                raise FormatError(_spec.ERROR_RANGE, block.at, "LEV-1", "level", found=lows[0], wanted="0 or more")
+        else:
+            check_level(max(*(-low for low in lows), *highs), levels, block.at, "QUA-1")

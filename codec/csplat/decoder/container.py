@@ -1,0 +1,217 @@
+"""The outermost layer: the file's header, its chunks' frames, its digest (spec 4.2, 5.1).
+
+Everything below reads from one `memoryview` of the whole file, so that every offset in an error
+is an offset in the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from csplat import _spec
+from csplat.errors import FormatError, InputError, UnsupportedError
+
+if TYPE_CHECKING:
+    from mmap import mmap
+
+    #: What a file may be handed in as (collections.abc.Buffer needs Python 3.12).
+    Buffer = bytes | bytearray | memoryview | mmap
+
+__all__ = [
+    "Cursor",
+    "check_digest",
+    "check_index_crc",
+    "check_length",
+    "check_reserved",
+    "open_chunk",
+    "read_file_header",
+    "view_of",
+]
+
+_CRC_SIZE = 4
+_FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + _CRC_SIZE
+
+
+class Cursor:
+    """A place in the file that moves forward and never past the end of its payload.
+
+    Args:
+        view: the whole file.
+        at: offset of the next byte.
+        end: offset behind the payload; the caller has checked that the file is that long.
+        clause: the clause that wants the payload to end with its last structure.
+    """
+
+    def __init__(self, view: memoryview, at: int, end: int, clause: str) -> None:
+        self.view = view
+        self.at = at
+        self.end = end
+        self.clause = clause
+
+    def take(self, size: int) -> int:
+        """Step over `size` bytes and return where they begin; E_STREAM where fewer are left."""
+        at = self.at
+        if size > self.end - at:
+            raise FormatError(
+                _spec.ERROR_STREAM,
+                at,
+                self.clause,
+                "the payload ends within a structure",
+                found=f"{self.end - at} bytes",
+                wanted=f"{size} bytes",
+            )
+        self.at = at + size
+        return at
+
+    def finish(self) -> None:
+        """Refuse bytes behind the last structure."""
+        if self.at != self.end:
+            raise FormatError(
+                _spec.ERROR_STREAM,
+                self.at,
+                self.clause,
+                "bytes follow the last structure of the payload",
+                found=f"{self.end - self.at} bytes",
+            )
+
+
+def view_of(data: Buffer) -> memoryview:
+    """Return the bytes of a buffer (bytes, bytearray, memoryview, mmap) without copying them.
+
+    Raises:
+        InputError: not a buffer, or not a contiguous one.
+    """
+    try:
+        return memoryview(data).cast("B")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"data is a {type(data).__name__}, wanted contiguous bytes: {error}") from None
+
+
+def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:
+    """RES-1: "A reserved field or bit MUST be 0".
+
+    Args:
+        record: a structure of `_spec`.
+        at: where it begins in the file.
+        offsets: its `..._OFFSETS`.
+    """
+    for name, place in offsets.items():
+        if name.startswith("reserved_") and getattr(record, name) != 0:
+            raise FormatError(_spec.ERROR_RESERVED, at + place, "RES-1", name, found=getattr(record, name), wanted=0)
+
+
+def read_file_header(view: memoryview) -> _spec.Header:
+    """Read and check the 64 bytes of the header (HDR-1 to HDR-4, HDR-7, HDR-11), not the digest."""
+    magic = bytes(view[: len(_spec.MAGIC)])
+    if len(view) < _spec.HEADER_SIZE:
+        if _spec.MAGIC.startswith(magic):
+            raise FormatError(
+                _spec.ERROR_TRUNCATED,
+                len(view),
+                "HDR-11",
+                "the data ends within the header",
+                found=f"{len(view)} bytes",
+                wanted=f"{_spec.HEADER_SIZE} bytes",
+            )
+        raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-11", found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
+    header = _spec.unpack_header(view)
+    places = _spec.HEADER_OFFSETS
+    if header.magic != _spec.MAGIC:
+        raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
+    version = (header.version_major, header.version_minor)
+    if version != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
+        raise UnsupportedError(
+            f"version {version[0]}.{version[1]} (this decoder reads {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR})",
+            _spec.ERROR_VERSION,
+            places["version_major"],
+            "HDR-2",
+        )
+    _check_crc(view, 0, places["header_crc"], header.header_crc, "HDR-3")
+    if header.profile not in _spec.PROFILE_NAMES:
+        raise UnsupportedError(f"profile {header.profile}", offset=places["profile"], clause="HDR-4")
+    check_reserved(header, 0, places)
+    room = header.file_size - _spec.HEADER_SIZE
+    if not _spec.INDEX_HEAD_SIZE + _CRC_SIZE <= header.index_size <= room:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            places["index_size"],
+            "HDR-7",
+            "index_size",
+            found=header.index_size,
+            wanted=f"{_spec.INDEX_HEAD_SIZE + _CRC_SIZE} to {room}",
+        )
+    return header
+
+
+def check_length(view: memoryview, file_size: int) -> None:
+    """The data is the file, whole and nothing else (HDR-5, HDR-6)."""
+    if len(view) < file_size:
+        raise FormatError(
+            _spec.ERROR_TRUNCATED,
+            len(view),
+            "HDR-5",
+            "the data ends early",
+            found=f"{len(view)} bytes",
+            wanted=f"{file_size} bytes",
+        )
+    if len(view) > file_size:
+        raise FormatError(
+            _spec.ERROR_TRAILING,
+            file_size,
+            "HDR-6",
+            "bytes follow the end of the file",
+            found=f"{len(view)} bytes",
+            wanted=f"{file_size} bytes",
+        )
+
+
+def check_digest(view: memoryview, digest: bytes) -> None:
+    """HDR-8: the SHA-256 of all bytes but the digest's own. Releases the GIL while it hashes."""
+    place = _spec.HEADER_OFFSETS["digest"]
+    computed = hashlib.sha256(view[:place])
+    computed.update(view[_spec.HEADER_SIZE :])
+    if computed.digest() != digest:
+        raise FormatError(
+            _spec.ERROR_DIGEST, place, "HDR-8", found=digest.hex(), wanted=f"{computed.hexdigest()} (computed)"
+        )
+
+
+def check_index_crc(view: memoryview, start: int, size: int) -> None:
+    """IDX-1; the caller has checked that the data holds the index."""
+    end = start + size - _CRC_SIZE
+    _check_crc(view, start, end, int.from_bytes(view[end : end + _CRC_SIZE], "little"), "IDX-1")
+
+
+def open_chunk(view: memoryview, offset: int, size: int, kind: bytes, flags: int, clause: str) -> Cursor:
+    """Check a chunk's frame (CHK-1, CHK-3) and stand at the beginning of its payload.
+
+    Args:
+        view: the whole file; COV-1 has shown that the chunk lies within.
+        offset: where the record says that the chunk begins.
+        size: how many bytes the record says it has, at least those of a frame.
+        kind: type of the record, or TILE.
+        flags: flags of the record, or those registered for TILE.
+        clause: what the cursor names when the payload is too long or too short.
+    """
+    end = offset + size - _CRC_SIZE
+    _check_crc(view, offset, end, int.from_bytes(view[end : end + _CRC_SIZE], "little"), "CHK-1")
+    head = _spec.unpack_chunk_header(view, offset)
+    places = _spec.CHUNK_HEADER_OFFSETS
+    check_reserved(head, offset, places)
+    for name, found, wanted in (
+        ("type", head.type, kind),
+        ("flags", head.flags, flags),
+        ("payload_size", head.payload_size, size - _FRAME_SIZE),
+    ):
+        if found != wanted:
+            raise FormatError(_spec.ERROR_INDEX, offset + places[name], "CHK-3", name, found=found, wanted=wanted)
+    return Cursor(view, offset + _spec.CHUNK_HEADER_SIZE, end, clause)
+
+
+def _check_crc(view: memoryview, start: int, end: int, stored: int, clause: str) -> None:
+    computed = zlib.crc32(view[start:end])
+    if computed != stored:
+        raise FormatError(_spec.ERROR_CRC, end, clause, f"found {stored:#010x}, computed {computed:#010x}")

@@ -1,0 +1,142 @@
+"""Block heads and the codings LEVELS, OFFSET and SIGNED (spec 6.4, 6.4.1, 6.4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from csplat import _spec
+from csplat.decoder.blocks import Columns
+from csplat.decoder.container import Cursor, check_reserved
+from csplat.decoder.header import SceneHeader
+from csplat.decoder.index_tiles import scaled_step
+from csplat.decoder.streams import read_stream
+from csplat.errors import FormatError, UnsupportedError
+
+__all__ = ["check_lattice_range", "check_level", "read_block_head", "read_columns", "read_exponent", "read_offsets"]
+
+
+def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
+    """Read a block head, or that of an escape block if `legal` codings are given; return the coding."""
+    at = cursor.take(_spec.BLOCK_HEAD_SIZE)
+    head = _spec.unpack_block_head(cursor.view, at)
+    check_reserved(head, at, _spec.BLOCK_HEAD_OFFSETS)
+    place = at + _spec.BLOCK_HEAD_OFFSETS["coding"]
+    if head.attribute != attribute:
+        raise FormatError(
+            _spec.ERROR_STREAM,
+            at,
+            "CBK-5" if legal else "TLE-2",
+            "attribute",
+            found=head.attribute,
+            wanted=attribute,
+        )
+    if head.coding not in _spec.CODING_NAMES:
+        raise UnsupportedError(f"attribute coding {head.coding}", offset=place, clause="BLK-1")
+    if legal is not None and head.coding not in legal:
+        raise FormatError(
+            _spec.ERROR_STREAM, place, "CBK-5", "coding of an escape block", found=head.coding, wanted=legal
+        )
+    if _spec.CODING_NAMES[head.coding] not in _spec.ATTRIBUTE_CODINGS[attribute]:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            place,
+            "BLK-1",
+            f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}",
+            found=_spec.CODING_NAMES[head.coding],
+            wanted=" or ".join(_spec.ATTRIBUTE_CODINGS[attribute]),
+        )
+    return head.coding
+
+
+def read_columns(
+    cursor: Cursor, header: SceneHeader, attribute: int, coding: int, count: int, escape: bool = False
+) -> Columns:
+    """Read what follows the block head: parameters and stream; ranges checked.
+
+    Args:
+        cursor: stands behind the block head.
+        header: the scene.
+        attribute: of the block.
+        coding: LEVELS, OFFSET or SIGNED.
+        count: splats of the block.
+        escape: it is an escape block.
+    """
+    columns = _spec.ATTRIBUTE_COLUMNS[attribute]
+    record = header.attribute(attribute)
+    exponent, offsets = 0, (0,) * columns
+    if coding != _spec.CODING_LEVELS:
+        exponent = read_exponent(cursor, record, fixed=escape or attribute == _spec.ATTRIBUTE_QUATS)
+    if coding == _spec.CODING_OFFSET:
+        offsets = read_offsets(cursor, columns)
+    at = cursor.at
+    elements = read_stream(
+        cursor,
+        header.profile,
+        columns * count,
+        _spec.CODING_WIDTH_MAX[coding],
+        signed=coding == _spec.CODING_SIGNED,
+    )
+    block = Columns(elements.reshape(columns, count), offsets, exponent, at)
+    if attribute == _spec.ATTRIBUTE_OPACITIES:
+        check_level(block.highs[0], record.levels, at, "LEV-1")
+    elif attribute == _spec.ATTRIBUTE_QUATS:
+        check_level(block.bound, record.levels, at, "QUA-1")
+    else:
+        check_lattice_range(block.lows, block.highs, record, at)
+    return block
+
+
+def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool) -> int:
+    """Read lattice parameters: LAT-1, or LAT-2 where the exponent is fixed at 0."""
+    at = cursor.take(_spec.LATTICE_PARAMS_SIZE)
+    params = _spec.unpack_lattice_params(cursor.view, at)
+    check_reserved(params, at, _spec.LATTICE_PARAMS_OFFSETS)
+    if fixed and params.exponent != 0:
+        raise FormatError(_spec.ERROR_VALUE, at, "LAT-2", "exponent", found=params.exponent, wanted=0)
+    if not fixed and scaled_step(record.step, params.exponent) is None:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at,
+            "LAT-1",
+            f"{record.step} x 2^{params.exponent} is not positive, finite and at least 2^-1022",
+        )
+    return params.exponent
+
+
+def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:
+    """Read i64[columns], the offsets (LAT-3)."""
+    at = cursor.take(8 * columns)
+    offsets = tuple(int(value) for value in np.frombuffer(cursor.view, "<i8", columns, at))
+    for i, offset in enumerate(offsets):
+        if abs(offset) > _spec.COLUMN_MAX:
+            raise FormatError(
+                _spec.ERROR_VALUE,
+                at + 8 * i,
+                "LAT-3",
+                "offset",
+                found=offset,
+                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
+            )
+    return offsets
+
+
+def check_level(found: int, levels: int, at: int, clause: str) -> None:
+    """LEV-1, QUA-1: no integer exceeds `levels` in magnitude."""
+    if found > levels:
+        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=found, wanted=f"{levels} at most")
+
+
+def check_lattice_range(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
+    """LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
+    for column, (low, high) in enumerate(zip(lows, highs, strict=True)):
+        shift = record.chroma_shift if 3 * column >= len(lows) else 0
+        found = max(-low, high) << shift
+        if found > _spec.COLUMN_MAX:
+            raise FormatError(
+                _spec.ERROR_RANGE,
+                at,
+                "LAT-4",
+                f"integer of column {column}",
+                found=found,
+                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
+            )

@@ -1,0 +1,81 @@
+"""What a caller allows a file to take (LIM-1), asked of the index before anything is allocated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from csplat import _spec
+from csplat.decoder.codebooks import table_bytes
+from csplat.decoder.header import SceneHeader, Tile
+from csplat.errors import InputError, LimitError
+
+__all__ = ["Limits", "check_budget", "float_bytes", "integer_bytes"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Budgets of one decode; the defaults are the registry's.
+
+    Attributes:
+        splats: splats of a decode of the whole scene, or of the chosen tiles.
+        bytes: memory of the arrays that are returned and of the codebooks they need.
+        json_bytes: length of one JSON text.
+    """
+
+    splats: int = _spec.BUDGET_SPLATS
+    bytes: int = _spec.BUDGET_BYTES
+    json_bytes: int = _spec.BUDGET_JSON_BYTES
+
+    def __post_init__(self) -> None:
+        for name in ("splats", "bytes", "json_bytes"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 0:
+                raise InputError(f"limit {name} is {value!r}, wanted a whole number, 0 or more")
+
+
+def float_bytes(header: SceneHeader, degree: int) -> int:
+    """Return the bytes of one splat in the arrays of section 3."""
+    floats = 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
+    return 4 * floats + sum(np.dtype(column.dtype).itemsize for column in header.extras)
+
+
+def integer_bytes(degree: int) -> int:
+    """Return the bytes of one splat in the integer arrays of section 9.2."""
+    return 4 + 8 * 3 + 4 * 3 + 8 * 3 + 8 * 3 * (degree + 1) ** 2
+
+
+def check_budget(
+    header: SceneHeader,
+    tiles: Sequence[Tile],
+    degree: int,
+    splat_bytes: int,
+    limits: Limits,
+    *,
+    whole: bool,
+    at_once: bool = True,
+) -> None:
+    """Refuse what exceeds the limits, from the index alone.
+
+    Args:
+        header: the scene.
+        tiles: what is to be decoded.
+        degree: highest SH band wanted.
+        splat_bytes: bytes that one splat takes in the result.
+        limits: what the caller allows.
+        whole: all of the file is to be decoded, and so every codebook read.
+        at_once: all tiles lie in memory together; otherwise one at a time.
+
+    Raises:
+        LimitError: E_LIMIT by LIM-1; `limit` is the name of the field of `Limits`.
+    """
+    counts = [tile.splat_count for tile in tiles]
+    at = _spec.HEADER_SIZE
+    if at_once and sum(counts) > limits.splats:
+        raise LimitError("splats", sum(counts), limits.splats, offset=at, clause="LIM-1")
+    splats = sum(counts) if at_once else max(counts, default=0)
+    wanted = splats * splat_bytes + table_bytes(header, tiles, degree, whole=whole)
+    if wanted > limits.bytes:
+        raise LimitError("bytes", wanted, limits.bytes, offset=at, clause="LIM-1")

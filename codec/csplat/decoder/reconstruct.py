@@ -1,0 +1,235 @@
+"""Integers into float32 (spec 7): one product in binary64, rounded once.
+
+Each `write_...` fills an output array for one tile. `lattice_rows` and `quat_rows` give the
+checked integers, colours as red, green and blue; `integers.py` hands out the same ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder.blocks import Block, Coded, Columns, runs, work_dtype
+from csplat.decoder.streams import Ints
+from csplat.errors import FormatError
+
+__all__ = [
+    "F32",
+    "lattice_rows",
+    "lift",
+    "opacity_table",
+    "quat_rows",
+    "write_bands",
+    "write_colour",
+    "write_lattice",
+    "write_opacities",
+    "write_quats",
+]
+
+F32 = NDArray[np.float32]
+
+_SQRT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # 7.5
+_INT32 = np.dtype(np.int32)
+
+
+# Lattices: means, scales, colours (7.1, 7.2, 7.4) --------------------------------------------------
+
+
+def lattice_rows(
+    block: Block, record: _spec.AttributeRecord, count: int, *, check: bool = True
+) -> Iterator[tuple[int, int, tuple[Ints, Ints, Ints]]]:
+    """Yield runs of lattice integers: start, stop and three arrays [C / 3, stop − start].
+
+    The three are x, y, z of means and scales, red, green, blue of colours.
+
+    Args:
+        block: of means, scales, sh0 or an SH band.
+        record: its attribute.
+        count: splats of the block.
+        check: refuse integers whose value is not finite in binary32.
+
+    Raises:
+        FormatError: E_RANGE by LAT-5 or MEA-1.
+    """
+    columns = _spec.ATTRIBUTE_COLUMNS[record.attribute]
+    colour = record.mapping == _spec.MAPPING_YCOCG
+    bound = max(1, block.bound)
+    if colour:  # |Y| + 2 (|Co| + |Cg|), shifted, covers R, G, B and all on the way
+        bound += bound << (record.chroma_shift + 2)
+    dtype = work_dtype(bound)
+    step = math.ldexp(record.step, block.exponent)
+    check = check and not np.isfinite(np.float32(min(bound * step, math.inf)))
+    for start, stop in runs(count, columns):
+        rows = block.rows(start, stop, dtype)
+        third = columns // 3
+        parts = rows[:third], rows[third : 2 * third], rows[2 * third :]
+        if colour:
+            parts = lift(*parts, record.chroma_shift)
+        if check:
+            _check_finite(parts, step, record, block.at)
+        yield start, stop, parts
+
+
+def lift(y: Ints, co: Ints, cg: Ints, chroma_shift: int) -> tuple[Ints, Ints, Ints]:
+    """Turn Y, Co, Cg into R, G, B (7.1), in place.
+
+    Args:
+        y: signed integers, wide enough for all that comes out.
+        co: like `y`.
+        cg: like `y`.
+        chroma_shift: k.
+    """
+    if chroma_shift:
+        scale = co.dtype.type(1 << chroma_shift)
+        co *= scale
+        cg *= scale
+    half = cg >> 1
+    y -= half  # t = y - (cg >> 1)
+    cg += y  # g = cg + t
+    np.right_shift(co, 1, out=half)
+    y -= half  # b = t - (co >> 1)
+    co += y  # r = b + co
+    return co, cg, y
+
+
+def write_lattice(block: Block, record: _spec.AttributeRecord, out: F32) -> int:
+    """Write means or scales, [n, 3]; return the largest lattice integer."""
+    step = math.ldexp(record.step, block.exponent)
+    largest = []
+    for start, stop, parts in lattice_rows(block, record, len(out)):
+        for axis, part in enumerate(parts):
+            _scale(part[0], step, out[start:stop, axis])
+        if isinstance(block, Coded):
+            largest.append(max(int(part.max()) for part in parts))
+    return max(largest) if isinstance(block, Coded) else max(block.highs)
+
+
+def write_colour(block: Block, record: _spec.AttributeRecord, out: F32, *, check: bool = True) -> None:
+    """Write coefficients of one band, [n, 2 l + 1, 3]."""
+    step = math.ldexp(record.step, block.exponent)
+    for start, stop, parts in lattice_rows(block, record, len(out), check=check):
+        for channel, part in enumerate(parts):
+            for coefficient, row in enumerate(part):
+                _scale(row, step, out[start:stop, coefficient, channel])
+
+
+def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> None:
+    """Write all higher coefficients of a tile, [n, K, 3]; bands without a block become +0.
+
+    Args:
+        blocks: by band, those the tile has.
+        records: by band, all that are wanted.
+        out: the tile's part of shN.
+    """
+    copied = _copy_entries(blocks, records, out)
+    for band, record in records.items():
+        part = out[:, band * band - 1 : (band + 1) ** 2 - 1]
+        block = blocks.get(band)
+        if block is None:
+            part[:] = 0.0
+        elif not copied:
+            write_colour(block, record, part)
+        elif isinstance(block, Coded) and block.escapes:
+            _write_escapes(block, block.escapes, record, part)
+
+
+def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
+    """Copy rows of float32 where one codebook of one stage serves all bands; False where not."""
+    first = blocks.get(1)
+    if not isinstance(first, Coded) or len(blocks) != len(records):
+        return False
+    indices = first.indices
+    values = indices.book.values
+    if values is None or values.shape[1:] != out.shape[1:]:
+        return False
+    if not all(isinstance(block, Coded) and block.indices is indices for block in blocks.values()):
+        return False
+    np.take(values, indices.stages[0], axis=0, out=out, mode="clip")
+    if not indices.book.values_finite:
+        used = np.delete(out, indices.escaped, axis=0)
+        if not np.isfinite(used).all():
+            raise FormatError(_spec.ERROR_RANGE, first.at, "LAT-5", "an entry's value is not finite in binary32")
+    return True
+
+
+def _write_escapes(block: Coded, escapes: Columns, record: _spec.AttributeRecord, out: F32) -> None:
+    values = np.empty((len(block.indices.escaped), *out.shape[1:]), np.float32)
+    write_colour(escapes, record, values)
+    out[block.indices.escaped] = values
+
+
+def _scale(integers: Ints, step: float, out: F32) -> None:
+    """float32(float64(n) × s): one product in binary64, rounded once."""
+    np.multiply(integers, step, out=out, dtype=np.float64, casting="same_kind")
+
+
+def _check_finite(parts: tuple[Ints, Ints, Ints], step: float, record: _spec.AttributeRecord, at: int) -> None:
+    largest = max(max(-int(part.min()), int(part.max())) for part in parts)
+    # Values grow with their integers: the largest decides.
+    if not np.isfinite(np.float32(float(largest) * step)):
+        raise FormatError(
+            _spec.ERROR_RANGE,
+            at,
+            "MEA-1" if record.attribute == _spec.ATTRIBUTE_MEANS else "LAT-5",
+            f"{_spec.ATTRIBUTE_NAMES[record.attribute]}: {largest} x {step} is not finite in binary32",
+        )
+
+
+# Levels: opacities, quats (7.3, 7.5) ---------------------------------------------------------------
+
+
+def opacity_table(record: _spec.AttributeRecord) -> F32:
+    """Return alpha for q = 0 .. levels (7.3)."""
+    q = np.arange(record.levels + 1, dtype=np.float64)
+    if record.mapping == _spec.MAPPING_SQUARE:  # q² and M² stay below 2^32: exact in binary64
+        return (q * q / float(record.levels * record.levels)).astype(np.float32)
+    return (q / float(record.levels)).astype(np.float32)
+
+
+def write_opacities(block: Block, table: F32, out: F32) -> None:
+    """Write opacities, [n]; LEV-1 has been checked, so each level has its place in the table."""
+    for start, stop in runs(len(out), 1):
+        levels = block.rows(start, stop, _INT32)[0]
+        np.take(table, levels, out=out[start:stop], mode="clip")
+
+
+def quat_rows(
+    block: Block, record: _spec.AttributeRecord, count: int
+) -> Iterator[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield start, stop, q1 to q3 as [3, stop − start] and R, both exact in binary64.
+
+    Raises:
+        FormatError: E_RANGE by QUA-2.
+    """
+    for start, stop in runs(count, 3):
+        q = block.rows(start, stop, _INT32).astype(np.float64)
+        square = q[0] * q[0]
+        r = 2.0 * record.levels * record.levels - square
+        for i in (1, 2):
+            np.multiply(q[i], q[i], out=square)
+            r -= square
+        lowest = r.min()
+        if lowest < 0:
+            raise FormatError(
+                _spec.ERROR_RANGE,
+                block.at,
+                "QUA-2",
+                f"R of splat {start + int(r.argmin())} of the block",
+                found=int(lowest),
+                wanted="0 or more",
+            )
+        yield start, stop, q, r
+
+
+def write_quats(block: Block, record: _spec.AttributeRecord, out: F32) -> None:
+    """Write rotations w, x, y, z, [n, 4]."""
+    c = 1.0 / (float(record.levels) * _SQRT_2)
+    for start, stop, q, r in quat_rows(block, record, len(out)):
+        np.sqrt(r, out=r)
+        np.multiply(r, c, out=out[start:stop, 0], dtype=np.float64, casting="same_kind")
+        for axis in range(3):
+            np.multiply(q[axis], c, out=out[start:stop, axis + 1], dtype=np.float64, casting="same_kind")

@@ -1,0 +1,247 @@
+"""Streams: a head, one coder, up to four transforms (spec 6.1 to 6.3)."""
+
+from __future__ import annotations
+
+import zlib
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder.container import Cursor, check_reserved
+from csplat.errors import FormatError, LimitError, UnsupportedError
+
+__all__ = ["Ints", "read_stream", "undo_transforms"]
+
+#: Integers of any width.
+Ints = NDArray[Any]
+
+_PLACES = _spec.STREAM_HEAD_OFFSETS
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, 3.1.1
+
+
+def read_stream(
+    cursor: Cursor,
+    profile: str,
+    count: int | None,
+    width_max: int,
+    *,
+    signed: bool = False,
+    count_max: int | None = None,
+) -> Ints:
+    """Read one stream and step over it.
+
+    Args:
+        cursor: stands at the stream's head.
+        profile: the file's profile, which says what coders may occur.
+        count: how many elements the place wants; `None`: as many as the stream says (JSON).
+        width_max: bytes of an element at most.
+        signed: read the elements as two's complement of `width` bytes.
+        count_max: the caller's budget where `count` is `None`.
+
+    Returns:
+        [count] little-endian integers of 1, 2, 4 or 8 bytes, the narrowest that hold `width`
+        bytes. The array may be a read-only view of the file.
+    """
+    at = cursor.take(_spec.STREAM_HEAD_SIZE)
+    head = _spec.unpack_stream_head(cursor.view, at)
+    _check_head(head, at, profile, count, width_max)
+    if count_max is not None and head.count > count_max:
+        raise LimitError("json_bytes", head.count, count_max, offset=at + _PLACES["count"], clause="STR-8")
+    if head.coded_size > cursor.end - cursor.at:
+        raise FormatError(
+            _spec.ERROR_STREAM,
+            at + _PLACES["coded_size"],
+            "STR-6",
+            "coded_size",
+            found=head.coded_size,
+            wanted=f"{cursor.end - cursor.at} at most",
+        )
+    start = cursor.take(head.coded_size)
+    packed: bytes | memoryview | Ints = _undo_coder(head, cursor.view[start : start + head.coded_size], start)
+    if _spec.TRANSFORM_RUN_LENGTH in head.transforms:
+        packed = _undo_run_length(packed, head.count * head.width, start)
+    elements = undo_transforms(packed, head.transforms, head.count, head.width)
+    return _as_signed(elements, head.width) if signed else elements
+
+
+def _check_head(head: _spec.StreamHead, at: int, profile: str, count: int | None, width_max: int) -> None:
+    check_reserved(head, at, _PLACES)
+    wanted = max(1, head.count) if count is None else count
+    if head.count != wanted:
+        _refuse(at, "count", "STR-1", head.count, wanted)
+    if not 1 <= head.width <= width_max:
+        _refuse(at, "width", "STR-2", head.width, f"1 to {width_max}")
+    used = head.transforms.rstrip(b"\0")
+    if any(transform not in _spec.TRANSFORM_NAMES for transform in used):
+        raise UnsupportedError(f"transform {max(used)}", offset=at + _PLACES["transforms"], clause="RES-2")
+    if any(a >= b for a, b in pairwise(b"\0" + used)):
+        _refuse(at, "transforms", "STR-3", list(head.transforms), "ascending values, then zeros")
+    if head.coder not in _spec.CODER_NAMES:
+        raise UnsupportedError(f"coder {head.coder}", offset=at + _PLACES["coder"], clause="RES-2")
+    # Names stand in the registry from the smallest profile to the largest.
+    profiles = list(_spec.PROFILE_NAMES.values())
+    if profiles.index(_spec.CODER_PROFILE[head.coder]) > profiles.index(profile):
+        raise UnsupportedError(
+            f"coder {_spec.CODER_NAMES[head.coder]} in profile {profile}",
+            offset=at + _PLACES["coder"],
+            clause="STR-7",
+        )
+    size = head.count * head.width
+    if _spec.TRANSFORM_RUN_LENGTH not in used:
+        if head.packed_size != size:
+            _refuse(at, "packed_size", "STR-4", head.packed_size, size)
+    elif head.packed_size % 3 or not 3 <= head.packed_size <= 3 * size:
+        _refuse(at, "packed_size", "STR-5", head.packed_size, f"a multiple of 3 up to {3 * size}")
+
+
+def _refuse(at: int, name: str, clause: str, found: object, wanted: object) -> None:
+    raise FormatError(_spec.ERROR_STREAM, at + _PLACES[name], clause, name, found=found, wanted=wanted)
+
+
+# Coders ------------------------------------------------------------------------------------------
+
+
+def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | memoryview:
+    """Return exactly `packed_size` bytes; E_CODER at the first coded byte otherwise."""
+    if head.coder == _spec.CODER_STORED:
+        if head.coded_size != head.packed_size:
+            raise FormatError(
+                _spec.ERROR_CODER, at, "COD-1", "coded_size", found=head.coded_size, wanted=head.packed_size
+            )
+        return coded
+    if head.coder == _spec.CODER_DEFLATE:
+        return _inflate(coded, head.packed_size, at)
+    return _undo_zstd(coded, head.packed_size, at)
+
+
+def _inflate(coded: memoryview, size: int, at: int) -> bytes:
+    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+    try:
+        # COD-4: one byte more than wanted shows a stream that gives too much, and lets inflate
+        # see the end of one that does not.
+        packed = inflater.decompress(coded, size + 1)
+    except zlib.error as error:
+        raise FormatError(_spec.ERROR_CODER, at, "COD-2", str(error)) from None
+    if len(packed) != size:
+        found = f"more than {size} bytes" if len(packed) > size else f"{len(packed)} bytes"
+        raise FormatError(_spec.ERROR_CODER, at, "COD-2", found=found, wanted=f"{size} bytes")
+    if not inflater.eof:
+        raise FormatError(_spec.ERROR_CODER, at, "COD-2", "the DEFLATE stream has no end")
+    if inflater.unused_data:
+        left = len(inflater.unused_data)
+        raise FormatError(_spec.ERROR_CODER, at + len(coded) - left, "COD-2", f"{left} bytes follow the final block")
+    return packed
+
+
+def _undo_zstd(coded: memoryview, size: int, at: int) -> bytes:
+    try:
+        import zstandard  # a decoder of the base profile works without it
+    except ImportError:
+        raise UnsupportedError("coder zstd without the package zstandard", offset=at, clause="STR-7") from None
+    try:
+        frame = zstandard.get_frame_parameters(coded)
+        if bytes(coded[:4]) != _ZSTD_MAGIC or frame.content_size != size or frame.dict_id:
+            raise FormatError(
+                _spec.ERROR_CODER, at, "COD-3", "not one frame without dictionary, of the size", wanted=size
+            )
+        if frame.window_size > _spec.ZSTD_WINDOW_MAX:
+            raise FormatError(
+                _spec.ERROR_CODER, at, "COD-3", "window", found=frame.window_size, wanted=_spec.ZSTD_WINDOW_MAX
+            )
+        # One shot into a buffer of the content size, which is `size`: COD-4 holds. (The streaming
+        # interface would hand out whatever the blocks give.)
+        packed: bytes = zstandard.ZstdDecompressor().decompress(coded, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise FormatError(_spec.ERROR_CODER, at, "COD-3", str(error)) from None
+    if len(packed) != size:
+        raise FormatError(_spec.ERROR_CODER, at, "COD-3", found=f"{len(packed)} bytes", wanted=f"{size} bytes")
+    return packed
+
+
+# Transforms --------------------------------------------------------------------------------------
+
+
+def _undo_run_length(packed: bytes | memoryview | Ints, size: int, at: int) -> Ints:
+    data = np.frombuffer(packed, np.uint8)
+    values, low, high = data.reshape(3, -1)
+    lengths = high.astype(np.int64)
+    lengths <<= 8
+    lengths += low
+    lengths += 1
+    total = int(lengths.sum())
+    if total != size:
+        raise FormatError(_spec.ERROR_CODER, at, "TRF-1", "sum of the run lengths", found=total, wanted=size)
+    return np.repeat(values, lengths)
+
+
+def undo_transforms(packed: bytes | memoryview | Ints, transforms: bytes, count: int, width: int) -> Ints:
+    """Undo byte planes, zigzag and delta, in this order (spec 6.3).
+
+    Args:
+        packed: `count` × `width` bytes.
+        transforms: ids; RUN_LENGTH, already undone, and NONE are passed over.
+        count: elements.
+        width: bytes of an element, 1 to 8.
+    """
+    data = np.frombuffer(packed, np.uint8)
+    if _spec.TRANSFORM_BYTE_PLANES in transforms:
+        elements = _join_planes(data.reshape(width, count))
+    elif width in (1, 2, 4, 8):
+        elements = data.view(f"<u{width}")
+    else:
+        elements = _join_planes(data.reshape(count, width).T)
+    if _spec.TRANSFORM_ZIGZAG in transforms:
+        elements = _undo_zigzag(elements, width)
+    if _spec.TRANSFORM_DELTA in transforms:
+        elements = _undo_delta(elements, width)
+    return elements
+
+
+def _join_planes(planes: Ints) -> Ints:
+    """Turn [width, count] bytes, lowest first, into [count] integers."""
+    width, count = planes.shape
+    if width == 1:
+        only: Ints = planes[0]
+        return only
+    size = 2 if width == 2 else 4 if width <= 4 else 8
+    out = np.empty((count, size), np.uint8)
+    for i in range(size):
+        out[:, i] = planes[i] if i < width else 0
+    return out.reshape(-1).view(f"<u{size}")
+
+
+def _undo_zigzag(elements: Ints, width: int) -> Ints:
+    one = elements.dtype.type(1)
+    out = elements & one
+    np.negative(out, out=out)  # all ones where the sign bit is set, modulo 2^bits
+    out ^= elements >> one
+    return _wrap(out, width)
+
+
+def _undo_delta(elements: Ints, width: int) -> Ints:
+    dtype = elements.dtype
+    if dtype.itemsize < 4:
+        # Four bytes run several times as fast as one, and agree modulo 2^(8 width).
+        narrow: Ints = np.cumsum(elements, dtype="<u4").astype(dtype)
+        return narrow
+    return _wrap(np.cumsum(elements, dtype=dtype), width)
+
+
+def _wrap(elements: Ints, width: int) -> Ints:
+    """Reduce modulo 2^(8 width), in place."""
+    if width < elements.dtype.itemsize:
+        elements &= elements.dtype.type((1 << (8 * width)) - 1)
+    return elements
+
+
+def _as_signed(elements: Ints, width: int) -> Ints:
+    spare = elements.dtype.itemsize - width
+    if spare:
+        elements = elements << elements.dtype.type(8 * spare)
+    result: Ints = elements.view(f"<i{elements.dtype.itemsize}")
+    if spare:
+        result = result >> result.dtype.type(8 * spare)
+    return result

@@ -1,0 +1,220 @@
+"""The SH stage: no SH, every splat for itself, or a codebook; whichever the scene wants (spec 6.4.5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.encoder.colour import ShTables, quantise_rows
+from csplat.encoder.container import CodebookTable, FileChunk
+from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
+from csplat.encoder.options import EncodeOptions
+from csplat.encoder.plan import Plan, Progress
+from csplat.encoder.quantise import colour_integers
+from csplat.encoder.streams import signed_stream
+from csplat.model import SplatModel
+
+__all__ = ["Books", "choose_sh"]
+
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
+F32 = NDArray[np.float32]
+Rows = NDArray[np.intp]
+
+_CLIP = 511  # lattice steps: splats beyond are coded directly, so that searches stay exact at full precision
+_BLOCK = 1 << 14
+_SAMPLE = 1 << 14  # splats on which coding every splat for itself is tried
+_LEAST = 256  # splats for which a codebook may pay
+_MANY = 4096  # entries from which on searching near groups saves more than it loses
+_ENOUGH = 1 << 15  # splats whose share of entries a smaller scene gets too, if it has users for them
+_USERS = 6  # splats per entry below which an entry does not pay for itself
+_CODEBOOK_ID = 0
+
+
+@dataclass(frozen=True)
+class Books:
+    """What was decided: the plan (its SH coding and step), what tiles need, what the index says, and chunks."""
+
+    plan: Plan
+    tables: ShTables
+    records: Sequence[CodebookTable] = ()
+    chunks: Sequence[FileChunk] = ()
+
+
+@dataclass(frozen=True)
+class _Stages:
+    """A trained codebook.
+
+    Attributes:
+        indices: by stage [N] int32; the size of the first stage says "escaped".
+        entries: by stage [size, 3K] int32, R, G, B of each coefficient.
+        error: weighted mean of the squared error that is left.
+    """
+
+    indices: list[I32]
+    entries: list[I32]
+    error: float
+
+
+def choose_sh(
+    model: SplatModel,
+    weights: F32 | None,
+    extras: Sequence[str],
+    sample: Rows,
+    plan: Plan,
+    options: EncodeOptions,
+    threads: int,
+    report: Progress,
+) -> Books:
+    """Decide how SH is coded, and train the codebook if there is to be one.
+
+    Args:
+        model: the scene.
+        weights: [N] float32, importance of the splats; None where nothing needs it.
+        extras: names of the extra columns that are carried.
+        sample: rows of one tile, on which scalar coding is tried.
+        plan: with `sh_coding` "auto", "codebook", "scalar" or "none".
+        options: `codebook_size`, `codebook_stages`, `escape_fraction`, `seed`.
+        threads: how many to use; the result does not depend on it.
+        report: progress.
+    """
+    reference = 1.0 if weights is None or not len(weights) else float(np.quantile(weights, 0.95))
+    tables = ShTables(weights, reference, extras=extras)
+    scalar = Books(replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), tables)
+    if plan.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
+        return scalar
+    if plan.sh_coding == "auto" and len(model) < _LEAST:
+        return scalar
+    fine = replace(plan, sh_coding="codebook", sh_step=plan.codebook_step)
+    stages = _train(model, weights, fine, options, threads, report)
+    books = _books(tables, stages, fine)
+    if plan.sh_coding == "auto" and not _codebook_pays(model, weights, stages, books, sample[:_SAMPLE], plan):
+        return scalar
+    return books
+
+
+def _train(
+    model: SplatModel, weights: F32, plan: Plan, options: EncodeOptions, threads: int, report: Progress
+) -> _Stages:
+    points = _lattice_points(model.shN, plan)
+    sizes = _sizes(len(model), plan, options)
+    effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if sizes[0] >= _MANY else {}
+    if len(sizes) == 1:
+
+        def steps_done(done: int, steps: int) -> None:
+            report("codebook", done / steps)
+
+        first = cluster(points, weights, sizes[0], seed=options.seed, threads=threads, progress=steps_done, **effort)
+        found = [first]
+    else:
+        found = cluster_residual(points, weights, sizes, seed=options.seed, threads=threads, **effort)
+        report("codebook", 1.0)
+    ranked = [rank_by_frequency(index, entries) for entries, index in found]
+    indices = [index.astype(np.int32) for index, _ in ranked]
+    entries = [entry for _, entry in ranked]
+    errors = _errors(model.shN, indices, entries, plan) * weights
+    escaped = _escapes(errors, plan, options)
+    errors[escaped] = 0.0
+    indices[0][escaped] = len(entries[0])
+    for stage in indices[1:]:
+        stage[escaped] = 0
+    total = float(weights.sum(dtype=np.float64)) or 1.0
+    return _Stages(indices, entries, float(errors.sum()) / total)
+
+
+def _lattice_points(shN: F32, plan: Plan) -> I16:
+    """[N, 3K] R, G, B integers of the bands that are kept, clipped to what clustering is exact for."""
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    points = np.empty((len(shN), 3 * kept), np.int16)
+    for at in range(0, len(shN), _BLOCK):
+        rows = shN[at : at + _BLOCK, :kept].reshape(-1, 3 * kept)
+        rows = np.clip(rows, -_CLIP * plan.sh_step, _CLIP * plan.sh_step)
+        points[at : at + _BLOCK] = np.rint(rows * np.float32(1.0 / plan.sh_step))
+    return points
+
+
+def _sizes(count: int, plan: Plan, options: EncodeOptions) -> tuple[int, ...]:
+    """Choose entries per stage: an entry costs some 20 bytes, and saves error for the splats that use it."""
+    size = options.codebook_size
+    if size is None:
+        wanted = max(count * plan.codebook_share, min(_ENOUGH * plan.codebook_share, count / _USERS))
+        size = 1 << min(max(round(math.log2(max(1.0, wanted))), 4), 13)
+    return (size,) * (options.codebook_stages or 1)
+
+
+def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan) -> NDArray[np.float64]:
+    """[N] squared error of each splat; infinite where a coefficient was clipped."""
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    tables = [entry.astype(np.float32) * np.float32(plan.sh_step) for entry in entries]
+    errors = np.empty(len(shN))
+    for at in range(0, len(shN), _BLOCK):
+        part = slice(at, at + _BLOCK)
+        difference = shN[part, :kept].reshape(-1, 3 * kept).copy()
+        clipped = np.abs(difference).max(axis=1) > (_CLIP - 1) * plan.sh_step
+        for table, index in zip(tables, indices, strict=True):
+            difference -= table[index[part]]
+        errors[part] = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
+        errors[part][clipped] = np.inf
+    return errors
+
+
+def _escapes(errors: NDArray[np.float64], plan: Plan, options: EncodeOptions) -> Rows:
+    """Return the splats that are coded directly: those with the largest weighted error, and all that were clipped."""
+    fraction = plan.escape_fraction if options.escape_fraction is None else options.escape_fraction
+    count = max(int(len(errors) * fraction), int(np.count_nonzero(~np.isfinite(errors))))
+    return np.sort(np.argsort(-errors, kind="stable")[:count])
+
+
+def _books(tables: ShTables, stages: _Stages, plan: Plan) -> Books:
+    columns = []
+    for stage in stages.entries:
+        rgb = stage.reshape(len(stage), -1, 3).transpose(2, 1, 0).astype(np.float32)
+        columns.append(colour_integers(np.ascontiguousarray(rgb), plan.chroma_shift))
+    bands = range(1, plan.sh_degree + 1)
+    chunks = []
+    for band in bands:
+        head = _spec.pack_codebook_head(_spec.CodebookHead(_CODEBOOK_ID, band, len(columns)))
+        span = slice(band * band - 1, (band + 1) ** 2 - 1)
+        streams = [signed_stream(np.ascontiguousarray(stage[:, span]).reshape(-1), plan.coding) for stage in columns]
+        chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + b"".join(streams), _CODEBOOK_ID, band))
+    record = CodebookTable(
+        _CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, plan.sh_degree), tuple(stage.shape[2] for stage in columns)
+    )
+    full = replace(tables, index=stages.indices, entries=columns, ids=(_CODEBOOK_ID,), layers=tuple(bands))
+    return Books(plan, full, (record,), tuple(chunks))
+
+
+def _codebook_pays(model: SplatModel, weights: F32, stages: _Stages, books: Books, sample: Rows, plan: Plan) -> bool:
+    """Compare bytes at equal error with scalar coding, tried on a sample at two steps.
+
+    Between the two, scalar coding trades bytes for the logarithm of the error in a straight line.
+    """
+    count = len(model)
+    spent = sum(len(chunk.payload) for chunk in books.chunks) / count
+    for index in stages.indices:
+        shares = np.bincount(index) / count
+        spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
+    fine_bytes, fine_error = _try_scalar(model, weights, sample, plan)
+    coarse_bytes, coarse_error = _try_scalar(model, weights, sample, replace(plan, sh_step=2 * plan.sh_step))
+    escaped = float((stages.indices[0] == len(stages.entries[0])).mean())
+    spent += escaped * fine_bytes
+    if not 0.0 < fine_error < coarse_error:
+        return spent < fine_bytes
+    per_halving = (fine_bytes - coarse_bytes) / math.log2(coarse_error / fine_error)
+    return spent + per_halving * math.log2(max(stages.error, 1e-30) / fine_error) < fine_bytes
+
+
+def _try_scalar(model: SplatModel, weights: F32, sample: Rows, plan: Plan) -> tuple[float, float]:
+    """Return bytes per splat and weighted mean squared error of scalar coding."""
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    source = np.take(model.shN, sample, axis=0)[:, :kept]
+    columns, _, decoded = quantise_rows(source, plan, None)
+    size = len(signed_stream(columns.reshape(-1), plan.coding))
+    squares = np.square(source - decoded).sum(axis=(1, 2), dtype=np.float64)
+    weight = weights[sample]
+    return size / len(sample), float((squares * weight).sum() / (weight.sum(dtype=np.float64) or 1.0))

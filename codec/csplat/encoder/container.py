@@ -1,0 +1,199 @@
+"""Chunks, index and header (spec 4 and 5): the last stage, and the only one that knows offsets."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat.encoder.streams import Coding, unsigned_stream
+
+__all__ = ["CodebookTable", "FileChunk", "FileTile", "Scene", "json_payload", "write"]
+
+
+@dataclass(frozen=True)
+class FileChunk:
+    """A chunk of the whole file: type, payload, and for codebooks id and layer."""
+
+    type: bytes
+    payload: bytes
+    id: int = 0
+    layer: int = 0
+
+
+@dataclass(frozen=True)
+class FileTile:
+    """A tile as the index describes it, and the payloads of its layers (without their heads)."""
+
+    splat_count: int
+    exponent: int
+    corner: tuple[int, int, int]
+    extent: tuple[int, int, int]
+    max_scale: float
+    layers: Mapping[int, Sequence[bytes]]
+    tables: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class CodebookTable:
+    """What the index says of a codebook."""
+
+    id: int
+    kind: int
+    bands: tuple[int, int]
+    sizes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that a file says about the scene as a whole."""
+
+    profile: int
+    sh_degree: int
+    scene_flags: int
+    axes: bytes
+    unit_metres: float
+    origin: tuple[float, float, float]
+    attributes: Sequence[_spec.AttributeRecord]
+    extras: Sequence[_spec.ExtraRecord] = ()
+    codebooks: Sequence[CodebookTable] = ()
+    chunks: Sequence[FileChunk] = field(default=())
+
+
+def json_payload(value: Any, coding: Coding) -> bytes:
+    """Return the payload of a JSON chunk (spec 5.4): keys sorted, so that equal content gives equal bytes."""
+    text = json.dumps(value, ensure_ascii=False, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return unsigned_stream(np.frombuffer(text.encode(), np.uint8), coding)
+
+
+def write(scene: Scene, tiles: Sequence[FileTile]) -> bytes:
+    """Lay out header, index and chunks in the order the spec recommends (4.3.6)."""
+    index_size = _index_size(scene, tiles)
+    offset = _spec.HEADER_SIZE + index_size
+    parts: list[bytes] = []
+    directory: list[_spec.DirectoryRecord] = []
+    layers: dict[tuple[int, int], _spec.LayerRecord] = {}
+    for place, chunk in _in_order(scene, tiles):
+        flags = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[chunk.type])
+        framed = _frame(chunk, flags)
+        if place is None:
+            directory.append(_spec.DirectoryRecord(chunk.type, flags, chunk.id, chunk.layer, 0, 0, len(framed), offset))
+        else:
+            layers[place] = _spec.LayerRecord(chunk.layer, 0, 0, len(framed), offset)
+        parts.append(framed)
+        offset += len(framed)
+    index = _index(scene, tiles, directory, layers)
+    assert len(index) == index_size
+    return _with_header(scene.profile, index, parts, offset)
+
+
+def _in_order(scene: Scene, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
+    """Yield each chunk with its (tile, layer), or None for chunks of the whole file."""
+    yield from ((None, chunk) for chunk in scene.chunks if chunk.type != _spec.CHUNK_CODEBOOK)
+    for layer in _spec.LAYER_NAMES:
+        for chunk in scene.chunks:
+            if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer == layer:
+                yield None, chunk
+        for number, tile in enumerate(tiles):
+            if layer in tile.layers:
+                blocks = tile.layers[layer]
+                head = _spec.pack_tile_head(_spec.TileHead(number, layer, len(blocks), 0))
+                yield (number, layer), FileChunk(_spec.CHUNK_TILE, head + b"".join(blocks), layer=layer)
+
+
+def _frame(chunk: FileChunk, flags: int) -> bytes:
+    head = _spec.pack_chunk_header(_spec.ChunkHeader(chunk.type, flags, 0, len(chunk.payload)))
+    crc = zlib.crc32(chunk.payload, zlib.crc32(head))
+    return head + chunk.payload + crc.to_bytes(4, "little")
+
+
+def _index_size(scene: Scene, tiles: Sequence[FileTile]) -> int:
+    return (
+        _spec.INDEX_HEAD_SIZE
+        + len(scene.attributes) * _spec.ATTRIBUTE_RECORD_SIZE
+        + len(scene.codebooks) * _spec.CODEBOOK_RECORD_SIZE
+        + len(scene.extras) * _spec.EXTRA_RECORD_SIZE
+        + len(scene.chunks) * _spec.DIRECTORY_RECORD_SIZE
+        + sum(
+            _spec.TILE_RECORD_SIZE + len(tile.layers) * _spec.LAYER_RECORD_SIZE + 2 * len(tile.tables) for tile in tiles
+        )
+        + 4
+    )
+
+
+def _index(
+    scene: Scene,
+    tiles: Sequence[FileTile],
+    directory: Sequence[_spec.DirectoryRecord],
+    layers: Mapping[tuple[int, int], _spec.LayerRecord],
+) -> bytes:
+    head = _spec.IndexHead(
+        splat_count=sum(tile.splat_count for tile in tiles),
+        tile_count=len(tiles),
+        directory_count=len(directory),
+        codebook_count=len(scene.codebooks),
+        extra_count=len(scene.extras),
+        attribute_count=len(scene.attributes),
+        sh_degree=scene.sh_degree,
+        scene_flags=scene.scene_flags,
+        axes=scene.axes,
+        unit_metres=scene.unit_metres,
+        origin=scene.origin,
+    )
+    parts = [_spec.pack_index_head(head)]
+    parts += [_spec.pack_attribute_record(record) for record in scene.attributes]
+    for book in scene.codebooks:
+        sizes = (*book.sizes, 0, 0, 0, 0)
+        record = _spec.CodebookRecord(
+            book.id, book.kind, *book.bands, len(book.sizes), 0, (sizes[0], sizes[1], sizes[2], sizes[3])
+        )
+        parts.append(_spec.pack_codebook_record(record))
+    parts += [_spec.pack_extra_record(record) for record in scene.extras]
+    parts += [_spec.pack_directory_record(record) for record in directory]
+    for number, tile in enumerate(tiles):
+        parts.append(
+            _spec.pack_tile_record(
+                _spec.TileRecord(
+                    splat_count=tile.splat_count,
+                    level=0,
+                    layer_count=len(tile.layers),
+                    table_count=len(tile.tables),
+                    exponent=tile.exponent,
+                    reserved_0=0,
+                    corner=tile.corner,
+                    extent=tile.extent,
+                    max_scale=tile.max_scale,
+                )
+            )
+        )
+        parts += [_spec.pack_layer_record(layers[number, layer]) for layer in sorted(tile.layers)]
+        parts += [table.to_bytes(2, "little") for table in tile.tables]
+    index = b"".join(parts)
+    return index + zlib.crc32(index).to_bytes(4, "little")
+
+
+def _with_header(profile: int, index: bytes, parts: Sequence[bytes], file_size: int) -> bytes:
+    header = _spec.Header(
+        magic=_spec.MAGIC,
+        version_major=_spec.VERSION_MAJOR,
+        version_minor=_spec.VERSION_MINOR,
+        profile=profile,
+        reserved_0=0,
+        reserved_1=0,
+        index_size=len(index),
+        file_size=file_size,
+        header_crc=0,
+        digest=b"",
+    )
+    fixed = _spec.pack_header(header)[: _spec.HEADER_OFFSETS["header_crc"]]
+    fixed += zlib.crc32(fixed).to_bytes(4, "little")
+    digest = hashlib.sha256(fixed)
+    for part in (index, *parts):
+        digest.update(part)
+    return b"".join([fixed, digest.digest(), index, *parts])

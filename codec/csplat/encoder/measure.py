@@ -1,0 +1,179 @@
+"""Errors between splats and what became of them: what a file states, and what proves it (spec 5.5).
+
+The functions on columns serve the encoder, tile by tile; `measure_errors` serves whoever has two models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+
+__all__ = ["ErrorSums", "covariance_errors", "distance_errors", "measure_errors", "value_errors"]
+
+Floats = NDArray[Any]
+F64 = NDArray[np.float64]
+
+_BLOCK = 8192  # splats at a time: the temporaries of a covariance stay in the second-level cache
+_ROUNDING = 2.0**-40  # relative
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Largest error and sum of squares by measure, over a number of splats; they add up."""
+
+    count: int = 0
+    largest: Mapping[str, float] = field(default_factory=dict)
+    squares: Mapping[str, float] = field(default_factory=dict)
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Return (max, rms) by measure; rms is over splats, a splat's square the sum over components."""
+        count = max(1, self.count)
+        return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
+
+    def stated(self) -> dict[str, tuple[float, float]]:
+        """Return `bounds()` a hair wider: whoever checks them may round in another order (spec SER-5)."""
+        result = {}
+        for name, (largest, rms) in self.bounds().items():
+            floor = _ROUNDING if name == "covariance" else 0.0  # a ratio, whose rounding does not shrink with it
+            result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
+        return result
+
+    @staticmethod
+    def total(parts: Iterable[ErrorSums]) -> ErrorSums:
+        """Add up in the order given, so that the sum does not depend on threads."""
+        count, largest, squares = 0, dict[str, float](), dict[str, float]()
+        for part in parts:
+            count += part.count
+            for name in part.largest:
+                largest[name] = max(largest.get(name, 0.0), part.largest[name])
+                squares[name] = squares.get(name, 0.0) + part.squares[name]
+        return ErrorSums(count, largest, squares)
+
+
+def distance_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
+    """Return (largest distance, sum of squared distances) of centres in columns, [3, n]."""
+    difference = decoded.astype(np.float64)
+    difference -= source
+    largest = float(np.abs(difference).max(initial=0.0))
+    if largest == 0.0:
+        return 0.0, 0.0
+    difference /= largest  # squares of distances of 1e30 or 1e-30 scene units stay within float64
+    squares = np.einsum("ij,ij->j", difference, difference)
+    return largest * float(np.sqrt(squares.max())), largest * largest * float(squares.sum())
+
+
+def value_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
+    """Return (largest difference, sum of squared differences) over all components."""
+    largest = squares = 0.0
+    source, decoded = source.reshape(-1), decoded.reshape(-1)
+    for at in range(0, source.size, 8 * _BLOCK):
+        difference = decoded[at : at + 8 * _BLOCK].astype(np.float64)
+        difference -= source[at : at + 8 * _BLOCK]
+        squares += float(np.einsum("i,i->", difference, difference))  # not BLAS, whose sums depend on threads
+        np.abs(difference, out=difference)
+        largest = max(largest, float(difference.max()))
+    return largest, squares
+
+
+def covariance_errors(
+    source_quats: Floats, source_scales: Floats, quats: Floats, scales: Floats
+) -> tuple[float, float]:
+    """Return (largest, sum of squares) of ‖Σ − Σ'‖ / ‖Σ‖ over splats in columns.
+
+    Args:
+        source_quats, quats: [4, n], w x y z, any length above 0.
+        source_scales, scales: [3, n], log standard deviations; all are taken relative to the source's largest, so
+            that ± 60 neither overflows nor vanishes.
+    """
+    largest = squares = 0.0
+    for at in range(0, source_quats.shape[1], _BLOCK):
+        part = slice(at, at + _BLOCK)
+        reference = source_scales[:, part].astype(np.float64)
+        top = reference.max(axis=0)
+        reference -= top
+        variances = np.exp(2.0 * reference)
+        decoded = np.exp(np.minimum(2.0 * (scales[:, part] - top), 600.0))
+        difference = _covariance(quats[:, part], decoded)
+        difference -= _covariance(source_quats[:, part], variances)
+        difference *= difference
+        difference[3:] *= 2.0  # each entry beside the diagonal stands twice
+        error = difference.sum(axis=0)
+        error /= (variances * variances).sum(axis=0)
+        squares += float(error.sum())
+        largest = max(largest, float(error.max()))
+    return float(np.sqrt(largest)), squares
+
+
+def measure_errors(
+    source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]
+) -> dict[str, tuple[float, float]]:
+    """Measure every attribute of a decoded model against its source.
+
+    Args:
+        source: the model that was encoded.
+        decoded: what its file decodes to.
+        source_index: [len(decoded)] integers, which source splat each decoded one is.
+
+    Returns:
+        (max, rms) by measure of the spec: means, covariance, opacities, sh0, sh1, sh2, sh3. Bands that only one of
+        the two has are measured against 0.
+
+    Raises:
+        InputError: an index of another length, or that leaves the source.
+    """
+    index = np.asarray(source_index)
+    if index.shape != (len(decoded),):
+        raise InputError(f"source index has shape {index.shape}, wanted ({len(decoded)},)")
+    if len(index) and not (int(index.min()) >= 0 and int(index.max()) < len(source)):
+        raise InputError(f"source index leaves the source's {len(source)} splats")
+    parts = []
+    for at in range(0, len(decoded), 4 * _BLOCK):
+        part = slice(at, at + 4 * _BLOCK)
+        parts.append(_errors_of_rows(source, decoded, index[part], part))
+    return ErrorSums.total(parts).bounds()
+
+
+def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any], part: slice) -> ErrorSums:
+    pairs = {
+        "means": distance_errors(source.means[rows].T, decoded.means[part].T),
+        "covariance": covariance_errors(
+            source.quats[rows].T, source.scales[rows].T, decoded.quats[part].T, decoded.scales[part].T
+        ),
+        "opacities": value_errors(source.opacities[rows], decoded.opacities[part]),
+        "sh0": value_errors(source.sh0[rows], decoded.sh0[part]),
+    }
+    for band in range(1, max(source.sh_degree, decoded.sh_degree) + 1):
+        span = slice(band * band - 1, (band + 1) * (band + 1) - 1)
+        zeros = np.zeros((len(rows), 2 * band + 1, 3), np.float32)
+        before = source.shN[rows, span] if band <= source.sh_degree else zeros
+        after = decoded.shN[part, span] if band <= decoded.sh_degree else zeros
+        pairs[f"sh{band}"] = value_errors(np.ascontiguousarray(before), np.ascontiguousarray(after))
+    return ErrorSums(
+        len(rows),
+        {name: pair[0] for name, pair in pairs.items()},
+        {name: pair[1] for name, pair in pairs.items()},
+    )
+
+
+def _covariance(quats: Floats, variances: F64) -> F64:
+    """Return Σ's entries xx, yy, zz, xy, xz, yz, [6, n]."""
+    w, x, y, z = quats.astype(np.float64)
+    two = 2.0 / (w * w + x * x + y * y + z * z)
+    rows = (
+        (1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
+        (two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)),
+        (two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)),
+    )
+    scaled = [tuple(entry * variance for entry, variance in zip(row, variances, strict=True)) for row in rows]
+    result = np.empty((6, len(w)))
+    for place, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+        a, b = scaled[i], rows[j]
+        result[place] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return result

@@ -1,0 +1,146 @@
+"""What a caller may choose, and what a preset chooses where the caller does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from csplat import _spec
+from csplat.errors import InputError
+
+__all__ = ["PRESETS", "EncodeOptions", "Preset"]
+
+
+@dataclass(frozen=True)
+class EncodeOptions:
+    """Every knob of the encoder. `None` leaves the choice to the preset.
+
+    Attributes:
+        preset: "fast", "balanced" or "small".
+        quality: PSNR in dB that each attribute alone is to keep; overrides the preset's. All steps follow from it.
+        profile: "base" (every decoder reads it) or "archive" (Zstandard too).
+        position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from splat sizes.
+        position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
+        means_coding: "auto", "morton" or "axis".
+        scale_step: step of the log scales, > 0.
+        opacity_levels: M, 1 to 65535.
+        quat_levels: M, 3 to 32767.
+        sh0_step: step of the degree-0 colour, > 0.
+        sh_step: step of the higher SH bands, > 0.
+        chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
+        sh_degree: keep bands up to this one, 0 to 3; `None` keeps all.
+        sh_coding: "auto", "codebook", "scalar" or "none".
+        codebook_size: entries of the SH codebook's first stage.
+        codebook_stages: residual stages, 1 to 4.
+        escape_fraction: share of the splats, the most important ones, whose SH is coded directly, 0 to 1.
+        adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
+            importance falls). By default only where an importance is given.
+        tile_splats: splats per tile at most, 1 to 65536.
+        effort: DEFLATE level, 1 to 12.
+        deflate: "auto", "libdeflate" or "zlib".
+        keep_extra: carry the model's extra columns.
+        seed: of the k-means.
+        threads: how many to use; `None` takes all cores. The bytes do not depend on it.
+    """
+
+    preset: str = "balanced"
+    quality: float | None = None
+    profile: str = "base"
+    position_bits: int | None = None
+    position_step: float | None = None
+    means_coding: str = "auto"
+    scale_step: float | None = None
+    opacity_levels: int | None = None
+    quat_levels: int | None = None
+    sh0_step: float | None = None
+    sh_step: float | None = None
+    chroma_shift: int | None = None
+    sh_degree: int | None = None
+    sh_coding: str = "auto"
+    codebook_size: int | None = None
+    codebook_stages: int | None = None
+    escape_fraction: float | None = None
+    adaptive: float | None = None
+    tile_splats: int = _spec.TILE_SPLATS_MAX
+    effort: int | None = None
+    deflate: str = "auto"
+    keep_extra: bool = False
+    seed: int = 0
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, words in _WORDS.items():
+            if getattr(self, name) not in words:
+                raise InputError(f"{name} is {getattr(self, name)!r}, wanted one of {', '.join(words)}")
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
+
+    def chosen(self) -> dict[str, Any]:
+        """Return what the caller set, by name, without what cannot change the bytes (`threads`)."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name != "threads" and (field.name == "preset" or getattr(self, field.name) != field.default)
+        }
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a preset chooses.
+
+    Attributes:
+        quality: PSNR in dB that each attribute alone is to keep, for scenes with SH and for scenes without; steps
+            follow from it and from the scene (plan.py).
+        sh_quality: the same for the bands 1 to 3, where bits are dear.
+        sh_coding: as in `EncodeOptions`, "auto" among them.
+        adaptive: as in `EncodeOptions`.
+        effort: as in `EncodeOptions`.
+        codebook_share: entries of an SH codebook per splat.
+        codebook_finer: its lattice is finer than that of scalar coding by 2**codebook_finer.
+        escape_fraction: as in `EncodeOptions`.
+    """
+
+    quality: tuple[float, float]
+    sh_quality: float
+    sh_coding: str
+    adaptive: float
+    effort: int
+    codebook_share: float = 1 / 16
+    codebook_finer: int = 1
+    escape_fraction: float = 0.02
+
+
+PRESETS = {
+    "fast": Preset((52.0, 63.5), 42.0, "scalar", 0.5, 1),
+    "balanced": Preset((53.5, 53.2), 43.0, "auto", 0.5, 12),
+    "small": Preset((48.6, 47.2), 39.0, "auto", 0.5, 12, 1 / 32),
+}
+
+_WORDS = {
+    "preset": tuple(PRESETS),
+    "profile": tuple(name for id, name in _spec.PROFILE_NAMES.items()),
+    "means_coding": ("auto", "morton", "axis"),
+    "sh_coding": ("auto", "codebook", "scalar", "none"),
+    "deflate": ("auto", "libdeflate", "zlib"),
+}
+_TINY, _HUGE = 1e-300, 1e300
+_RANGES: dict[str, tuple[float, float]] = {
+    "quality": (10, 120),
+    "position_bits": (2, 16),
+    "position_step": (_TINY, _HUGE),
+    "scale_step": (1e-6, 1e3),
+    "opacity_levels": (1, _spec.OPACITY_LEVELS_MAX),
+    "quat_levels": (_spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX),
+    "sh0_step": (1e-6, 1e3),
+    "sh_step": (1e-6, 1e3),
+    "chroma_shift": (0, _spec.CHROMA_SHIFT_MAX),
+    "sh_degree": (0, _spec.SH_DEGREE_MAX),
+    "codebook_size": (1, _spec.CODEBOOK_ENTRIES_MAX),
+    "codebook_stages": (1, _spec.STAGES_MAX),
+    "escape_fraction": (0, 1),
+    "adaptive": (0, 1),
+    "tile_splats": (1, _spec.TILE_SPLATS_MAX),
+    "effort": (1, 12),
+}

@@ -1,0 +1,136 @@
+"""From a model to the bytes of a file, stage by stage."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.codebook import choose_sh
+from csplat.encoder.colour import ShTables
+from csplat.encoder.container import write
+from csplat.encoder.importance import splat_weights
+from csplat.encoder.measure import ErrorSums
+from csplat.encoder.options import EncodeOptions
+from csplat.encoder.plan import Plan, Progress, make_plan
+from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene
+from csplat.encoder.tile import EncodedTile, encode_tile
+from csplat.encoder.tiling import Tile, cut
+from csplat.model import SplatModel
+
+__all__ = ["EncodeReport", "EncodeResult", "encode", "encode_with_report"]
+
+
+@dataclass(frozen=True)
+class EncodeReport:
+    """What the encoder chose and what it cost.
+
+    Attributes:
+        options: what the caller asked for, and the steps and codings that followed; it stands in the file too.
+        errors: (max, rms) by measure, as the file states them (spec 5.5).
+        splat_count: splats of the file. tile_count: its tiles. size_bytes: its size.
+    """
+
+    options: dict[str, Any]
+    errors: dict[str, tuple[float, float]]
+    splat_count: int
+    tile_count: int
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class EncodeResult:
+    """A file, and which source splat each of its splats is.
+
+    Attributes:
+        data: the file.
+        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model.
+        report: choices and errors.
+    """
+
+    data: bytes
+    source_index: NDArray[np.int64]
+    report: EncodeReport
+
+
+def encode(model: SplatModel, options: EncodeOptions | None = None) -> bytes:
+    """Compress a scene.
+
+    Args:
+        model: the scene.
+        options: presets and knobs; the default preset is "balanced".
+
+    Returns:
+        The bytes of a `.csplat` file. Same model, options and library versions: same bytes, at any thread count.
+
+    Raises:
+        InputError: values that no lattice can hold, or an option that the model does not allow.
+    """
+    return encode_with_report(model, options).data
+
+
+def encode_with_report(
+    model: SplatModel,
+    options: EncodeOptions | None = None,
+    *,
+    importance: NDArray[Any] | None = None,
+    progress: Progress | None = None,
+) -> EncodeResult:
+    """Compress a scene and say how.
+
+    Args:
+        model: the scene.
+        options: as in `encode`.
+        importance: [N] weights >= 0 of the splats, in place of opacity × projected area.
+        progress: called with the stage's name and the share done, 0 to 1; from any thread.
+
+    Raises:
+        InputError: as `encode`; or an importance of another shape, or negative, or not finite.
+    """
+    options = options or EncodeOptions()
+    report = progress or _silent
+    threads = options.threads or os.cpu_count() or 1
+    plan = make_plan(model, options, importance_given=importance is not None)
+    extras = extra_columns(model, options)
+    tiles = cut(model.means, plan.lattice, plan.tile_splats)
+    needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
+    weights = splat_weights(model, importance) if needs_weights else None
+    sample = tiles[len(tiles) // 2].rows if tiles else np.zeros(0, np.intp)
+    carried = tuple(model.extra) if options.keep_extra else ()
+    books = choose_sh(model, weights, carried, sample, plan, options, threads, report)
+    plan = books.plan
+    encoded = _encode_tiles(model, tiles, plan, books.tables, threads, report)
+    errors = ErrorSums.total(part.errors for part in encoded)
+    settings = chosen_settings(plan, books.tables, options)
+    scene = file_scene(model, plan, books, extras, file_chunks(model, errors, settings, plan))
+    data = write(scene, [part.tile for part in encoded])
+    rows = np.concatenate([part.rows for part in encoded]) if encoded else np.zeros(0, np.int64)
+    summary = EncodeReport(settings, errors.stated(), len(model), len(tiles), len(data))
+    return EncodeResult(data, rows.astype(np.int64, copy=False), summary)
+
+
+def _encode_tiles(
+    model: SplatModel, tiles: Sequence[Tile], plan: Plan, tables: ShTables, threads: int, report: Progress
+) -> list[EncodedTile]:
+    done = 0
+
+    def one(tile: Tile) -> EncodedTile:
+        nonlocal done
+        encoded = encode_tile(model, tile, plan, tables)
+        done += len(tile.rows)
+        report("tiles", done / max(1, len(model)))
+        return encoded
+
+    if threads == 1 or len(tiles) < 2:
+        return [one(tile) for tile in tiles]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, tiles))
+
+
+def _silent(stage: str, done: float) -> None:
+    """Report to nobody."""

@@ -1,0 +1,119 @@
+"""What a file says beside its splats: scene fields, metadata, options, stated errors (spec 4.3, 5.4, 5.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat.encoder.codebook import Books
+from csplat.encoder.colour import ShTables
+from csplat.encoder.container import FileChunk, Scene, json_payload
+from csplat.encoder.measure import ErrorSums
+from csplat.encoder.options import EncodeOptions
+from csplat.encoder.plan import Plan
+from csplat.errors import InputError
+from csplat.model import UNSPECIFIED, SplatModel
+
+__all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene"]
+
+
+def chosen_settings(plan: Plan, tables: ShTables, options: EncodeOptions) -> dict[str, Any]:
+    """Return what was asked and what followed, JSON-compatible; it becomes the OPTS chunk."""
+    return {
+        "asked": options.chosen(),
+        "encoder": _versions(plan),
+        "position_step": plan.lattice.step,
+        "position_bits": plan.lattice.bits,
+        "means_coding": "morton" if plan.morton else "axis",
+        "scale_step": plan.scale_step,
+        "opacity_levels": plan.opacity_levels,
+        "quat_levels": plan.quat_levels,
+        "sh0_step": plan.sh0_step,
+        "sh_step": plan.sh_step,
+        "sh_degree": plan.sh_degree,
+        "sh_coding": plan.sh_coding,
+        "chroma_shift": plan.chroma_shift,
+        "adaptive": plan.adaptive,
+        "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
+        "effort": plan.coding.effort,
+        "deflate": plan.coding.library,
+        "seed": options.seed,
+    }
+
+
+def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.ExtraRecord]:
+    """Return the records of the extra columns that are carried; none unless asked."""
+    records: list[_spec.ExtraRecord] = []
+    if not options.keep_extra:
+        return records
+    ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
+    for name, column in model.extra.items():
+        text = name.encode()
+        kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}".replace("b8", "u8")
+        if kind not in ids:
+            raise InputError(f"extra column {name!r} has dtype {column.dtype}, wanted one of {', '.join(ids)}")
+        if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):
+            raise InputError(f"extra column {name!r}: a name has 1 to {_spec.EXTRA_NAME_MAX} bytes, no control codes")
+        records.append(_spec.ExtraRecord(ids[kind], len(text), text.ljust(_spec.EXTRA_NAME_MAX, b"\0")))
+    return records
+
+
+def file_chunks(model: SplatModel, errors: ErrorSums, settings: dict[str, Any], plan: Plan) -> list[FileChunk]:
+    """Return the chunks of the whole file: metadata, cameras, options, stated errors."""
+    chunks = []
+    try:
+        if model.metadata:
+            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(model.metadata), plan.coding)))
+        if model.cameras is not None:
+            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), plan.coding)))
+    except (TypeError, ValueError) as problem:
+        raise InputError(f"metadata or cameras are not JSON: {problem}") from None
+    chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, plan.coding)))
+    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _stated_errors(model, errors)))
+    return chunks
+
+
+def file_scene(
+    model: SplatModel,
+    plan: Plan,
+    books: Books,
+    extras: Sequence[_spec.ExtraRecord],
+    chunks: Sequence[FileChunk],
+) -> Scene:
+    """Gather what header and index say of the scene."""
+    directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
+    letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
+    flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
+    return Scene(
+        profile=plan.profile,
+        sh_degree=plan.sh_degree,
+        scene_flags=flags,
+        axes=bytes(directions[letter] for letter in letters),
+        unit_metres=model.unit_metres or 0.0,
+        origin=model.origin,
+        attributes=plan.attribute_records(),
+        extras=extras,
+        codebooks=books.records,
+        chunks=[*chunks, *books.chunks],
+    )
+
+
+def _stated_errors(model: SplatModel, errors: ErrorSums) -> bytes:
+    ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
+    bounds = sorted((ids[name], *pair) for name, pair in errors.stated().items())
+    head = _spec.StatedErrorsHead(len(model), 0, model.sh_degree, 0, len(bounds))
+    records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
+    return _spec.pack_stated_errors_head(head) + b"".join(records)
+
+
+def _versions(plan: Plan) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        own = version("csplat")
+    except PackageNotFoundError:
+        own = "unpackaged"
+    return f"csplat {own}, numpy {np.__version__}, {plan.coding.library}"

@@ -1,0 +1,229 @@
+"""Integers to coded bytes: transforms, then one coder (spec 6)."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import deflate
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.errors import InputError
+
+__all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsigned_stream"]
+
+Integers = NDArray[Any]
+
+_HUFFMAN_EFFORT = 1  # at this effort matches are not worth their search where Huffman codes alone do as well
+_SAMPLE = 4096  # bytes from which the choice between the two is made
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How hard to try, and with what.
+
+    Attributes:
+        effort: DEFLATE level, 1 to 12 (libdeflate's scale).
+        library: "libdeflate" or "zlib".
+        zstandard: Zstandard may be used (profile archive).
+    """
+
+    effort: int = 9
+    library: str = "libdeflate"
+    zstandard: bool = False
+
+    def __post_init__(self) -> None:
+        if self.library not in ("libdeflate", "zlib"):
+            raise InputError(f"deflate library is {self.library!r}, wanted libdeflate or zlib")
+        if not 1 <= self.effort <= 12:
+            raise InputError(f"effort is {self.effort}, wanted 1 to 12")
+
+
+def unsigned_stream(
+    values: Integers, coding: Coding, *, delta: bool = False, signed_delta: bool = False, fixed_width: int = 0
+) -> bytes:
+    """Write a stream of unsigned integers.
+
+    Args:
+        values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype without differences).
+        coding: what the coder may do.
+        delta: differences from the element before; pays where values ascend.
+        signed_delta: differences that fall as well as rise (DELTA, then ZIGZAG).
+        fixed_width: bytes of an element; 0 takes as many as the largest needs.
+
+    Returns:
+        Head and coded bytes.
+    """
+    width = fixed_width or _width(int(values.max()))
+    if not (delta or signed_delta):
+        return _finish(values, width, (_spec.TRANSFORM_NONE,), coding)
+    differences = np.empty(len(values), np.int64)
+    differences[0] = values[0]
+    np.subtract(values[1:], values[:-1], out=differences[1:], dtype=np.int64, casting="unsafe")
+    if signed_delta:
+        half = 1 << (8 * width - 1)
+        wrapped = ((differences + half) & (2 * half - 1)) - half
+        return _finish(_zigzag(wrapped), width, (_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG), coding)
+    differences &= (1 << (8 * width)) - 1
+    return _finish(differences, width, (_spec.TRANSFORM_DELTA,), coding)
+
+
+def smooth_stream(values: Integers, coding: Coding) -> bytes:
+    """Write unsigned integers as they are or as differences, whichever is smaller.
+
+    Neighbours in Morton order often have like colours and sizes, but not in every scene.
+
+    Args:
+        values: [n], n >= 1, integers from 0 to 2**32 - 1.
+        coding: what the coder may do; at the lowest effort the entropies decide instead of trials.
+    """
+    if coding.effort > _HUFFMAN_EFFORT:
+        return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
+    low = values.astype(np.uint8)
+    differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
+    return unsigned_stream(values, coding, signed_delta=_entropy(differences) < _entropy(low))
+
+
+def signed_stream(values: Integers, coding: Coding) -> bytes:
+    """Write a stream of signed integers, zigzagged.
+
+    Args:
+        values: [n], n >= 1, signed integers of at most 32 bits.
+        coding: what the coder may do.
+    """
+    folded = _zigzag(values)
+    return _finish(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), coding)
+
+
+def deflate_library(wanted: str) -> str:
+    """Resolve "auto" to the library that is used; it stands in the options chunk."""
+    return "libdeflate" if wanted == "auto" else wanted
+
+
+def _entropy(symbols: NDArray[np.uint8]) -> float:
+    """Order-0 entropy, bits per symbol."""
+    shares = np.bincount(symbols, minlength=1) / max(1, len(symbols))
+    shares = shares[shares > 0]
+    return -float((shares * np.log2(shares)).sum())
+
+
+def _width(largest: int) -> int:
+    return max(1, (largest.bit_length() + 7) // 8)
+
+
+def _zigzag(values: Integers) -> Integers:
+    """Fold two's complement into unsigned: 0, -1, 1, -2 become 0, 1, 2, 3."""
+    bits = 8 * values.itemsize
+    if values.dtype == np.int8:  # 2v leaves int8 only where the result, read as unsigned, is right
+        return ((values << 1) ^ (values >> 7)).view(np.uint8)
+    return ((values << 1) ^ (values >> (bits - 1))).view(f"u{values.itemsize}")
+
+
+def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: Coding) -> bytes:
+    """Cut into byte planes, choose the coder, and put the head before the bytes."""
+    steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
+    if width > 1:
+        steps.append(_spec.TRANSFORM_BYTE_PLANES)
+    planes = _byte_planes(values, width)
+    packed: NDArray[np.uint8] = planes
+    runs = _run_length(planes)
+    if runs is not None:
+        packed = runs
+        steps.append(_spec.TRANSFORM_RUN_LENGTH)
+    coder, coded = _code(packed, coding)
+    head = _spec.StreamHead(
+        width=width,
+        coder=coder,
+        transforms=bytes(steps).ljust(_spec.TRANSFORMS_MAX, b"\0"),
+        reserved_0=0,
+        count=len(values),
+        packed_size=len(packed),
+        coded_size=len(coded),
+    )
+    return _spec.pack_stream_head(head) + coded
+
+
+def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
+    """[n] integers to [width * n] bytes, lowest bytes first."""
+    if width == 1:
+        return np.ascontiguousarray(values.astype(np.uint8, copy=False))
+    little = np.ascontiguousarray(values).astype(f"<u{values.itemsize}", copy=False)
+    columns = little.view(np.uint8).reshape(len(values), values.itemsize)
+    return np.ascontiguousarray(columns[:, :width].T).reshape(-1)
+
+
+def _run_length(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+    """Return the runs where they are few enough to help DEFLATE, else None.
+
+    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well.
+    """
+    if len(data) < 64:
+        return None
+    changes = np.flatnonzero(data[1:] != data[:-1])
+    if 32 * (len(changes) + 1) > len(data):
+        return None
+    starts = np.concatenate([[0], changes + 1])
+    lengths = np.diff(np.append(starts, len(data)))
+    pieces = (lengths + _spec.RUN_MAX - 1) // _spec.RUN_MAX
+    values = np.repeat(data[starts], pieces)
+    sizes = np.full(len(values), _spec.RUN_MAX, np.int64)
+    sizes[np.cumsum(pieces) - 1] = lengths - (pieces - 1) * _spec.RUN_MAX
+    sizes -= 1
+    return np.concatenate([values, sizes.astype(np.uint8), (sizes >> 8).astype(np.uint8)])
+
+
+def _code(packed: NDArray[np.uint8], coding: Coding) -> tuple[int, bytes]:
+    """Return the coder with the fewest bytes, and the bytes."""
+    raw = packed.tobytes()
+    best, coded = _spec.CODER_STORED, raw
+    if len(raw) > 3:
+        deflated = _deflate(raw, coding)
+        if len(deflated) < len(coded):
+            best, coded = _spec.CODER_DEFLATE, deflated
+    if coding.zstandard and len(raw) > 3:
+        squeezed = _zstandard(raw, coding.effort)
+        if len(squeezed) < len(coded):
+            best, coded = _spec.CODER_ZSTD, squeezed
+    return best, coded
+
+
+def _deflate(raw: bytes, coding: Coding) -> bytes:
+    if coding.library == "zlib":
+        return _zlib(raw, min(coding.effort, 9), zlib.Z_DEFAULT_STRATEGY)
+    if coding.effort <= _HUFFMAN_EFFORT and not _has_matches(raw):
+        return _zlib(raw, 1, zlib.Z_HUFFMAN_ONLY)
+    return bytes(deflate.deflate_compress(raw, coding.effort))
+
+
+def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
+    coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
+    return coder.compress(raw) + coder.flush()
+
+
+def _has_matches(raw: bytes) -> bool:
+    """Judge on samples whether a fast search for matches beats Huffman codes alone."""
+    step = max(_SAMPLE, len(raw) // 4)
+    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
+    return len(deflate.deflate_compress(sample, 1)) < len(_zlib(sample, 1, zlib.Z_HUFFMAN_ONLY))
+
+
+def _zstandard(raw: bytes, effort: int) -> bytes:
+    import zstandard
+
+    level = min(22, max(1, 2 * effort - 5))
+    parameters = zstandard.ZstdCompressionParameters.from_level(
+        level, source_size=len(raw), write_checksum=False, write_content_size=True, write_dict_id=False
+    )
+    if parameters.window_log > _spec.ZSTD_WINDOW_MAX.bit_length() - 1:
+        parameters = zstandard.ZstdCompressionParameters.from_level(
+            level,
+            source_size=len(raw),
+            window_log=_spec.ZSTD_WINDOW_MAX.bit_length() - 1,
+            write_checksum=False,
+            write_content_size=True,
+            write_dict_id=False,
+        )
+    return zstandard.ZstdCompressor(compression_params=parameters).compress(raw)

@@ -1,0 +1,150 @@
+"""What can go wrong, one class for each party at fault.
+
+| class | at fault | what helps |
+|---|---|---|
+| `FormatError` | the file: it breaks a clause of the format | another copy of the file |
+| `UnsupportedError` | nobody: the file asks for what this decoder does not do | a newer decoder |
+| `LimitError` | nobody: the file asks for more than the caller allows | larger limits |
+| `InputError` | the caller's data: a PLY, an array, an option | the message says |
+
+Every error has a `code`, a short constant string that programs may compare.
+"""
+
+from __future__ import annotations
+
+__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError"]
+
+
+class CsplatError(Exception):
+    """Base of every error that csplat raises on purpose.
+
+    Attributes:
+        code: what went wrong, constant across versions and languages (`E_CRC`).
+    """
+
+    code: str = "E_CSPLAT"
+
+
+class FormatError(CsplatError):
+    """A file breaks a clause of the format.
+
+    `str()` says what, where, by which clause, what was found and what was wanted:
+    `E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081`.
+
+    Args:
+        code: error code of the registry, `E_...`.
+        offset: byte of the file where the offending field begins; `None` where no single byte is
+            to blame.
+        clause: id of the clause that is broken, `CRC-1`.
+        detail: text after the colon, for what `found` and `wanted` cannot say.
+        found: what the file holds.
+        wanted: what the clause asks for.
+    """
+
+    def __init__(
+        self,
+        code: str,
+        offset: int | None,
+        clause: str,
+        detail: str = "",
+        *,
+        found: object = None,
+        wanted: object = None,
+    ) -> None:
+        super().__init__(code, offset, clause, _join(detail, found, wanted))
+        self.code = code
+        self.offset = offset
+        self.clause = clause
+        self.detail = _join(detail, found, wanted)
+
+    def __str__(self) -> str:
+        return _sentence(self.code, self.offset, self.clause, self.detail)
+
+
+class UnsupportedError(CsplatError):
+    """A file asks for a feature that this decoder does not have.
+
+    Args:
+        feature: what is asked for, `version 0.7`.
+        code: error code of the registry.
+        offset: byte of the file that asks for it, if known.
+        clause: id of the clause that says so, if there is one.
+    """
+
+    def __init__(
+        self,
+        feature: str,
+        code: str = "E_UNSUPPORTED",
+        offset: int | None = None,
+        clause: str = "",
+    ) -> None:
+        super().__init__(feature, code, offset, clause)
+        self.code = code
+        self.feature = feature
+        self.offset = offset
+        self.clause = clause
+
+    def __str__(self) -> str:
+        return _sentence(self.code, self.offset, self.clause, f"{self.feature} is not supported")
+
+
+class LimitError(CsplatError):
+    """A file asks for more than the caller's limits allow. Nothing was allocated.
+
+    Args:
+        limit: name of the limit, `max_splats`.
+        wanted: how much the file asks for.
+        allowed: how much the caller allows.
+        code: error code of the registry.
+        offset: byte of the file that asks for it, if known.
+        clause: id of the clause that says so, if there is one.
+    """
+
+    def __init__(
+        self,
+        limit: str,
+        wanted: int,
+        allowed: int | None = None,
+        code: str = "E_LIMIT",
+        offset: int | None = None,
+        clause: str = "",
+    ) -> None:
+        super().__init__(limit, wanted, allowed, code, offset, clause)
+        self.code = code
+        self.limit = limit
+        self.wanted = wanted
+        self.allowed = allowed
+        self.offset = offset
+        self.clause = clause
+
+    def __str__(self) -> str:
+        allowed = "" if self.allowed is None else f", allowed {self.allowed}"
+        return _sentence(self.code, self.offset, self.clause, f"{self.limit}: wanted {self.wanted}{allowed}")
+
+
+class InputError(CsplatError):
+    """What the caller handed in cannot be used: a PLY, an array, an option.
+
+    Args:
+        message: one line that says what is wrong and, where there is one, what helps.
+    """
+
+    code = "E_INPUT"
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+
+
+def _join(detail: str, found: object, wanted: object) -> str:
+    parts = [detail] if detail else []
+    if found is not None:
+        parts.append(f"found {found}")
+    if wanted is not None:
+        parts.append(f"wanted {wanted}")
+    return ", ".join(parts)
+
+
+def _sentence(code: str, offset: int | None, clause: str, detail: str) -> str:
+    where = "" if offset is None else f" at byte {offset}"
+    by = f" ({clause})" if clause else ""
+    return f"{code}{where}{by}: {detail}" if detail else f"{code}{where}{by}"

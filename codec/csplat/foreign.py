@@ -1,0 +1,122 @@
+"""Recognise splat files that are not an uncompressed PLY, and say what converts them.
+
+A user who hands over a .spz wants to read "this is SPZ, convert it with ...", not where a PLY
+parser stumbled. Only names and the first bytes are looked at; nothing is parsed.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+from csplat.errors import InputError
+
+__all__ = ["HEAD_SIZE", "refuse_folder", "refuse_foreign", "refuse_packed_header"]
+
+#: Bytes of the beginning of a file that `refuse_foreign` wants to see.
+HEAD_SIZE = 512
+
+_SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_SPLAT_ROW_SIZE = 32
+
+#: By file name, for formats without a magic, or where the magic is missing.
+_BY_SUFFIX = {
+    ".spz": ("SPZ", _SPLAT_TRANSFORM),
+    ".sog": ("SOG", _SPLAT_TRANSFORM),
+    ".splat": (".splat", _SPLAT_TRANSFORM),
+    ".ksplat": (".ksplat", _SPLAT_TRANSFORM),
+    ".spx": (".spx", "gsbox"),
+    ".lcc": ("LCC", _SPLAT_TRANSFORM),
+    ".glb": ("glTF", "gsbox"),
+    ".gltf": ("glTF", "gsbox"),
+    ".csplat": ("csplat", "`csplat decode`"),
+}
+
+
+def refuse_foreign(path: Path, head: bytes, size: int) -> None:
+    """Refuse a file that is not a PLY, naming what it is and what converts it.
+
+    Args:
+        path: the file; its name decides where its first bytes do not.
+        head: its first `HEAD_SIZE` bytes, or all of them.
+        size: of the file, in bytes.
+
+    Raises:
+        InputError: the file does not begin as a PLY.
+    """
+    if head[:3] == b"ply" and head[3:4] in (b"\n", b"\r"):
+        return
+    found = _by_magic(path, head)
+    if found is None:
+        found = _BY_SUFFIX.get(path.suffix.lower())
+    if found is not None:
+        raise InputError(_refusal(path, *found))
+    if size == 0:
+        raise InputError(f"{path.name} is empty, wanted a PLY")
+    if size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
+        raise InputError(
+            f"{path.name} is not a PLY; its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that"
+            f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
+        )
+    raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}")
+
+
+def refuse_folder(path: Path) -> None:
+    """Refuse a folder: the unbundled form of SOG, or no scene at all.
+
+    Raises:
+        InputError: always.
+    """
+    if (path / "meta.json").exists():
+        raise InputError(_refusal(path, "SOG", _SPLAT_TRANSFORM))
+    raise InputError(f"{path.name} is a folder, wanted a PLY")
+
+
+def refuse_packed_header(path: Path, header: bytes) -> None:
+    """Refuse a PLY whose columns are PlayCanvas' packed words.
+
+    Args:
+        path: the file, for the message.
+        header: its PLY header, up to `end_header`.
+
+    Raises:
+        InputError: it has packed positions.
+    """
+    if any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines()):
+        raise InputError(_refusal(path, "compressed PLY", _SPLAT_TRANSFORM))
+
+
+def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
+    if head[:4] == b"NGSP":
+        return _BY_SUFFIX[".spz"]
+    if head[:2] == b"\x1f\x8b":
+        if _inflated_head(head)[:4] == b"NGSP":
+            return _BY_SUFFIX[".spz"]
+        return ("gzip", "gunzip")
+    if head[:4] == b"PK\x03\x04":
+        return _BY_SUFFIX[".sog"] if _zip_holds_meta(path) else ("zip", "unzip")
+    if head[:4] == b"glTF":
+        return _BY_SUFFIX[".glb"]
+    if path.name == "meta.json":
+        return _BY_SUFFIX[".sog"]
+    return None
+
+
+def _inflated_head(head: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 16)
+    except zlib.error:
+        return b""
+
+
+def _zip_holds_meta(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.rsplit("/", 1)[-1] == "meta.json" for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return path.suffix.lower() == ".sog"
+
+
+def _refusal(path: Path, what: str, converter: str) -> str:
+    return f"{path.name} is {what}, not a plain PLY: convert it to PLY first, with {converter}"

@@ -1,0 +1,254 @@
+"""`SplatModel`: the one in-memory form of a scene of 3D Gaussian splats.
+
+Everything that reads, writes, renders or compresses splats meets here. The constructor checks
+and never repairs: readers of other formats bring their data into this form first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+
+__all__ = [
+    "F32",
+    "MAX_SH_DEGREE",
+    "QUAT_LENGTH_TOLERANCE",
+    "UNSPECIFIED",
+    "SplatModel",
+    "normalise_quats",
+    "sh_degree_of",
+]
+
+F32 = NDArray[np.float32]
+
+#: Highest spherical-harmonics degree of a model.
+MAX_SH_DEGREE = 3
+
+#: A quaternion counts as unit when its length lies within this of 1.
+QUAT_LENGTH_TOLERANCE = 1e-3
+
+#: The coordinate system of a scene whose source did not name one.
+UNSPECIFIED = "unspecified"
+
+_AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
+_BLOCK = 1 << 18  # values that are checked at a time where a sum was not finite
+_NO_SH: F32 = np.zeros((0, 0, 3), np.float32)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SplatModel:
+    """N splats and what a viewer must know about them.
+
+    The arrays are not copied and not made read-only; treat them as constant.
+
+    Attributes:
+        means: [N, 3] float32, centres in scene units, relative to `origin`.
+        quats: [N, 4] float32, rotations w x y z. Their lengths lie within
+            `QUAT_LENGTH_TOLERANCE` of 1; `normalise_quats` makes them so.
+        scales: [N, 3] float32, natural logarithms of the standard deviations (scene units).
+        opacities: [N] float32, alpha in [0, 1] (no logits).
+        sh0: [N, 3] float32, spherical-harmonics coefficient of degree 0, red green blue.
+        shN: [N, K, 3] float32, the higher coefficients, K = (d + 1)**2 - 1 for d = 0, 1, 2, 3.
+            Left out: none, K = 0.
+        origin: what to add to `means`, three float64, scene units. A scene at geographic
+            coordinates keeps its float32 precision this way.
+        coordinate_system: `"unspecified"`, or the directions of +x, +y and +z for a person who
+            looks at the scene, as three letters of R/L, U/D and F/B: `"RDF"`.
+        unit_metres: length of one scene unit in metres; `None` where it is not known.
+        antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
+        flat: splats are discs (2DGS): the third, smallest scale means nothing.
+        cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
+            with OpenCV axes, pixel centres at +0.5; `None` where there are none.
+        metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str).
+        extra: further columns by name, each [N], integer or floating.
+
+    Raises:
+        InputError: an array has another shape or dtype, holds NaN or infinity, or is out of
+            range; or a field does not hold what is said above.
+    """
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    shN: F32 = field(default_factory=lambda: _NO_SH)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    coordinate_system: str = UNSPECIFIED
+    unit_metres: float | None = None
+    antialiased: bool = False
+    flat: bool = False
+    cameras: Sequence[Mapping[str, Any]] | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.means) if getattr(self.means, "ndim", 0) else 0
+        if self.shN is _NO_SH:
+            object.__setattr__(self, "shN", np.zeros((n, 0, 3), np.float32))
+        _check_array("means", self.means, (n, 3))
+        _check_array("quats", self.quats, (n, 4))
+        _check_array("scales", self.scales, (n, 3))
+        _check_array("opacities", self.opacities, (n,))
+        _check_array("sh0", self.sh0, (n, 3))
+        _check_array("shN", self.shN, (n, "K", 3))
+        sh_degree_of(self.shN.shape[1])
+        _check_opacities(self.opacities)
+        _check_quats(self.quats)
+        _check_extra(self.extra, n)
+        object.__setattr__(self, "origin", _checked_origin(self.origin))
+        _check_coordinate_system(self.coordinate_system)
+        unit = self.unit_metres
+        if unit is not None and not (math.isfinite(unit) and unit > 0):
+            raise InputError(f"unit_metres is {unit}, wanted a length above 0 or None")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"SplatModel({len(self)} splats, sh_degree={self.sh_degree})"
+
+    @property
+    def sh_degree(self) -> int:
+        """Spherical-harmonics degree, 0 to `MAX_SH_DEGREE`."""
+        return sh_degree_of(self.shN.shape[1])
+
+    def select(self, index: NDArray[Any] | slice) -> SplatModel:
+        """Keep some splats, in the order of `index`; everything else stays.
+
+        Args:
+            index: whatever indexes the first axis of a NumPy array: positions, a mask, a slice.
+
+        Returns:
+            A model of the chosen splats (views of this one's arrays for a slice).
+        """
+        return replace(
+            self,
+            means=self.means[index],
+            quats=self.quats[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            sh0=self.sh0[index],
+            shN=self.shN[index],
+            extra={name: column[index] for name, column in self.extra.items()},
+        )
+
+
+def sh_degree_of(coefficient_count: int) -> int:
+    """Spherical-harmonics degree of K higher coefficients.
+
+    Args:
+        coefficient_count: K, the length of the middle axis of `shN`.
+
+    Returns:
+        d with K = (d + 1)**2 - 1.
+
+    Raises:
+        InputError: K belongs to no degree up to `MAX_SH_DEGREE`.
+    """
+    for degree in range(MAX_SH_DEGREE + 1):
+        if (degree + 1) ** 2 - 1 == coefficient_count:
+            return degree
+    raise InputError(f"shN has {coefficient_count} coefficients per channel, wanted 0, 3, 8 or 15")
+
+
+def normalise_quats(quats: NDArray[Any]) -> F32:
+    """Bring quaternions to unit length; a zero quaternion becomes the identity.
+
+    Those that are unit already, as nearly as float32 can say, stay as they are, bit for bit: so
+    doing it twice changes nothing. Huge and denormal ones are no special case in float64.
+
+    Args:
+        quats: [N, 4] float32, w x y z, finite, of any length.
+
+    Returns:
+        [N, 4] float32, a new array.
+    """
+    wide = quats.astype(np.float64)
+    squared = np.einsum("ij,ij->i", wide, wide)
+    zero = squared == 0.0
+    length = np.sqrt(squared)
+    length[zero] = 1.0
+    # Four roundings of half an ulp move the squared length by at most 2**-23.
+    length[np.abs(squared - 1.0) <= 2.0**-22] = 1.0
+    wide /= length[:, None]
+    wide[zero, 0] = 1.0
+    return wide.astype(np.float32)
+
+
+def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
+    wanted = "[" + ", ".join(str(size) for size in shape) + "]"
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{name} is a {type(array).__name__}, wanted a float32 array {wanted}")
+    fits = len(array.shape) == len(shape) and all(
+        isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        raise InputError(f"{name} has shape {list(array.shape)}, wanted {wanted}")
+    if array.dtype != np.float32:
+        raise InputError(f"{name} is {array.dtype}, wanted float32")
+    bad = _non_finite_count(array)
+    if bad:
+        raise InputError(f"{name} holds {bad} values that are NaN or infinite")
+
+
+def _non_finite_count(array: F32) -> int:
+    """Count NaN and infinities; one pass over memory where there are none."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.isfinite(array.sum(dtype=np.float32)):
+            return 0  # a NaN or an infinity would have shown in the sum
+    # Large finite values can overflow the sum too: look at each, without a mask of the whole.
+    rows = max(1, _BLOCK // max(1, math.prod(array.shape[1:])))
+    return sum(int(np.count_nonzero(~np.isfinite(array[start : start + rows]))) for start in range(0, len(array), rows))
+
+
+def _check_opacities(opacities: F32) -> None:
+    if len(opacities) == 0:
+        return
+    low, high = float(opacities.min()), float(opacities.max())
+    if low < 0.0 or high > 1.0:
+        raise InputError(f"opacities reach from {low:g} to {high:g}, wanted alpha in [0, 1] (not logits)")
+
+
+def _check_quats(quats: F32) -> None:
+    with np.errstate(over="ignore"):
+        squared = np.einsum("ij,ij->i", quats, quats)
+    low, high = (1.0 - QUAT_LENGTH_TOLERANCE) ** 2, (1.0 + QUAT_LENGTH_TOLERANCE) ** 2
+    bad = int(np.count_nonzero((squared < low) | (squared > high)))
+    if bad:
+        raise InputError(f"quats holds {bad} rows that are not unit length: see normalise_quats")
+
+
+def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
+    for name, column in extra.items():
+        if not isinstance(column, np.ndarray) or column.shape != (n,):
+            raise InputError(f"extra column {name!r} is not an array of {n} values")
+        if column.dtype.kind not in "iuf":
+            raise InputError(f"extra column {name!r} is {column.dtype}, wanted integers or floats")
+
+
+def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(value) for value in origin)
+    except (TypeError, ValueError):
+        raise InputError(f"origin is {origin!r}, wanted three numbers") from None
+    if not all(math.isfinite(value) for value in (x, y, z)):
+        raise InputError(f"origin is {origin!r}, wanted finite numbers")
+    return x, y, z
+
+
+def _check_coordinate_system(letters: str) -> None:
+    if letters == UNSPECIFIED:
+        return
+    axes = {_AXIS_OF_LETTER.get(letter) for letter in letters}
+    if len(letters) != 3 or axes != {"x", "y", "z"}:
+        raise InputError(
+            f"coordinate_system is {letters!r}, wanted {UNSPECIFIED!r} or three letters, one each of R/L, U/D and F/B"
+        )

@@ -1,0 +1,271 @@
+"""Read and write PLY files of 3D Gaussian splats (INRIA's layout and its relatives).
+
+The only module that imports `plyfile`, which is GPL-3.0-or-later: programs that embed the decoder
+and never touch a PLY do not load it.
+
+PLY has no place for what a scene needs beyond its columns, so it goes into header comments:
+`csplat origin X Y Z` (x, y, z are relative to it), `csplat absolute_origin X Y Z` (x, y, z are
+absolute, in doubles), `csplat coordinate_system RDF`, `csplat unit_metres U`,
+`csplat antialiased`, `csplat flat`, `csplat licence TEXT`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import plyfile
+
+from csplat.errors import InputError
+from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_packed_header
+from csplat.lint import Finding, find_columns, refuse
+from csplat.model import SplatModel
+from csplat.ply_columns import Rows, gather
+from csplat.ply_comments import parse_comments
+from csplat.ply_origin import relative_to_origin
+from csplat.ply_write import write_ply
+
+__all__ = ["lint_ply", "read_ply", "write_ply"]
+
+_ELEMENT = "vertex"
+_END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)")
+_MAX_HEADER_SIZE = 1 << 20
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+
+
+def read_ply(
+    path: str | os.PathLike[str],
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    report: list[Finding] | None = None,
+) -> SplatModel:
+    """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
+
+    Opacities go through the sigmoid in float64, rounded once; above a logit of 16 float32 alpha
+    is too close to 1 to keep neighbours apart. Rotations become unit length. Positions in doubles
+    get an `origin`, named by a comment of the file or chosen so that float32 loses nothing.
+    Header comments are kept in `metadata["comments"]`.
+
+    Args:
+        path: the file.
+        strict: refuse what would be repaired (`csplat.lint` lists it).
+        keep_extra: keep columns that splats do not have in `SplatModel.extra`.
+        report: findings are appended to this list, repairs among them.
+
+    Raises:
+        InputError: not a PLY of splats (other splat formats are named, with a converter), or one
+            that cannot be repaired, or under `strict` one that would have to be.
+        OSError: the file cannot be read.
+    """
+    findings: list[Finding] = []
+    try:
+        model = _load(Path(path), findings, keep_extra=keep_extra, strict=strict)
+    finally:
+        if report is not None:
+            report.extend(findings)
+    refuse(findings, strict=strict)
+    assert model is not None, "without an error there is a model"
+    return model
+
+
+def lint_ply(path: str | os.PathLike[str]) -> list[Finding]:
+    """Find out what is wrong with a PLY of splats, without refusing it.
+
+    Returns:
+        Findings in the order of reading; the last one is an error where `read_ply` would refuse.
+
+    Raises:
+        InputError: not a PLY at all, or its header cannot be parsed.
+        OSError: the file cannot be read.
+    """
+    findings: list[Finding] = []
+    _load(Path(path), findings, keep_extra=False, strict=False)
+    return findings
+
+
+def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> SplatModel | None:
+    """Read a file, appending what is noticed to `findings`; `None` where that holds an error."""
+    content = _parse(path, findings)
+    if content is None:
+        return None
+    rows, comments = content
+    columns, more = find_columns(rows.dtype, keep_extra=keep_extra)
+    findings += more
+    if columns is None:
+        return None
+    refuse(findings, strict=strict)  # before the work
+    facts = parse_comments(comments)
+    blocks = _blocks(path, rows)
+    arrays, more = gather(blocks, len(rows), rows.dtype, columns, keep_extra=keep_extra)
+    findings += more
+    if len(rows) == 0:
+        findings.append(Finding("empty", 0, "the file holds no splats", "note"))
+    means, origin = relative_to_origin(arrays.means, facts)
+    if columns.double:
+        text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
+        findings.append(Finding("double-means", len(means), text, "note"))
+    return SplatModel(
+        means=means,
+        quats=arrays.quats,
+        scales=arrays.scales,
+        opacities=arrays.opacities,
+        sh0=arrays.sh0,
+        shN=arrays.shN,
+        origin=origin,
+        coordinate_system=facts.coordinate_system,
+        unit_metres=facts.unit_metres,
+        antialiased=facts.antialiased,
+        flat=facts.flat or len(columns.scales) == 2,
+        metadata=facts.metadata,
+        extra=arrays.extra,
+    )
+
+
+def _parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
+    """Let plyfile parse a file. Returns rows of scalar columns, and the comments."""
+    header = _header(path)
+    refuse_packed_header(path, header)
+    findings += _header_findings(header, path.stat().st_size)
+    if any(not one.repairable for one in findings):
+        return None
+    with _open(path, header) as stream:
+        try:
+            parsed = plyfile.PlyData.read(stream)
+        except plyfile.PlyElementParseError as error:
+            findings.append(_row_finding(error))
+            return None
+        except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
+            raise InputError(f"{path.name}: {error or type(error).__name__}") from None
+        end = None if parsed.text else stream.tell()
+    row_count = sum(element.count for element in parsed)
+    findings += _trailing_findings(path, len(header), end, row_count)
+    if _ELEMENT not in parsed:
+        raise InputError(f"{path.name} has no element {_ELEMENT!r}: not a PLY of splats")
+    others = [element.name for element in parsed if element.name != _ELEMENT]
+    if others:
+        text = f"elements besides {_ELEMENT}: {', '.join(others)}: dropped"
+        findings.append(Finding("other-elements", len(others), text, "repair"))
+    rows, lists = _scalars(parsed[_ELEMENT].data)
+    if lists:
+        text = f"list properties {', '.join(lists)}: dropped"
+        findings.append(Finding("list-columns", len(lists), text, "repair"))
+    comments = [*parsed.comments, *parsed.obj_info]
+    for element in parsed:
+        comments += element.comments
+    return rows, comments
+
+
+def _header(path: Path) -> bytes:
+    """The bytes of a PLY header, up to and including the line `end_header`."""
+    if path.is_dir():
+        refuse_folder(path)
+    with path.open("rb") as stream:
+        refuse_foreign(path, stream.read(HEAD_SIZE), path.stat().st_size)
+        stream.seek(0)
+        start = stream.read(_MAX_HEADER_SIZE)
+    end = _END_OF_HEADER.search(start)
+    if end is None:
+        raise InputError(f"{path.name}: the PLY header has no line end_header")
+    return start[: end.end()]
+
+
+def _header_findings(header: bytes, size: int) -> list[Finding]:
+    findings = []
+    if not header.isascii():
+        count = sum(byte > 127 for byte in header)
+        text = f"the header holds {count} bytes that are not ASCII: read as question marks"
+        findings.append(Finding("non-ascii-header", count, text, "note"))
+    for line in header.splitlines():
+        words = line.split()
+        if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
+            count = int(words[2])
+            if count > size:  # a row takes a byte at least: do not let anyone allocate for it
+                text = f"{count} rows are declared, the file has {size} bytes"
+                findings.append(Finding("truncated", count, text, "error"))
+    return findings
+
+
+def _row_finding(error: Any) -> Finding:
+    present, declared = error.row or 0, error.element.count
+    if error.message == "early end-of-file":
+        text = f"{declared} rows of {error.element.name} are declared, {present} are there"
+        return Finding("truncated", declared - present, text, "error")
+    return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}", "error")
+
+
+def _trailing_findings(path: Path, header_size: int, end: int | None, row_count: int) -> list[Finding]:
+    """Count the bytes after the last row; an ASCII file (`end` is `None`) has a line per row."""
+    if end is not None:
+        count = path.stat().st_size - end
+    else:
+        with path.open("rb") as stream:
+            stream.seek(header_size)
+            lines = stream.read().splitlines(keepends=True)
+        count = len(b"".join(lines[row_count:]).strip())
+    if count == 0:
+        return []
+    text = f"{count} bytes follow the last row: ignored"
+    return [Finding("trailing-bytes", count, text, "repair")]
+
+
+def _scalars(data: Rows) -> tuple[Rows, list[str]]:
+    """Take list properties out of rows. Returns contiguous rows and the names taken out."""
+    names = data.dtype.names or ()
+    lists = [name for name in names if data.dtype[name].hasobject]
+    if not lists:
+        return data, []
+    kept = [(name, data.dtype[name]) for name in names if name not in lists]
+    rows = np.empty(len(data), kept)
+    for name, _ in kept:
+        rows[name] = data[name]
+    return rows, lists
+
+
+def _blocks(path: Path, rows: Rows) -> Iterator[Rows]:
+    """Rows in blocks. Those of a memory map are read instead: aligned, and not resident twice."""
+    step = max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
+    if not isinstance(rows, np.memmap):
+        yield from (rows[start : start + step] for start in range(0, len(rows), step))
+        return
+    with path.open("rb") as stream:
+        stream.seek(rows.offset)
+        for start in range(0, len(rows), step):
+            want = min(step, len(rows) - start)
+            block = np.fromfile(stream, rows.dtype, want)
+            if len(block) != want:
+                raise InputError(f"{path.name} became shorter while it was read")
+            yield block
+
+
+def _open(path: Path, header: bytes) -> IO[Any]:
+    """Open a PLY for plyfile: as text where it is text, and ASCII where plyfile insists on it."""
+    if any(line.split()[:2] == [b"format", b"ascii"] for line in header.splitlines()):
+        return io.TextIOWrapper(_AsciiReader(path, path.stat().st_size), encoding="ascii")
+    return _AsciiReader(path, len(header))
+
+
+class _AsciiReader(io.BufferedReader):
+    """A file whose first bytes read as ASCII, whatever they are: plyfile stops at others."""
+
+    def __init__(self, path: Path, ascii_size: int) -> None:
+        super().__init__(io.FileIO(path))
+        self._ascii_left = ascii_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._as_ascii(super().read(size))
+
+    def read1(self, size: int = -1, /) -> bytes:
+        return self._as_ascii(super().read1(size))
+
+    def _as_ascii(self, data: bytes) -> bytes:
+        if self._ascii_left <= 0 or data.isascii():
+            self._ascii_left -= len(data)
+            return data
+        self._ascii_left -= len(data)
+        return bytes(byte if byte < 128 else ord("?") for byte in data)

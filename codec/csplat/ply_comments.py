@@ -1,0 +1,116 @@
+"""What a scene is beyond its columns, as comment lines of a PLY header."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from csplat.errors import InputError
+from csplat.model import UNSPECIFIED, SplatModel
+
+__all__ = ["SceneFacts", "format_comments", "parse_comments"]
+
+_PREFIX = "csplat"
+
+
+@dataclass
+class SceneFacts:
+    """What comments say about a scene; defaults where they say nothing.
+
+    Attributes:
+        origin: `None` where no comment names one.
+        origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
+        coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
+        metadata: `comments`, the lines that are not ours; `licence`.
+    """
+
+    origin: tuple[float, float, float] | None = None
+    origin_is_added: bool = False
+    coordinate_system: str = UNSPECIFIED
+    unit_metres: float | None = None
+    antialiased: bool = False
+    flat: bool = False
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def parse_comments(comments: Sequence[str]) -> SceneFacts:
+    """Read the comment lines of a header, without the word `comment`.
+
+    Raises:
+        InputError: a line begins as ours but its value cannot be understood. To skip an origin
+            would put the scene elsewhere.
+    """
+    facts = SceneFacts()
+    others: list[str] = []
+    for comment in comments:
+        words = comment.split()
+        if words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
+            others.append(comment)
+    if others:
+        facts.metadata["comments"] = others
+    return facts
+
+
+def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
+    """Write the facts of a model as comment lines, without the word `comment`.
+
+    Args:
+        model: the scene.
+        absolute: positions are written with the origin added.
+
+    Returns:
+        Lines of ASCII (other characters become question marks), none for what is default.
+    """
+    lines = [line for one in _strings(model.metadata.get("comments")) for line in one.splitlines()]
+    if absolute or any(model.origin):
+        key = "absolute_origin" if absolute else "origin"
+        lines.append(f"{_PREFIX} {key} {' '.join(repr(value) for value in model.origin)}")
+    if model.coordinate_system != UNSPECIFIED:
+        lines.append(f"{_PREFIX} coordinate_system {model.coordinate_system}")
+    if model.unit_metres is not None:
+        lines.append(f"{_PREFIX} unit_metres {model.unit_metres!r}")
+    if model.antialiased:
+        lines.append(f"{_PREFIX} antialiased")
+    if model.flat:
+        lines.append(f"{_PREFIX} flat")
+    licence = model.metadata.get("licence")
+    if isinstance(licence, str):
+        lines.append(f"{_PREFIX} licence {' '.join(licence.split())}")
+    return [line.encode("ascii", "replace").decode("ascii") for line in lines]
+
+
+def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
+    """Take one fact over; `False` where the key is none of ours."""
+    if key in ("origin", "absolute_origin"):
+        x, y, z = _numbers(key, values, 3)
+        facts.origin, facts.origin_is_added = (x, y, z), key == "absolute_origin"
+    elif key == "coordinate_system" and len(values) == 1:
+        facts.coordinate_system = values[0]
+    elif key == "unit_metres":
+        (facts.unit_metres,) = _numbers(key, values, 1)
+    elif key == "antialiased" and not values:
+        facts.antialiased = True
+    elif key == "flat" and not values:
+        facts.flat = True
+    elif key == "licence" and values:
+        facts.metadata["licence"] = " ".join(values)
+    else:
+        return False
+    return True
+
+
+def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
+    try:
+        numbers = [float(value) for value in values]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        line = " ".join((_PREFIX, key, *values))
+        raise InputError(f"the header comment {line!r} does not hold {count} finite numbers")
+    return numbers
+
+
+def _strings(value: object) -> list[str]:
+    return [one for one in value if isinstance(one, str)] if isinstance(value, list) else []

@@ -1,0 +1,56 @@
+"""Where a PLY's positions are measured from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import F32
+from csplat.ply_columns import F64
+from csplat.ply_comments import SceneFacts
+
+__all__ = ["relative_to_origin"]
+
+#: float64 positions keep origin 0 while their centre is nearer than this many spreads: float32
+#: relative to 0 then is at most four bits coarser than relative to the centre.
+_NEAR_SPREADS = 16.0
+
+
+def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tuple[float, float, float]]:
+    """Split the positions of a PLY into float32 means and the origin they are relative to.
+
+    Args:
+        means: [N, 3] x, y, z as the file has them, float32 or float64.
+        facts: what the comments of the file say about an origin.
+
+    Returns:
+        [N, 3] float32 and three float64, in scene units.
+    """
+    if facts.origin is not None and not facts.origin_is_added:
+        return means.astype(np.float32, copy=False), facts.origin
+    if means.dtype == np.float32:
+        return means, (0.0, 0.0, 0.0)
+    origin = facts.origin if facts.origin is not None else _origin_for(means)
+    with np.errstate(over="ignore"):  # the model refuses what leaves float32
+        return (means - np.array(origin)).astype(np.float32), origin
+
+
+def _origin_for(positions: F64) -> tuple[float, float, float]:
+    """Choose an origin for float64 positions so that float32 loses nothing that shows.
+
+    Zero, where float32 is exact or the scene lies around zero; else its centre (the median, which
+    outliers do not move), rounded to a power of two near the scene's spread.
+    """
+    if len(positions) == 0 or np.array_equal(positions, positions.astype(np.float32)):
+        return (0.0, 0.0, 0.0)
+    centre = np.median(positions, axis=0)
+    spread = float(np.median(np.abs(positions - centre), axis=0).max())
+    if np.abs(centre).max() <= _NEAR_SPREADS * spread:
+        return (0.0, 0.0, 0.0)
+    if spread > 0.0:
+        step = 2.0 ** np.floor(np.log2(spread))
+        centre = np.round(centre / step) * step
+    x, y, z = centre.tolist()
+    return x, y, z

@@ -1,0 +1,117 @@
+"""Write a model as a PLY in INRIA's layout, which every viewer of splats opens."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.model import SplatModel
+from csplat.ply_columns import logits_of_alpha
+from csplat.ply_comments import format_comments
+
+__all__ = ["write_ply"]
+
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are put together at a time: they stay in the cache
+
+_PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+
+
+def write_ply(path: str | os.PathLike[str], model: SplatModel, *, absolute: bool = False) -> None:
+    """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
+
+    Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow
+    the others; cameras and metadata but comments and licence are not written.
+
+    Args:
+        path: the file; it takes its name when it is complete, replacing an older one.
+        model: the scene.
+        absolute: write x, y and z as doubles with the origin added, for programs that take
+            doubles. By default they are floats relative to the origin, which a comment names.
+
+    Raises:
+        InputError: an extra column has a name or type that a PLY cannot hold.
+        OSError: the file cannot be written.
+    """
+    dtype = _row_dtype(model, absolute=absolute)
+    with atomic_writer(path) as stream:
+        stream.write(_header(model, absolute=absolute))
+        step = max(1, _BLOCK_SIZE // dtype.itemsize)
+        rows = np.zeros(min(step, len(model)), dtype)
+        for start in range(0, len(model), step):
+            part = slice(start, min(start + step, len(model)))
+            block = rows[: part.stop - part.start]
+            _fill(block, model, part, absolute=absolute)
+            stream.write(block.view(np.uint8).data)
+
+
+def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
+    coefficients = model.shN.shape[1]
+    return np.dtype(
+        [
+            ("means", "<f8" if absolute else "<f4", 3),
+            ("normals", "<f4", 3),
+            ("sh0", "<f4", 3),
+            ("shN", "<f4", (3, coefficients)),
+            ("logits", "<f4"),
+            ("scales", "<f4", 3),
+            ("quats", "<f4", 4),
+            *((f"extra {name}", column.dtype.newbyteorder("<")) for name, column in model.extra.items()),
+        ]
+    )
+
+
+def _header(model: SplatModel, *, absolute: bool) -> bytes:
+    # Comments come last: SIBR's viewer expects the element on the third line.
+    position = "double" if absolute else "float"
+    rest_count = 3 * model.shN.shape[1]
+    floats = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    floats += [f"f_rest_{index}" for index in range(rest_count)]
+    floats += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(model)}"]
+    lines += [f"property {position} {name}" for name in ("x", "y", "z")]
+    lines += [f"property float {name}" for name in floats]
+    for name, column in model.extra.items():
+        if name in {"x", "y", "z", *floats}:
+            raise InputError(f"extra column {name!r} has the name of a column of every splat PLY")
+        lines.append(f"property {_ply_type(name, column.dtype)} {name}")
+    lines += [f"comment {line}" for line in format_comments(model, absolute=absolute)]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+
+
+def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
+    if not name.isascii() or name.split() != [name]:
+        raise InputError(f"extra column {name!r}: a PLY property is one word of ASCII")
+    kind = _PLY_TYPES.get(f"{dtype.kind}{dtype.itemsize}")
+    if kind is None:
+        raise InputError(f"extra column {name!r} is {dtype}, which no PLY property holds")
+    return kind
+
+
+def _fill(block: NDArray[Any], model: SplatModel, part: slice, *, absolute: bool) -> None:
+    """Copy splats `part` of a model into rows; the normals are zero already."""
+    if absolute:
+        block["means"] = model.means[part].astype(np.float64) + np.array(model.origin)
+    else:
+        block["means"] = model.means[part]
+    block["sh0"] = model.sh0[part]
+    for channel in range(3):
+        block["shN"][:, channel] = model.shN[part, :, channel]
+    block["logits"] = logits_of_alpha(model.opacities[part])
+    block["scales"] = model.scales[part]
+    block["quats"] = model.quats[part]
+    for name, column in model.extra.items():
+        block[f"extra {name}"] = column[part]

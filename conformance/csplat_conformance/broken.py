@@ -1,0 +1,71 @@
+"""How a recipe breaks a valid file: overwrite its fields, or declare its scene wrong."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+from csplat_conformance.builder import Built, build
+from csplat_conformance.samples import Recipe, rich_scene, scene
+from csplat_conformance.scene import Scene
+
+__all__ = ["patched", "rich", "small", "swapped", "whole"]
+
+
+@cache
+def small() -> Built:
+    """Return one tile of two splats."""
+    return build(scene())
+
+
+@cache
+def rich() -> Built:
+    """Return the scene of `valid/rich`."""
+    return build(rich_scene())
+
+
+def patched(
+    name: str,
+    why: str,
+    clauses: str,
+    code: str,
+    base: Built,
+    changes: dict[str, Any],
+    also: tuple[str, ...] = (),
+    at: str = "",
+    within: int = 0,
+) -> Recipe:
+    """Return a recipe that overwrites fields of a valid file.
+
+    Args:
+        name: of the vector.
+        why: one line.
+        clauses: the one that is broken, and others that the vector covers.
+        code: error code.
+        base: the valid file.
+        changes: field to value.
+        also: further codes that do as well.
+        at: field that is to blame; the first that changes where left out.
+        within: byte within that field.
+    """
+    place = base.fields[at or next(iter(changes))].offset + within
+    ids = tuple(clauses.split())
+    return Recipe(f"invalid/{name}", why, ids, lambda: base.patched(changes), None, code, place, also)
+
+
+def whole(
+    name: str, why: str, clauses: str, code: str, made: Scene, at: str, within: int = 0, optional: bool = False
+) -> Recipe:
+    """Return a recipe whose scene is declared wrong; `at` names the field that is to blame."""
+    built = build(made)
+    place = built.fields[at].offset + within
+    ids = tuple(clauses.split())
+    return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=optional)
+
+
+def swapped(base: Built, one: str, other: str) -> dict[str, Any]:
+    """Return the changes that exchange two layer records."""
+    keys = [f"{name}.{key}" for name in (one, other) for key in ("layer", "size", "offset")]
+    values = [struct.unpack_from(base.fields[k].format, base.data, base.fields[k].offset) for k in keys]
+    return dict(zip(keys, values[3:] + values[:3], strict=True))

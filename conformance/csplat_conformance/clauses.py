@@ -1,0 +1,55 @@
+"""Which clause of the spec is shown by which vector, and why some are shown by none."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final
+
+from csplat_conformance.manifest import Vector
+
+__all__ = ["EXCUSES", "clause_ids", "clause_map", "replaced"]
+
+#: Clauses that no vector covers: the reason, or the test that covers them.
+EXCUSES: Final = {
+    "HDR-10": "about readers of parts; a CRC that fails is `invalid/index_crc`, `invalid/chunk_crc`",
+    "CHK-5": "about editors, which change files rather than read them",
+    "JSN-3": "a permission; the vectors of JSN-1 are marked optional",
+    "SER-5": "about what an encoder states: needs the source",
+    "CNF-2": "the sum of all vectors",
+    "CNF-3": "no file shows the absence of crashes: `tests/fuzz.py`, `tests/test_damage.py`",
+    "CNF-4": "about a decoder's interface",
+    "CNF-5": "about encoders",
+    "CNF-6": "about encoders",
+}
+
+_SHOWN = 4
+
+
+def clause_ids(text: str) -> list[str]:
+    """Return every clause id that the spec's text defines, in its order, repetitions kept."""
+    return re.findall(r"\[([A-Z]{3}-[0-9]+)\]", text)
+
+
+def clause_map(text: str, vectors: Sequence[Vector]) -> str:
+    """Return annex C: a row for each clause."""
+    covering: dict[str, list[str]] = {}
+    for vector in vectors:
+        for clause in vector.clauses:
+            covering.setdefault(clause, []).append(vector.name)
+    lines = ["| clause | vectors, or why there are none |", "|---|---|"]
+    for clause in clause_ids(text):
+        # Refusals say most about a clause: they come first.
+        names = sorted(covering.get(clause, []), key=lambda name: not name.startswith("invalid/"))
+        cell = ", ".join(f"`{name}`" for name in names[:_SHOWN])
+        if len(names) > _SHOWN:
+            cell += f" and {len(names) - _SHOWN} more"
+        lines.append(f"| {clause} | {cell or EXCUSES.get(clause, 'missing')} |")
+    return "\n".join(lines) + "\n"
+
+
+def replaced(text: str, name: str, body: str) -> str:
+    """Return the spec's text with the part between two marks replaced."""
+    begin, end = f"<!-- begin generated: {name} -->\n", "<!-- end generated -->"
+    before, rest = text.split(begin, 1)
+    return before + begin + body + rest[rest.index(end) :]

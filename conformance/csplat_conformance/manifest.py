@@ -1,0 +1,105 @@
+"""The manifest: what each vector is, and what a decoder must make of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat_conformance.reference import expected
+from csplat_conformance.samples import Recipe
+
+__all__ = ["VECTORS", "Vector", "describe", "load", "summarise", "to_json"]
+
+#: Folder of the vectors and of manifest.json.
+VECTORS = Path(__file__).parent / "vectors"
+
+_PROFILE_AT = _spec.HEADER_OFFSETS["profile"]
+
+
+@dataclass(frozen=True)
+class Vector:
+    """An entry of the manifest.
+
+    Attributes:
+        name: group and name, `valid/rich`.
+        file: path below the folder of the vectors.
+        sha256: of the file.
+        why: one line.
+        clauses: ids that the vector covers.
+        since: version of the format.
+        profile: name of the profile that a decoder needs; for refusals base where the file names none.
+        expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
+        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted).
+    """
+
+    name: str
+    file: str
+    sha256: str
+    why: str
+    clauses: list[str]
+    since: str
+    profile: str
+    expect: dict[str, Any]
+    error: dict[str, Any]
+
+    @property
+    def data(self) -> bytes:
+        """The file's bytes."""
+        return (VECTORS / self.file).read_bytes()
+
+
+def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
+    """Read the manifest."""
+    return [Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"]]
+
+
+def describe(recipe: Recipe, data: bytes) -> Vector:
+    """Return a recipe's entry for the bytes that it made."""
+    expect: dict[str, Any] = {}
+    error: dict[str, Any] = {}
+    if recipe.scene is not None:
+        result = expected(recipe.scene)
+        expect = {"header": result.header}
+        for key in ("integers", "floats", "extra"):
+            expect[key] = summarise(getattr(result, key))
+    else:
+        error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
+        error |= {"also": list(recipe.also), "optional": recipe.optional}
+    named = data[_PROFILE_AT] if len(data) >= _spec.HEADER_SIZE else _spec.PROFILE_BASE
+    return Vector(
+        name=recipe.name,
+        file=f"{recipe.name}.csplat",
+        sha256=hashlib.sha256(data).hexdigest(),
+        why=recipe.why,
+        clauses=list(recipe.clauses),
+        since=f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
+        profile=_spec.PROFILE_NAMES.get(named, _spec.PROFILE_NAMES[_spec.PROFILE_BASE]),
+        expect=expect,
+        error=error,
+    )
+
+
+def summarise(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
+    """Return [dtype, shape, SHA-256 of the little-endian bytes in C order] of each array."""
+    return {name: _summary(array) for name, array in arrays.items()}
+
+
+def _summary(array: NDArray[Any]) -> list[Any]:
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    name = f"{array.dtype.kind}{array.dtype.itemsize}"
+    return [name, list(array.shape), hashlib.sha256(little.tobytes()).hexdigest()]
+
+
+def to_json(vectors: Sequence[Vector]) -> str:
+    """Return the text of manifest.json, one vector a line."""
+    lines = [json.dumps(vars(vector), ensure_ascii=False, separators=(",", ":")) for vector in vectors]
+    head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
+    return head[:-1] + ', "vectors": [\n' + ",\n".join(lines) + "\n]}\n"

@@ -1,0 +1,35 @@
+"""Recipes of all vectors. `python -m csplat_conformance.recipes` writes the files, `--check` compares them."""
+
+from __future__ import annotations
+
+from csplat_conformance.recipes.extreme import extreme_recipes
+from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
+from csplat_conformance.recipes.invalid_blocks import block_recipes
+from csplat_conformance.recipes.invalid_chunks import chunk_recipes
+from csplat_conformance.recipes.invalid_codebooks import codebook_recipes
+from csplat_conformance.recipes.invalid_header import header_recipes
+from csplat_conformance.recipes.invalid_index import index_recipes
+from csplat_conformance.recipes.invalid_records import record_recipes
+from csplat_conformance.recipes.invalid_streams import stream_recipes
+from csplat_conformance.recipes.invalid_tiles import tile_recipes
+from csplat_conformance.recipes.valid import valid_recipes
+from csplat_conformance.recipes.valid_streams import valid_stream_recipes
+from csplat_conformance.samples import Recipe
+
+__all__ = ["all_recipes"]
+
+
+def all_recipes() -> list[Recipe]:
+    """Return every recipe, in the order of the manifest."""
+    valid = (valid_recipes, valid_stream_recipes, extreme_recipes, extreme_stream_recipes)
+    invalid = (
+        header_recipes,
+        index_recipes,
+        record_recipes,
+        tile_recipes,
+        chunk_recipes,
+        stream_recipes,
+        block_recipes,
+        codebook_recipes,
+    )
+    return [recipe for make in (*valid, *invalid) for recipe in make()]

@@ -1,0 +1,204 @@
+"""Valid files at the limits, or of a kind that no sensible encoder writes: numbers and tiles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from csplat import _spec
+from csplat_conformance.builder import build
+from csplat_conformance.samples import (
+    MEANS,
+    OPACITIES,
+    QUATS,
+    SCALES,
+    SH0,
+    Recipe,
+    axis,
+    coded,
+    levels,
+    morton,
+    offset,
+    scene,
+    signed,
+    tile,
+)
+from csplat_conformance.scene import Attribute, Block, Extra, Scene, Stream
+
+__all__ = ["extreme_recipes"]
+
+_RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
+_MAX = _spec.INTEGER_MAX
+
+
+def extreme_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_numbers(), *_tiles()]
+
+
+def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
+    return Recipe(f"extreme/{name}", why, tuple(clauses.split()), lambda: build(made).data, made)
+
+
+def _with(changes: dict[int, Block], n: int = 3, records: dict[int, Attribute] | None = None, **rest: object) -> Scene:
+    made = scene(tiles=[replace(tile(2, n, 0, changes), **rest)])  # type: ignore[arg-type]  # fields of Tile
+    return replace(made, attributes=made.attributes | (records or {}))
+
+
+def _lattice(step: float, mapping: int = _spec.MAPPING_LATTICE, chroma_shift: int = 0) -> Attribute:
+    return Attribute(mapping, step, chroma_shift=chroma_shift)
+
+
+def _numbers() -> list[Recipe]:
+    tiny, huge = 2.0**-1022, 2.0**1023
+    far = {MEANS: _lattice(2.0**-30)}
+    box = {MEANS: axis([[0, 2**24 - 1, 0], [2**24 - 1, 0, 5], [77, 1, 2**24 - 1]], Stream(3))}
+    column = _spec.COLUMN_MAX
+    lifted = _lattice(1e-9, _spec.MAPPING_YCOCG)
+    shifted = _lattice(0.5, _spec.MAPPING_YCOCG, 16)
+    return [
+        _recipe(
+            "corner_at_2_53",
+            "lattice integers of 2^53 and one step below",
+            "TIL-7 MEA-1",
+            _with({MEANS: axis([[0, 1, 0], [1, 0, 1], [0, 0, 0]])}, records=far, corner=(_MAX - 1, -_MAX, 0)),
+        ),
+        _recipe(
+            "extent_24_bits",
+            "the largest extent on each axis",
+            "TIL-8 AXI-1 TIL-10",
+            _with(box, corner=(-(2**52), 1, -1)),
+        ),
+        _recipe(
+            "morton_17_bits",
+            "51-bit codes in seven bytes",
+            "MOR-1 MOR-2",
+            _with({MEANS: morton([[2**17 - 1, 0, 2**17 - 1], [0, 2**17 - 1, 0], [2**16, 1, 3]], 17, Stream(7))}),
+        ),
+        _recipe(
+            "morton_wide_bits",
+            "more bits than the extent needs",
+            "MOR-1",
+            _with({MEANS: morton([[1, 0, 0], [0, 1, 1], [1, 1, 0]], 17, Stream(1))}),
+        ),
+        _recipe(
+            "step_smallest",
+            "values that vanish in binary32: zeros of either sign",
+            "ATT-6 TIL-11",
+            _with({SCALES: signed([[-1, -2, -3], [-9, -1, -1], [-5, -5, -5]])}, records={SCALES: _lattice(tiny)}),
+        ),
+        _recipe(
+            "scales_zero_of_both_signs",
+            "the largest scale is +0 beside −0",
+            "TIL-11",
+            _with({SCALES: signed([[-1, 0, -3], [-9, -1, -1], [-5, -5, -5]])}, records={SCALES: _lattice(tiny)}),
+        ),
+        _recipe(
+            "exponent_beyond_1023",
+            "2^exponent alone overflows binary64, step × 2^exponent does not",
+            "LAT-1 ATT-6",
+            _with(
+                {SH0: signed([[0, 0, 0], [1, -1, 0], [-1, 0, 1]], exponent=1040)}, records={SH0: _lattice(2.0**-1000)}
+            ),
+        ),
+        _recipe(
+            "exponent_below_1074",
+            "2^exponent alone vanishes, step × 2^exponent does not",
+            "LAT-1",
+            _with(
+                {SH0: signed([[0, 9, 0], [1, -1, 0], [-1, 0, 1]], exponent=-1080)},
+                records={SH0: _lattice(1.75 * 2.0**1000)},
+            ),
+        ),
+        _recipe(
+            "step_largest_lattice_zero",
+            "a huge lattice whose only integer is 0",
+            "TIL-9 ATT-6",
+            _with({MEANS: axis([[0, 0, 0]] * 3)}, corner=(0, 0, 0), exponent=0, records={MEANS: _lattice(huge)}),
+        ),
+        _recipe(
+            "subnormal_values",
+            "products that binary32 holds as subnormals",
+            "NUM-1",
+            _with({SH0: signed([[1, 2, 3], [-1, -7, 100], [33, 0, 127]])}, records={SH0: _lattice(1.1 * 2.0**-149)}),
+        ),
+        _recipe(
+            "ties_to_even",
+            "float32 halfway cases of large integers",
+            "NUM-1",
+            _with(
+                {
+                    SH0: offset(
+                        [[2**24 + 1, 2**24 + 3, -(2**24) - 1], [2**25 + 2, 2**25 + 6, 0], [2**24, 1, 3]],
+                        Stream(4),
+                        offsets=(0, 0, -(2**24) - 1),
+                    )
+                },
+                records={SH0: _lattice(1.0)},
+            ),
+        ),
+        _recipe(
+            "column_limits",
+            "colour columns of ±2^50 through the lifting",
+            "LAT-3 LAT-4",
+            _with({SH0: _limits(column)}, records={SH0: lifted}),
+        ),
+        _recipe(
+            "chroma_shift_16",
+            "the coarsest chroma, negative and odd",
+            "ATT-8 LAT-4",
+            _with({SH0: signed([[1, -1, 3], [0, 2**14, -(2**14)], [-5, 7, -7]], Stream(4))}, records={SH0: shifted}),
+        ),
+        _recipe(
+            "levels_of_one",
+            "a single level of opacity",
+            "ATT-3",
+            _with({OPACITIES: levels([0, 1, 1])}, records={OPACITIES: Attribute(_spec.MAPPING_SQUARE, levels=1)}),
+        ),
+        _recipe(
+            "quats_three_levels",
+            "the smallest M; R of 0 makes w +0",
+            "ATT-4 QUA-2",
+            _with(
+                {QUATS: signed([[3, 3, 0], [-3, 0, 3], [1, -2, 3]])},
+                records={QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=3)},
+            ),
+        ),
+        _recipe(
+            "quats_all_levels",
+            "R of 0 at M = 32,767",
+            "QUA-1 QUA-2",
+            _with(
+                {QUATS: signed([[32767, -32767, 0], [0, 0, 32767], [18918, 18918, -18918]], Stream(2))},
+                records={QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=32767)},
+            ),
+        ),
+    ]
+
+
+def _limits(column: int) -> Block:
+    return offset([[column, column, -column]] * 3, Stream(1), offsets=(column, column, -column))
+
+
+def _tiles() -> list[Recipe]:
+    n = _spec.TILE_SPLATS_MAX
+    same = tile(1, 1)
+    full = {a: replace(b, rows=[list(b.rows[0])] * n) for a, b in same.blocks.items()}
+    full |= {QUATS: signed([[1, 2, 3]] * (n - 1) + [[9, 9, 9]])}
+    many = [tile(k, 1, k % 2, corner=(k, -k, 2 * k), exponent=k % 5 - 2) for k in range(24)]
+    extras = tuple(Extra("x" * _spec.EXTRA_NAME_MAX if i == 0 else f"é{i}", _spec.EXTRA_DTYPE_U8) for i in range(9))
+    raws = tuple(Block(_spec.CODING_RAW, [[i], [255 - i]]) for i in range(9))
+    return [
+        _recipe(
+            "tile_of_65536",
+            "a full tile, one run after the other",
+            "TIL-1 STR-5 TRF-1",
+            coded(scene(tiles=[replace(same, blocks=full)]), lambda how: replace(how, transforms=_RUNS)),
+        ),
+        _recipe("tiles_of_one", "many tiles, each with layers and exponents of its own", "TIL-1 TIL-4", scene(1, many)),
+        _recipe(
+            "extra_names",
+            "a name of 62 bytes, names beyond ASCII, nine columns",
+            "EXR-1 EXR-2",
+            scene(tiles=[tile(extras=raws)], extras=extras),
+        ),
+    ]

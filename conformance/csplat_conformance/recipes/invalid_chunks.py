@@ -1,0 +1,314 @@
+"""Invalid files: frames of chunks, JSON texts and stated errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from csplat import _spec
+from csplat_conformance.broken import patched, rich, small, swapped, whole
+from csplat_conformance.builder import build
+from csplat_conformance.samples import (
+    Recipe,
+    rich_scene,
+    scene,
+    tile,
+)
+from csplat_conformance.scene import Chunk, Scene, StatedErrors, Stream
+
+__all__ = ["chunk_recipes"]
+
+_NAN, _INF = float("nan"), float("inf")
+_KNOWN = _spec.CHUNK_FLAG_CRITICAL
+
+
+def chunk_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_chunks(), *_texts()]
+
+
+def _chunks() -> list[Recipe]:
+    base, one = rich(), small()
+    twins = build(scene(tiles=[tile(1), tile(1, corner=(0, 0, 0))]))
+    first, second = (f"tile[{i}].layer[0]" for i in (0, 1))
+    tail = "TILE.0.0/"
+    return [
+        whole(
+            "gap",
+            "three bytes between index and chunks",
+            "COV-1",
+            "E_INDEX",
+            scene(gap=bytes(3)),
+            "tile[0].layer[0].offset",
+        ),
+        patched(
+            "chunks_overlap",
+            "two records name one chunk",
+            "COV-1",
+            "E_INDEX",
+            twins,
+            {f"{second}.offset": twins.spans["TILE.0.0"][0]},
+        ),
+        patched("chunk_offset_huge", "an offset of 2^64 − 1", "COV-1", "E_INDEX", one, {f"{first}.offset": 2**64 - 1}),
+        patched(
+            "chunk_size_huge",
+            "a size of 2^32 − 1",
+            "COV-1",
+            "E_INDEX",
+            one,
+            {f"{first}.size": 2**32 - 1},
+            at="header.file_size",
+        ),
+        patched("chunk_size_zero", "a size of 0", "CHK-3", "E_INDEX", one, {f"{first}.size": 0}),
+        patched("chunk_crc", "a tile's CRC alone is wrong", "CHK-1", "E_CRC", one, {f"{tail}crc": 7}),
+        patched(
+            "metadata_crc",
+            "the CRC of a chunk that decoding does not need",
+            "CHK-1 CHK-2",
+            "E_CRC",
+            base,
+            {"SERR/crc": 7},
+        ),
+        whole("codebook_tail", "a byte after the last stage", "CDB-2", "E_STREAM", _codebook_tail(), "CODB.2.0/tail"),
+        _unknown_crc(),
+        patched(
+            "chunk_type_differs",
+            "CODB in the directory, META in the chunk",
+            "CHK-3",
+            "E_INDEX",
+            base,
+            {"CODB.2.0/header.type": _spec.CHUNK_METADATA},
+        ),
+        patched(
+            "chunk_flags_differ",
+            "flags of record and chunk differ",
+            "CHK-3",
+            "E_INDEX",
+            base,
+            {"META/header.flags": 0},
+            ("E_VALUE",),
+        ),
+        patched(
+            "tile_type",
+            "a layer record names a chunk that is no TILE",
+            "CHK-3",
+            "E_INDEX",
+            one,
+            {f"{tail}header.type": b"TILF"},
+        ),
+        patched(
+            "tile_flags",
+            "a TILE that is not critical",
+            "CHK-3",
+            "E_INDEX",
+            one,
+            {f"{tail}header.flags": 0},
+            ("E_VALUE",),
+        ),
+        patched(
+            "payload_size",
+            "the payload's size is not the record's",
+            "CHK-3",
+            "E_INDEX",
+            one,
+            {f"{tail}header.payload_size": 5},
+        ),
+        patched(
+            "payload_size_huge",
+            "a payload of 2^32 − 1 bytes",
+            "CHK-3",
+            "E_INDEX",
+            one,
+            {f"{tail}header.payload_size": 2**32 - 1},
+        ),
+        patched(
+            "known_flags",
+            "META as critical in record and chunk",
+            "CHK-4",
+            "E_VALUE",
+            base,
+            {"directory[META].flags": _KNOWN, "META/header.flags": _KNOWN},
+        ),
+        patched(
+            "tiles_swapped",
+            "each tile's record names the other's chunk",
+            "TLE-1",
+            "E_INDEX",
+            twins,
+            swapped(twins, first, second),
+            at="TILE.1.0/head.tile_index",
+        ),
+        patched("tile_layer", "the chunk says another layer", "TLE-1", "E_INDEX", one, {f"{tail}head.layer": 1}),
+        patched(
+            "codebook_chunk_other_id",
+            "the payload names another codebook",
+            "CDB-1",
+            "E_INDEX",
+            base,
+            {"CODB.7.1/head.codebook_id": 2},
+        ),
+        patched(
+            "codebook_chunk_other_layer",
+            "the payload names another band",
+            "CDB-1",
+            "E_INDEX",
+            base,
+            {"CODB.7.1/head.layer": 2},
+        ),
+        patched(
+            "codebook_chunk_stages",
+            "the payload has another number of stages",
+            "CDB-1",
+            "E_INDEX",
+            base,
+            {"CODB.7.1/head.stage_count": 1},
+        ),
+    ]
+
+
+def _unknown_crc() -> Recipe:
+    base = build(scene(chunks=(Chunk(b"priv", payload=b"x", flags=0),)))
+    return patched("unknown_chunk_crc", "the CRC of an unknown chunk", "CHK-1 CHK-2", "E_CRC", base, {"priv/crc": 7})
+
+
+def _texts() -> list[Recipe]:
+    deep = b'{"a":' + b"[" * 64 + b"]" * 64 + b"}"
+    bad = {
+        "not_utf_8": (b'{"a":"\xff"}', "a byte that is not UTF-8"),
+        "surrogate": (b'{"a":"\xed\xa0\x80"}', "a surrogate in UTF-8"),
+        "mark": (b"\xef\xbb\xbf{}", "a byte order mark"),
+        "open": (b'{"a":1', "an object without an end"),
+        "comma": (b'{"a":1,}', "a comma before the end"),
+        "nan": (b'{"a":NaN}', "a word that JSON does not have"),
+        "infinity": (b'{"a":-Infinity}', "another word that JSON does not have"),
+        "zero": (b'{"a":01}', "a number that begins with 0"),
+        "control": (b'{"a":"\t"}', "a control character in a string"),
+        "two_values": (b"{} {}", "two values"),
+        "array": (b"[]", "an array in META"),
+        "twice": (b'{"a":1,"b":{"c":2,"\\u0063":3}}', "a name twice, once written as an escape"),
+        "deep": (deep, "65 levels"),
+        "lone_surrogate": (b'{"a":"\\ud800"}', "half of a surrogate pair as an escape"),
+        "number_large": (b'{"a":1e999}', "a number beyond binary64"),
+        "number_long": (b'{"a":-' + b"9" * 400 + b"}", "an integer beyond binary64"),
+    }
+    meta = _spec.CHUNK_METADATA
+    result = [
+        whole(
+            f"json_{name}",
+            why,
+            "JSN-1",
+            "E_JSON",
+            scene(chunks=(Chunk(meta, text),)),
+            "META/stream.width",
+            optional=True,
+        )
+        for name, (text, why) in bad.items()
+    ]
+    cameras = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"{}"),))
+    numbers = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"[{},1]"),))
+    tail = scene(chunks=(Chunk(meta, b"{}", tail=b"\0"),))
+    runs = 1024  # of 65,536 spaces: beyond the default budget, and 3 kB in the file
+    values = b"{}" + b" " * runs
+    packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
+    spaces = Stream(1, (_spec.TRANSFORM_RUN_LENGTH,), "deflate_fixed", packed=packed)
+    bomb = build(scene(chunks=(Chunk(meta, b"{}", spaces),)))
+    base = rich()
+    record = "SERR/record[means]"
+    return [
+        *result,
+        whole(
+            "json_cameras_object", "an object in CAMS", "JSN-1", "E_JSON", cameras, "CAMS/stream.width", optional=True
+        ),
+        whole(
+            "json_cameras_number", "a number in CAMS", "JSN-1", "E_JSON", numbers, "CAMS/stream.width", optional=True
+        ),
+        whole("json_tail", "a byte after the stream", "JSN-2", "E_STREAM", tail, "META/tail"),
+        patched(
+            "json_beyond_budget",
+            "a sound text of 64 MiB and two bytes, beyond the default budget",
+            "STR-8 LIM-1",
+            "E_LIMIT",
+            bomb,
+            {"META/stream.count": 2 + runs * _spec.RUN_MAX},
+        ),
+        patched("measure_zero", "measure 0", "SER-1", "E_VALUE", base, {f"{record}.measure": 0}),
+        patched(
+            "measure_unknown",
+            "a measure beyond the registry",
+            "SER-1",
+            "E_VALUE",
+            base,
+            {f"{record}.measure": 8},
+            ("E_UNSUPPORTED",),
+        ),
+        _measures_descend(),
+        patched("error_nan", "a maximum that is no number", "SER-2", "E_VALUE", base, {f"{record}.max": _NAN}),
+        patched("error_infinite", "an infinite maximum", "SER-2", "E_VALUE", base, {f"{record}.max": _INF}),
+        patched(
+            "error_negative",
+            "a negative rms",
+            "SER-2",
+            "E_VALUE",
+            base,
+            {f"{record}.rms": -0.25},
+            at="SERR/record[means].max",
+        ),
+        patched(
+            "error_rms_above_max",
+            "rms above max",
+            "SER-2",
+            "E_VALUE",
+            base,
+            {f"{record}.rms": 0.75},
+            at="SERR/record[means].max",
+        ),
+        patched(
+            "error_records_missing",
+            "more records than the payload holds",
+            "SER-3",
+            "E_STREAM",
+            base,
+            {"SERR/head.record_count": 2},
+            at="SERR/crc",
+        ),
+        patched(
+            "error_records_left",
+            "a record too many",
+            "SER-3",
+            "E_STREAM",
+            base,
+            {"SERR/head.record_count": 0},
+            at="SERR/record[means].measure",
+        ),
+        patched(
+            "error_counts", "source minus pruned is not N", "SER-4", "E_VALUE", base, {"SERR/head.source_count": 7}
+        ),
+        patched(
+            "error_counts_wrap",
+            "more pruned than there were",
+            "SER-4",
+            "E_VALUE",
+            base,
+            {"SERR/head.pruned_count": 2**64 - 1},
+            at="SERR/head.source_count",
+        ),
+        whole(
+            "error_head_cut",
+            "a payload shorter than its head",
+            "SER-3",
+            "E_STREAM",
+            scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, payload=bytes(7)),)),
+            "SERR/payload",
+        ),
+    ]
+
+
+def _measures_descend() -> Recipe:
+    records = ((_spec.MEASURE_SH0, 0.5, 0.25), (_spec.MEASURE_MEANS, 0.5, 0.25))
+    made = scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(2, 0, 0, 0, records)),))
+    return whole("measures_descending", "measures that descend", "SER-1", "E_VALUE", made, "SERR/record[means].measure")
+
+
+def _codebook_tail() -> Scene:
+    made = rich_scene()
+    shape, colours = made.codebooks
+    return replace(made, codebooks=(replace(shape, tail=b"\0"), colours))

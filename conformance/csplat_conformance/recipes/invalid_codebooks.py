@@ -1,0 +1,219 @@
+"""Invalid files: blocks coded by codebooks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from csplat import _spec
+from csplat_conformance.broken import patched, rich, whole
+from csplat_conformance.samples import (
+    OPACITIES,
+    QUATS,
+    SCALES,
+    SH0,
+    Recipe,
+    attributes,
+    book,
+    offset,
+    rich_scene,
+    rows_of,
+    scene,
+    sh_attribute,
+    signed,
+    tile,
+)
+from csplat_conformance.scene import Attribute, Block, Codebook, Scene, Stream
+
+__all__ = ["codebook_recipes"]
+
+
+def codebook_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_codebooks()]
+
+
+def _codebooks() -> list[Recipe]:
+    made = rich_scene()
+    base = rich()
+    first = made.tiles[0]
+    one = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)},))
+
+    def sh0(block: Block, *books: Codebook, tables: tuple[int, ...] | None = None) -> Scene:
+        return scene(tiles=[tile(changes={SH0: block}, tables=tables)], codebooks=books or (one,))
+
+    def tiled(blocks: dict[int, Block]) -> Scene:
+        return replace(made, tiles=(replace(first, blocks=first.blocks | blocks), made.tiles[1]))
+
+    scales = Codebook(1, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(4, 3, 3, -60, 60)},))
+    escape = signed([[1, 2, 3]])
+    nested = book(1, ((0, 0),))
+    without = {a: b for a, b in first.blocks.items() if a != sh_attribute(1)}
+    lone = replace(made, tiles=(replace(first, blocks=without), made.tiles[1]))
+    two = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)}, {0: rows_of(5, 2, 3, -60, 60)}))
+    level_book = Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[3], [300]]}, {0: [[0], [-4]]}))
+    quat_book = Codebook(
+        1, _spec.CODEBOOK_KIND_QUATS, ({0: [[0, 0, 0], [127, 127, 1], [127, 0, 0]]}, {0: [[0, 0, 0], [1, 0, 0]]})
+    )
+
+    def opacities(name: str, why: str, clauses: str, indices: tuple[tuple[int, ...], ...]) -> Recipe:
+        made = scene(tiles=[tile(changes={OPACITIES: book(1, indices)})], codebooks=(level_book,))
+        return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/opacities.attribute")
+
+    def quats(name: str, why: str, clauses: str, indices: tuple[tuple[int, ...], ...]) -> Recipe:
+        made = scene(tiles=[tile(changes={QUATS: book(1, indices)})], codebooks=(quat_book,))
+        return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/quats.attribute")
+
+    far = Attribute(_spec.MAPPING_LATTICE, 2.0**100)
+    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [0, 2**28, 0]]},), how=Stream(4))
+    halves = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[2**27, 0, 0]]},) * 2, how=Stream(4))
+    summed = {SCALES: replace(book(2, ((0, 2, 1),), summands=(0, 2**28, 0)), how=Stream(4))}
+    shape = {SCALES: book(2, ((0, 2, 1),), summands=(2**50, 2**50, 2**50))}
+    return [
+        whole(
+            "codebook_unlisted",
+            "a codebook that the tile does not list",
+            "CBK-1",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 1),)), tables=()),
+            "TILE.0.0/sh0.params.codebook_id",
+        ),
+        whole(
+            "codebook_of_another",
+            "sh0 by a codebook of scales",
+            "CBK-1",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 1),)), scales),
+            "TILE.0.0/sh0.params.codebook_id",
+        ),
+        whole(
+            "codebook_index",
+            "an index above the escape index",
+            "CBK-2",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 4),))),
+            "TILE.0.0/sh0.indices[0].width",
+        ),
+        whole(
+            "codebook_index_later",
+            "an index of stage 1 that is its size",
+            "CBK-2",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 1), (2, 0))), two),
+            "TILE.0.0/sh0.indices[1].width",
+        ),
+        whole(
+            "codebook_escape_unasked",
+            "an escaped splat, and none announced",
+            "CBK-3",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 3),))),
+            "TILE.0.0/sh0.params.escape_count",
+        ),
+        whole(
+            "codebook_escape_missing",
+            "no escaped splat, and one announced",
+            "CBK-3",
+            "E_CODEBOOK",
+            sh0(book(1, ((0, 1),), escape)),
+            "TILE.0.0/sh0.params.escape_count",
+        ),
+        patched(
+            "codebook_escape_count_huge",
+            "2^32 − 1 escaped splats",
+            "CBK-3",
+            "E_CODEBOOK",
+            base,
+            {"TILE.0.1/sh1.params.escape_count": 2**32 - 1},
+            ("E_STREAM", "E_LIMIT"),
+        ),
+        whole(
+            "codebook_without_first",
+            "band 2 by a codebook whose band 1 the tile left out",
+            "CBK-4",
+            "E_CODEBOOK",
+            lone,
+            "TILE.0.2/sh2.params.codebook_id",
+        ),
+        whole(
+            "codebook_other_first",
+            "rotations by a codebook of shapes, scales without",
+            "CBK-4",
+            "E_CODEBOOK",
+            _without_first(made),
+            "TILE.0.0/quats.params.codebook_id",
+        ),
+        whole(
+            "codebook_other_escapes",
+            "band 2 with another number of escapes",
+            "CBK-4",
+            "E_CODEBOOK",
+            tiled({sh_attribute(2): book(7, (), offset(rows_of(2, 2, 15, -5, 5)))}),
+            "TILE.0.2/sh2.params.codebook_id",
+        ),
+        whole(
+            "escape_by_codebook",
+            "an escape block coded CODEBOOK",
+            "CBK-5",
+            "E_STREAM",
+            sh0(book(1, ((0, 3),), replace(nested, rows=((0, 0, 0),)))),
+            "TILE.0.0/sh0.escape.coding",
+        ),
+        patched(
+            "escape_of_another",
+            "an escape block of another attribute",
+            "CBK-5",
+            "E_STREAM",
+            base,
+            {"TILE.0.1/sh1.escape.attribute": SH0},
+        ),
+        whole(
+            "codebook_value_beyond_float32",
+            "an entry whose value leaves binary32",
+            "LAT-5 CBK-6",
+            "E_RANGE",
+            replace(sh0(book(1, ((0, 1),)), large), attributes=attributes() | {SH0: far}),
+            "TILE.0.0/sh0.attribute",
+        ),
+        whole(
+            "codebook_value_in_stages",
+            "two entries whose sum leaves binary32",
+            "LAT-5 CBK-6",
+            "E_RANGE",
+            replace(sh0(book(1, ((0, 0), (0, 0))), halves), attributes=attributes() | {SH0: far}),
+            "TILE.0.0/sh0.attribute",
+        ),
+        whole(
+            "codebook_value_of_shape",
+            "entry plus summand leave binary32",
+            "LAT-5 CBK-6",
+            "E_RANGE",
+            replace(tiled(summed), attributes=made.attributes | {SCALES: far}),
+            "TILE.0.0/scales.attribute",
+        ),
+        whole(
+            "codebook_unused_damaged",
+            "coded bytes of a codebook that no tile names",
+            "COD-2",
+            "E_CODER",
+            scene(codebooks=(replace(one, how=Stream(1, coder="deflate", coded=b"\xff\xff")),)),
+            "CODB.1.0/stage[0].coded",
+        ),
+        opacities("codebook_level_negative", "a sum below 0", "LEV-1 CBK-6", ((0, 0), (0, 1))),
+        opacities("codebook_level_large", "a sum above M", "LEV-1 CBK-6", ((0, 1), (0, 0))),
+        quats("codebook_quat_radicand", "a sum whose R is below 0", "QUA-2 CBK-6", ((0, 1), (0, 0))),
+        quats("codebook_quat_component", "a sum beyond M", "QUA-1 CBK-6", ((0, 2), (0, 1))),
+        whole(
+            "codebook_summand_large",
+            "entry plus summand beyond 2^50",
+            "LAT-4 CBK-6",
+            "E_RANGE",
+            replace(tiled(shape), attributes=made.attributes | {SCALES: Attribute(0, 1e-9)}),
+            "TILE.0.0/scales.attribute",
+        ),
+    ]
+
+
+def _without_first(made: Scene) -> Scene:
+    first = made.tiles[0]
+    plain = replace(first, blocks=first.blocks | {SCALES: signed(rows_of(1, 3, 3, -9, 9))})
+    return replace(made, tiles=(plain, made.tiles[1]))

@@ -1,0 +1,255 @@
+"""Invalid files: head of the index and attribute records."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from csplat import _spec
+from csplat_conformance.broken import patched, rich, small, whole
+from csplat_conformance.builder import build
+from csplat_conformance.samples import (
+    Recipe,
+    scene,
+)
+
+__all__ = ["index_recipes"]
+
+_NAN, _INF = float("nan"), float("inf")
+
+
+def index_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_index(), *_attributes()]
+
+
+def _index() -> list[Recipe]:
+    base = small()
+    index_size = _spec.unpack_header(base.data).index_size
+    padded = build(scene(gap=bytes(4)))
+    return [
+        patched("index_crc", "the index's CRC alone is wrong", "IDX-1", "E_CRC", base, {"index.crc": 1}),
+        patched(
+            "index_rest",
+            "four bytes of the index belong to no record",
+            "IDX-2",
+            "E_INDEX",
+            padded,
+            {"header.index_size": index_size + 4},
+            at="index.crc",
+        ),
+        patched(
+            "index_tile_count",
+            "more tile records than the index holds",
+            "IDX-2",
+            "E_INDEX",
+            base,
+            {"index.tile_count": 2},
+            at="index.splat_count",
+        ),
+        patched(
+            "index_tile_count_huge",
+            "2^32 − 1 tile records",
+            "IDX-2",
+            "E_INDEX",
+            base,
+            {"index.tile_count": 2**32 - 1},
+            ("E_LIMIT",),
+            at="index.splat_count",
+        ),
+        patched(
+            "index_table_count_huge",
+            "65,535 table ids",
+            "IDX-2",
+            "E_INDEX",
+            base,
+            {"tile[0].table_count": 65535},
+            at="tile[0].splat_count",
+        ),
+        patched(
+            "index_directory_count_huge",
+            "65,535 directory records",
+            "IDX-2",
+            "E_INDEX",
+            base,
+            {"index.directory_count": 65535},
+            at="index.splat_count",
+        ),
+        patched("sh_degree_4", "the reserved degree", "IDX-3", "E_UNSUPPORTED", base, {"index.sh_degree": 4}),
+        patched(
+            "axes_one_unspecified",
+            "two directions and one unspecified",
+            "IDX-4",
+            "E_VALUE",
+            base,
+            {"index.axes": bytes([1, 4, 0])},
+        ),
+        patched("axes_same_line", "left and right", "IDX-4", "E_VALUE", base, {"index.axes": bytes([1, 2, 5])}),
+        patched(
+            "axes_unknown",
+            "a direction beyond the registry",
+            "IDX-4",
+            "E_VALUE",
+            base,
+            {"index.axes": bytes([1, 4, 7])},
+            ("E_UNSUPPORTED",),
+        ),
+        patched("unit_negative", "a negative unit", "IDX-5", "E_VALUE", base, {"index.unit_metres": -1.0}),
+        patched("unit_nan", "a unit that is no number", "IDX-5", "E_VALUE", base, {"index.unit_metres": _NAN}),
+        patched("unit_infinite", "an infinite unit", "IDX-5", "E_VALUE", base, {"index.unit_metres": _INF}),
+        patched(
+            "origin_infinite",
+            "an infinite origin",
+            "IDX-6",
+            "E_VALUE",
+            base,
+            {"index.origin": (0.0, _INF, 0.0)},
+            within=8,
+        ),
+        patched(
+            "origin_nan",
+            "an origin that is no number",
+            "IDX-6",
+            "E_VALUE",
+            base,
+            {"index.origin": (0.0, 0.0, _NAN)},
+            within=16,
+        ),
+        patched("splat_count", "N is not the sum of the tiles", "IDX-7", "E_INDEX", base, {"index.splat_count": 3}),
+        patched(
+            "splat_count_huge",
+            "2^64 − 1 splats in one small tile",
+            "IDX-7",
+            "E_INDEX",
+            base,
+            {"index.splat_count": 2**64 - 1},
+            ("E_LIMIT",),
+        ),
+    ]
+
+
+def _attributes() -> list[Recipe]:
+    base = small()
+    made = scene()
+    opacities, step = "attribute[opacities]", "attribute[means].step"
+    swapped = dict(reversed(made.attributes.items()))
+    missing = {a: r for a, r in made.attributes.items() if a != _spec.ATTRIBUTE_SH0}
+    return [
+        whole(
+            "attributes_order",
+            "attribute records in descending order",
+            "ATT-1",
+            "E_INDEX",
+            replace(made, attributes=swapped),
+            "attribute[sh0].attribute",
+        ),
+        whole(
+            "attributes_missing",
+            "no record for sh0",
+            "ATT-1",
+            "E_INDEX",
+            replace(made, attributes=missing),
+            "index.attribute_count",
+        ),
+        patched(
+            "attribute_twice",
+            "the record of scales names opacities",
+            "ATT-1",
+            "E_INDEX",
+            base,
+            {"attribute[scales].attribute": _spec.ATTRIBUTE_OPACITIES},
+        ),
+        patched(
+            "attribute_reserved",
+            "band 4 in place of sh0",
+            "ATT-1",
+            "E_INDEX",
+            base,
+            {"attribute[sh0].attribute": _spec.ATTRIBUTE_SH4},
+            ("E_UNSUPPORTED",),
+        ),
+        patched(
+            "sh_degree_without_records",
+            "degree 1 with the records of degree 0",
+            "ATT-1",
+            "E_INDEX",
+            base,
+            {"index.sh_degree": 1},
+            at="index.attribute_count",
+        ),
+        patched(
+            "mapping_of_another",
+            "scales as YCOCG",
+            "ATT-2",
+            "E_VALUE",
+            base,
+            {"attribute[scales].mapping": _spec.MAPPING_YCOCG},
+        ),
+        patched(
+            "mapping_unknown",
+            "a mapping beyond the registry",
+            "ATT-2",
+            "E_VALUE",
+            base,
+            {"attribute[sh0].mapping": 99},
+            ("E_UNSUPPORTED",),
+        ),
+        patched("opacity_levels_zero", "M = 0", "ATT-3", "E_VALUE", base, {f"{opacities}.levels": 0}),
+        patched(
+            "opacity_levels_65536",
+            "M = 65,536",
+            "ATT-3",
+            "E_VALUE",
+            base,
+            {f"{opacities}.levels": _spec.OPACITY_LEVELS_MAX + 1},
+        ),
+        patched(
+            "quat_levels_2", "M = 2", "ATT-4", "E_VALUE", base, {"attribute[quats].levels": _spec.QUAT_LEVELS_MIN - 1}
+        ),
+        patched(
+            "quat_levels_32768",
+            "M = 32,768",
+            "ATT-4",
+            "E_VALUE",
+            base,
+            {"attribute[quats].levels": _spec.QUAT_LEVELS_MAX + 1},
+        ),
+        patched("lattice_levels", "levels for the means", "ATT-5", "E_RESERVED", base, {"attribute[means].levels": 1}),
+        patched("step_zero", "a step of 0", "ATT-6", "E_VALUE", base, {step: 0.0}),
+        patched("step_negative", "a step below 0", "ATT-6", "E_VALUE", base, {step: -1.0}),
+        patched("step_nan", "a step that is no number", "ATT-6", "E_VALUE", base, {"attribute[sh0].step": _NAN}),
+        patched("step_infinite", "an infinite step", "ATT-6", "E_VALUE", base, {"attribute[scales].step": _INF}),
+        patched("step_subnormal", "a subnormal step", "ATT-6", "E_VALUE", base, {step: 2.0**-1023}),
+        patched("level_step", "a step for opacities", "ATT-7", "E_RESERVED", base, {f"{opacities}.step": 1.0}),
+        patched(
+            "level_step_minus_zero",
+            "a step of −0 for quats",
+            "ATT-7",
+            "E_RESERVED",
+            base,
+            {"attribute[quats].step": -0.0},
+        ),
+        patched(
+            "chroma_shift_17",
+            "chroma shift of 17",
+            "ATT-8",
+            "E_VALUE",
+            rich(),
+            {"attribute[sh0].chroma_shift": _spec.CHROMA_SHIFT_MAX + 1},
+        ),
+        patched(
+            "chroma_shift_of_rgb",
+            "a chroma shift for R, G, B",
+            "ATT-9",
+            "E_VALUE",
+            base,
+            {"attribute[sh0].chroma_shift": 1},
+        ),
+        patched(
+            "chroma_shift_of_scales",
+            "a chroma shift for scales",
+            "ATT-9",
+            "E_VALUE",
+            base,
+            {"attribute[scales].chroma_shift": 1},
+        ),
+    ]

@@ -1,0 +1,162 @@
+"""Invalid files: records of codebooks and extra columns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from csplat import _spec
+from csplat_conformance.broken import patched, rich, whole
+from csplat_conformance.builder import build
+from csplat_conformance.samples import (
+    Recipe,
+    scene,
+)
+from csplat_conformance.scene import Extra
+
+__all__ = ["record_recipes"]
+
+
+def record_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_codebooks_and_extras()]
+
+
+def _codebooks_and_extras() -> list[Recipe]:
+    base = rich()
+    two = scene(tiles=[], extras=())
+    doubled = replace(two, extras=(_extra("same"), _extra("same")))
+    long = "n" * _spec.EXTRA_NAME_MAX
+    named = build(replace(two, extras=(_extra(long),)))
+    return [
+        patched(
+            "codebook_ids_equal", "two codebooks of one id", "CBR-1", "E_INDEX", base, {"codebook[7].codebook_id": 2}
+        ),
+        patched(
+            "codebook_ids_descending", "ids that descend", "CBR-1", "E_INDEX", base, {"codebook[7].codebook_id": 1}
+        ),
+        patched(
+            "codebook_kind_unknown",
+            "a codebook kind beyond the registry",
+            "RES-2",
+            "E_UNSUPPORTED",
+            base,
+            {"codebook[2].kind": 7},
+        ),
+        patched("codebook_band_0", "band 0 of an SH codebook", "CBR-2", "E_VALUE", base, {"codebook[7].band_first": 0}),
+        patched(
+            "codebook_bands_swapped",
+            "first band above the last",
+            "CBR-2",
+            "E_VALUE",
+            base,
+            {"codebook[7].band_last": 0},
+            at="codebook[7].band_first",
+        ),
+        patched(
+            "codebook_band_above_degree",
+            "band 3 in a scene of degree 2",
+            "CBR-2",
+            "E_VALUE",
+            base,
+            {"codebook[7].band_last": 3},
+            at="codebook[7].band_first",
+        ),
+        patched(
+            "codebook_bands_of_shape",
+            "bands for the kind SHAPE",
+            "CBR-2",
+            "E_VALUE",
+            base,
+            {"codebook[2].band_first": 1},
+        ),
+        patched("codebook_no_stage", "no stage", "CBR-3", "E_VALUE", base, {"codebook[2].stage_count": 0}),
+        patched(
+            "codebook_five_stages",
+            "five stages",
+            "CBR-3",
+            "E_VALUE",
+            base,
+            {"codebook[2].stage_count": _spec.STAGES_MAX + 1},
+        ),
+        patched(
+            "codebook_size_zero",
+            "a stage without entries",
+            "CBR-4",
+            "E_VALUE",
+            base,
+            {"codebook[2].sizes": (0, 0, 0, 0)},
+        ),
+        patched(
+            "codebook_size_65537",
+            "a stage of 65,537 entries",
+            "CBR-4",
+            "E_VALUE",
+            base,
+            {"codebook[2].sizes": (_spec.CODEBOOK_ENTRIES_MAX + 1, 0, 0, 0)},
+        ),
+        patched(
+            "codebook_size_beyond",
+            "a size behind the last stage",
+            "CBR-4",
+            "E_VALUE",
+            base,
+            {"codebook[2].sizes": (3, 0, 1, 0)},
+            within=8,
+        ),
+        patched(
+            "extra_dtype_unknown",
+            "a column type beyond the registry",
+            "RES-2",
+            "E_UNSUPPORTED",
+            base,
+            {"extra[0].dtype": 9},
+        ),
+        patched("extra_name_empty", "a name of no bytes", "EXR-1", "E_VALUE", base, {"extra[0].name_size": 0}),
+        patched(
+            "extra_name_63",
+            "a name of 63 bytes",
+            "EXR-1",
+            "E_VALUE",
+            named,
+            {"extra[0].name_size": _spec.EXTRA_NAME_MAX + 1},
+        ),
+        patched(
+            "extra_name_latin",
+            "a name that is not UTF-8",
+            "EXR-2",
+            "E_VALUE",
+            base,
+            {"extra[0].name": b"lab\xe9l".ljust(62, b"\0")},
+            within=3,
+        ),
+        patched(
+            "extra_name_control",
+            "a line feed in the name",
+            "EXR-2",
+            "E_VALUE",
+            base,
+            {"extra[0].name": b"la\nel".ljust(62, b"\0")},
+        ),
+        patched(
+            "extra_name_delete",
+            "U+007F in the name",
+            "EXR-2",
+            "E_VALUE",
+            base,
+            {"extra[0].name": b"lab\x7fl".ljust(62, b"\0")},
+        ),
+        whole("extra_names_equal", "two columns of one name", "EXR-2", "E_VALUE", doubled, "extra[1].name"),
+        patched(
+            "extra_name_padding",
+            "a byte behind the name is not 0",
+            "EXR-3",
+            "E_RESERVED",
+            base,
+            {"extra[0].name": b"label\0x".ljust(62, b"\0")},
+            within=5,
+        ),
+    ]
+
+
+def _extra(name: str) -> Extra:
+    return Extra(name, _spec.EXTRA_DTYPE_U8)

@@ -1,0 +1,176 @@
+"""Valid files: transforms, coders and codebooks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+from csplat import _spec
+from csplat_conformance.builder import build
+from csplat_conformance.samples import (
+    OPACITIES,
+    QUATS,
+    SCALES,
+    SH0,
+    Recipe,
+    book,
+    coded,
+    integers,
+    levels,
+    offset,
+    rows_of,
+    scene,
+    signed,
+    tile,
+)
+from csplat_conformance.scene import Attribute, Block, Codebook, Scene, Stream
+
+__all__ = ["valid_stream_recipes"]
+
+_DELTA, _ZIGZAG, _PLANES, _RUNS = (
+    _spec.TRANSFORM_DELTA,
+    _spec.TRANSFORM_ZIGZAG,
+    _spec.TRANSFORM_BYTE_PLANES,
+    _spec.TRANSFORM_RUN_LENGTH,
+)
+_ARCHIVE = _spec.PROFILE_ARCHIVE
+# zstandard.ZstdCompressor(3).compress(bytes(range(40)) * 3): a compressed block with a match
+_ZSTD_COMPRESSED = bytes.fromhex(
+    "28b52ffd20788501008402000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526270100e885aa32"
+)
+_KINDS = {
+    "opacities": (_spec.CODEBOOK_KIND_OPACITIES, OPACITIES, 1),
+    "scales": (_spec.CODEBOOK_KIND_SCALES, SCALES, 3),
+    "quats": (_spec.CODEBOOK_KIND_QUATS, QUATS, 3),
+    "sh0": (_spec.CODEBOOK_KIND_SH0, SH0, 3),
+}
+
+
+def valid_stream_recipes() -> list[Recipe]:
+    """Return the recipes of this module."""
+    return [*_streams(), *_codebooks()]
+
+
+def _streams() -> list[Recipe]:
+    base = scene(1, [tile(4, 6, 1)])
+    wide = coded(replace(base), lambda _: Stream(2))
+    result = []
+    every = (_DELTA, _ZIGZAG, _PLANES, _RUNS)
+    for chosen in [c for k in range(5) for c in combinations(every, k)]:
+        name = "_".join(_spec.TRANSFORM_NAMES[t] for t in chosen) or "none"
+        made = coded(wide, lambda how, chosen=chosen: replace(how, transforms=chosen))  # type: ignore[misc]  # a bound default
+        result.append(
+            _recipe(f"transforms_{name}", "every stream of the file, two bytes wide", "STR-3 STR-4 STR-5 TRF-1", made)
+        )
+    for name in ("deflate_stored", "deflate_fixed", "deflate_dynamic"):
+        made = coded(base, lambda how, name=name: replace(how, coder=name))  # type: ignore[misc]  # a bound default
+        result.append(_recipe(f"coder_{name}", "each block type of RFC 1951", "COD-2 COD-4", made))
+    made = coded(wide, lambda how: replace(how, transforms=(_PLANES, _RUNS), coder="deflate_dynamic"))
+    result.append(_recipe("run_length_deflate", "runs of byte planes, then DEFLATE", "COD-2 STR-5 TRF-1", made))
+    raw = replace(coded(base, lambda how: replace(how, coder="zstd_raw")), profile=_ARCHIVE)
+    result.append(_recipe("coder_zstd_raw", "profile archive, frames of raw blocks", "COD-3 STR-7", raw))
+    same = replace(_changed({OPACITIES: levels([7] * 40, Stream(coder="zstd_rle"))}, 40), profile=_ARCHIVE)
+    result.append(_recipe("coder_zstd_rle", "a frame of one repeated byte", "COD-3", same))
+    pattern = bytes(range(40)) * 3
+    how = Stream(coder="zstd", coded=_ZSTD_COMPRESSED)
+    packed = [list(pattern[3 * i : 3 * i + 3]) for i in range(40)]
+    columns = [[pattern[i], pattern[40 + i], pattern[80 + i]] for i in range(len(packed))]
+    zstd = replace(_changed({SH0: offset(columns, how, offsets=(0, 0, 0))}, 40), profile=_ARCHIVE)
+    result.append(_recipe("coder_zstd_compressed", "a compressed block with sequences", "COD-3", zstd))
+    result.append(
+        _recipe("profile_archive_base_coders", "archive without Zstandard", "HDR-4", replace(base, profile=_ARCHIVE))
+    )
+    return result
+
+
+def _codebooks() -> list[Recipe]:
+    result = []
+    for name, (kind, attribute, columns) in _KINDS.items():
+        low = 0 if attribute == OPACITIES else -60
+        made = Codebook(1, kind, ({0: rows_of(4, 3, columns, low, 60)},))
+        one = tile(3, 4, 0, {attribute: book(1, ((2, 0, 1, 0),))})
+        result.append(
+            _recipe(
+                f"codebook_{name}", "one stage, no escapes", "CBK-1 CBK-2 CBK-6", scene(tiles=[one], codebooks=(made,))
+            )
+        )
+        one_escape = levels([200]) if attribute == OPACITIES else signed(rows_of(2, 1, columns, -70, 70))
+        escaped = tile(3, 4, 0, {attribute: book(1, ((2, 0, 3, 0),), one_escape)})
+        result.append(
+            _recipe(
+                f"codebook_{name}_escape",
+                "the third splat is escaped",
+                "CBK-3 CBK-5",
+                scene(tiles=[escaped], codebooks=(made,)),
+            )
+        )
+    result += _shapes()
+    for first, last in ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (1, 3)):
+        stages = ({band: rows_of(band, 3, 3 * (2 * band + 1), -99, 99) for band in range(first, last + 1)},)
+        made = Codebook(900, _spec.CODEBOOK_KIND_SH, stages, (first, last), Stream(1, (_DELTA, _ZIGZAG)))
+        changes = {SH0 + first: book(900, ((0, 2, 1, 1),))} | {SH0 + b: book(900) for b in range(first + 1, last + 1)}
+        others = {
+            SH0 + b: signed(rows_of(b, 4, 3 * (2 * b + 1), -9, 9))
+            for b in range(1, 4)
+            if b not in range(first, last + 1)
+        }
+        whole = scene(3, [tile(3, 4, 0, dict(sorted((changes | others).items())))], codebooks=(made,))
+        result.append(
+            _recipe(
+                f"codebook_sh_{first}_{last}", "bands in chunks of their own, one index", "DIR-5 CBR-2 CBK-4", whole
+            )
+        )
+    for count in (2, 3, 4):
+        made = Codebook(3, _spec.CODEBOOK_KIND_SH0, tuple({0: rows_of(k, 2 + k, 3, -99, 99)} for k in range(count)))
+        indices = tuple(tuple(integers(k, 5, 0, 1 + k)) for k in range(count))
+        whole = scene(tiles=[tile(3, 5, 0, {SH0: book(3, indices)})], codebooks=(made,))
+        result.append(
+            _recipe(f"codebook_stages_{count}", "residual stages of different sizes add up", "CBR-3 CBR-4 CBK-2", whole)
+        )
+    return result
+
+
+def _shapes() -> list[Recipe]:
+    shape = Codebook(5, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(1, 3, 6, -40, 40)},))
+    plain = tile(3, 4, 0, {SCALES: book(5, ((2, 0, 1, 0),), summands=(-9, 4, 0, 7)), QUATS: book(5)})
+    escapes = tile(
+        3,
+        4,
+        0,
+        {
+            SCALES: book(
+                5, ((3, 0, 1, 3),), offset(rows_of(8, 2, 3, -30, 30)), summands=(0, 4, -300, 0), offsets=(-300,)
+            ),
+            QUATS: book(5, (), signed(rows_of(9, 2, 3, -60, 60))),
+        },
+    )
+    escapes = replace(escapes, blocks=escapes.blocks | {SCALES: replace(escapes.blocks[SCALES], how=Stream(2))})
+    half = tile(3, 4, 0, {SCALES: book(5, ((2, 0, 1, 0),), summands=(-9, 4, 0, 7))})
+    return [
+        _recipe(
+            "codebook_shape",
+            "a common summand of the log scales",
+            "CBK-1 CBK-4",
+            scene(tiles=[plain], codebooks=(shape,)),
+        ),
+        _recipe(
+            "codebook_shape_escape",
+            "escapes in both blocks",
+            "CBK-3 CBK-4 CBK-5",
+            scene(tiles=[escapes], codebooks=(shape,)),
+        ),
+        _recipe(
+            "codebook_shape_scales_only", "rotations coded apart", "CBK-1", scene(tiles=[half], codebooks=(shape,))
+        ),
+    ]
+
+
+def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
+    return Recipe(f"valid/{name}", why, tuple(clauses.split()), lambda: build(made).data, made)
+
+
+def _changed(changes: dict[int, Block], n: int = 5, degree: int = 0, **records: Attribute) -> Scene:
+    one = tile(2, n, degree, changes)
+    made = scene(degree, [one])
+    names = {_spec.ATTRIBUTE_NAMES[a]: a for a in made.attributes}
+    return replace(made, attributes=made.attributes | {names[name]: record for name, record in records.items()})

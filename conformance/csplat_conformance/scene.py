@@ -1,0 +1,239 @@
+"""A scene as a vector declares it: every number that the file will hold, and how each stream is coded.
+
+Nothing is derived that a vector may want to get wrong; `builder` turns a scene into bytes, `reference`
+into the arrays that a decoder must return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from csplat import _spec
+
+__all__ = [
+    "PAIRS",
+    "PLAIN",
+    "Attribute",
+    "Block",
+    "Chunk",
+    "Codebook",
+    "Extra",
+    "Rows",
+    "Scene",
+    "StatedErrors",
+    "Stream",
+    "Tile",
+    "attribute_named",
+    "band_of",
+    "transpose",
+]
+
+#: n rows of C integers.
+Rows = Sequence[Sequence[int]]
+
+_LAYER_0 = tuple(a for a, layer in _spec.ATTRIBUTE_LAYER.items() if layer == _spec.LAYER_GEOMETRY)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """How a stream is coded.
+
+    Attributes:
+        width: bytes of an element.
+        transforms: registry values, as they stand in the file.
+        coder: `stored`, `deflate_stored`, `deflate_fixed`, `deflate_dynamic`, `zstd_raw` or `zstd_rle`.
+        packed: bytes between transforms and coder, in place of the true ones.
+        coded: bytes after the coder, in place of the true ones.
+    """
+
+    width: int = 1
+    transforms: tuple[int, ...] = ()
+    coder: str = "stored"
+    packed: bytes | None = None
+    coded: bytes | None = None
+
+
+#: One byte per element, stored; two bytes per element, stored.
+PLAIN, PAIRS = Stream(), Stream(2)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One attribute in one layer of one tile, as one coding holds it.
+
+    Attributes:
+        coding: registry value.
+        rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW.
+        how: coding of the stream of these.
+        exponent: of OFFSET and SIGNED.
+        offsets: of OFFSET, one per column; for SHAPE's summand one.
+        bits: per axis, of MORTON.
+        codebook: id, of CODEBOOK.
+        indices: for each stage n indices; empty in a block that is not the first of its codebook.
+        index_how: coding of each stage's indices.
+        summands: n common summands, of kind SHAPE in the block of the scales.
+        escape: the block of the escaped splats.
+        tail: bytes after the block.
+    """
+
+    coding: int
+    rows: Rows = ()
+    how: Stream = PLAIN
+    exponent: int = 0
+    offsets: tuple[int, ...] = ()
+    bits: int = 0
+    codebook: int = 0
+    indices: tuple[tuple[int, ...], ...] = ()
+    index_how: tuple[Stream, ...] = ()
+    summands: tuple[int, ...] = ()
+    escape: Block | None = None
+    tail: bytes = b""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile. Attributes that `blocks` lacks are left out; corner and extent are those of the means' rows.
+
+    Attributes:
+        blocks: attribute (registry value) to block.
+        corner: lattice integers.
+        exponent: of the means.
+        extras: blocks RAW, one per extra column.
+        tables: ids, or None for those that the blocks use.
+        order: attributes of layer 0 as their blocks follow one another.
+        tails: layer to bytes after the last block.
+    """
+
+    blocks: dict[int, Block]
+    corner: tuple[int, int, int] = (0, 0, 0)
+    exponent: int = 0
+    extras: tuple[Block, ...] = ()
+    tables: tuple[int, ...] | None = None
+    order: tuple[int, ...] = _LAYER_0
+    tails: tuple[tuple[int, bytes], ...] = ()
+
+    @property
+    def splat_count(self) -> int:
+        """Number of splats: the rows of the means."""
+        return len(self.blocks[_spec.ATTRIBUTE_MEANS].rows)
+
+    @property
+    def layers(self) -> list[int]:
+        """Layers that the tile holds, ascending."""
+        layers = {_spec.ATTRIBUTE_LAYER[attribute] for attribute in self.blocks}
+        return sorted(layers | ({_spec.LAYER_EXTRA} if self.extras else set()))
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """An attribute record (spec 4.3.1)."""
+
+    mapping: int
+    step: float = 0.0
+    levels: int = 0
+    chroma_shift: int = 0
+
+
+@dataclass(frozen=True)
+class Codebook:
+    """A codebook: for each stage and layer the entries as rows.
+
+    Attributes:
+        id: of the record.
+        kind: registry value.
+        stages: for each stage a map from layer to rows [size, C].
+        bands: first and last SH band; zeros for other kinds.
+        how: coding of the entries, the same for all streams.
+        tail: bytes after the last stream of each chunk.
+    """
+
+    id: int
+    kind: int
+    stages: tuple[Mapping[int, Rows], ...]
+    bands: tuple[int, int] = (0, 0)
+    how: Stream = PAIRS
+    tail: bytes = b""
+
+    @property
+    def layers(self) -> list[int]:
+        """Layers of its CODB chunks."""
+        return list(self.stages[0])
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra column's record."""
+
+    name: str
+    dtype: int
+
+
+@dataclass(frozen=True)
+class StatedErrors:
+    """The payload of a SERR chunk; records are (measure, max, rms)."""
+
+    source_count: int
+    pruned_count: int = 0
+    source_sh_degree: int = 0
+    flags: int = 0
+    records: tuple[tuple[int, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk of the whole file: a JSON text, stated errors or any payload."""
+
+    type: bytes
+    text: bytes | None = None
+    how: Stream = PLAIN
+    errors: StatedErrors | None = None
+    payload: bytes = b""
+    flags: int | None = None
+    id: int = 0
+    layer: int = 0
+    tail: bytes = b""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All of a file.
+
+    Attributes:
+        attributes: registry value to record, in the order of the file.
+        order: names of the chunks as they follow one another; None for the order that the spec recommends.
+        directory: names in the order of the directory; None for the order of the chunks.
+        gap: bytes between the index and the first chunk.
+        trailing: bytes after the end.
+    """
+
+    attributes: dict[int, Attribute]
+    tiles: tuple[Tile, ...] = ()
+    codebooks: tuple[Codebook, ...] = ()
+    extras: tuple[Extra, ...] = ()
+    chunks: tuple[Chunk, ...] = ()
+    profile: int = _spec.PROFILE_BASE
+    sh_degree: int = 0
+    scene_flags: int = 0
+    axes: tuple[int, int, int] = (0, 0, 0)
+    unit_metres: float = 0.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    order: tuple[str, ...] | None = None
+    directory: tuple[str, ...] | None = None
+    gap: bytes = b""
+    trailing: bytes = b""
+
+
+def attribute_named(name: str) -> int:
+    """Return the registry value of an attribute."""
+    return next(value for value, known in _spec.ATTRIBUTE_NAMES.items() if known == name)
+
+
+def band_of(attribute: int) -> int:
+    """Return the SH band of an attribute; 0 for those of layer 0."""
+    return _spec.ATTRIBUTE_LAYER[attribute]
+
+
+def transpose(rows: Rows) -> list[int]:
+    """Return rows in columns: all of column 0, then all of column 1."""
+    return [value for column in zip(*rows, strict=True) for value in column]

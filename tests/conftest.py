@@ -1,0 +1,49 @@
+"""What several test files need."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from csplat.model import SplatModel, normalise_quats
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of shared scenes, which are never part of the project."""
+    path = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"shared scenes are absent ({path}); CSPLAT_DATA names their folder")
+    return path
+
+
+@pytest.fixture(scope="session")
+def sample_path() -> Path:
+    """The sample PLY that ships with the project."""
+    return ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
+
+
+@pytest.fixture
+def make_model():
+    """A function that makes a small random model: `make_model(count, degree, **fields)`."""
+
+    def make(count: int = 10, degree: int = 3, seed: int = 0, **fields: object) -> SplatModel:
+        rng = np.random.default_rng(seed)
+
+        def normal(*shape: int) -> np.ndarray:
+            return rng.standard_normal((count, *shape)).astype(np.float32)
+
+        arrays = {
+            "means": normal(3),
+            "quats": normalise_quats(normal(4)),
+            "scales": normal(3) - 4,
+            "opacities": rng.random(count).astype(np.float32),
+            "sh0": normal(3),
+            "shN": normal((degree + 1) ** 2 - 1, 3),
+        }
+        return SplatModel(**{**arrays, **fields})
+
+    return make

@@ -1,0 +1,70 @@
+#!/usr/bin/env bash
+# Everything that must hold, the quick things first and pytest last. `make test` sets up .venv and
+# calls this. The Python tests run against the built wheel, installed in a place of its own.
+# With CI=true in the environment nothing may be skipped for want of a program.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+DEV=.venv/bin
+WHEEL=.venv-wheel/bin
+
+main() {
+    step "style" "$DEV/ruff" check .
+    step "layout" "$DEV/ruff" format --check .
+    step "types (mypy)" "$DEV/mypy"
+    step "import contracts" "$DEV/lint-imports"
+    step "generated files" "$DEV/python" spec/generate.py --check
+    step "vectors and annexes" "$DEV/python" -m csplat_conformance.recipes --check
+    if have_node; then
+        step "types (pyright)" "$DEV/pyright"
+        step "JavaScript" javascript_tests
+    fi
+    step "wheel" build_and_install_wheel
+    step "conformance of the decoder" "$WHEEL/csplat" conformance decoder
+    step "fuzzing" "$WHEEL/python" tests/fuzz.py --seconds 30
+    step "Python tests" "$WHEEL/pytest" "$@"
+}
+
+step() {
+    printf '\n== %s\n' "$1"
+    shift
+    "$@"
+}
+
+have_node() {
+    command -v node >/dev/null && return 0
+    printf '\n==== SKIPPED: pyright and the JavaScript tests, because node is not installed ====\n'
+    if [ "${CI:-}" = true ]; then
+        echo "CI=true: a skip is a failure" >&2
+        exit 1
+    fi
+    return 1
+}
+
+javascript_tests() {
+    node --input-type=module --eval 'import "./codec/js/spec.mjs"'
+    local files
+    files=$(find codec/js/test -name '*.test.mjs' 2>/dev/null | sort)
+    if [ -z "$files" ]; then
+        echo "the generated constants load; there are no JavaScript tests yet"
+        return
+    fi
+    # shellcheck disable=SC2086  # one word per file; no name holds a space
+    node --test $files
+}
+
+build_and_install_wheel() {
+    rm -rf out/dist
+    "$DEV/python" -m build --wheel --outdir out/dist . >out/build.log 2>&1 || {
+        cat out/build.log
+        return 1
+    }
+    [ -x "$WHEEL/python" ] || "$DEV/python" -m venv .venv-wheel
+    local pip=("$WHEEL/python" -m pip install --quiet --disable-pip-version-check)
+    "${pip[@]}" out/dist/csplat-*.whl pytest hypothesis
+    "${pip[@]}" --force-reinstall --no-deps out/dist/csplat-*.whl
+    "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
+}
+
+mkdir -p out
+main "$@"

@@ -1,0 +1,574 @@
+"""The command line: what it prints where, its statuses, and that it never leaves half a file or a traceback."""
+
+import gzip
+import inspect
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import decode, read_ply, write_ply
+from csplat.encoder import EncodeOptions
+from csplat.model import SplatModel
+from csplat_tools.app import app
+from csplat_tools.commands.encode import encode as encode_command
+
+PROGRAM = [sys.executable, "-m", "csplat_tools"]
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    path = tmp_path / "scene.ply"
+    write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture
+def csplat_file(tmp_path, ply):
+    path = tmp_path / "scene.csplat"
+    call("encode", ply, path, "--source-index", tmp_path / "index.npy", "--quiet")
+    return path
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def call(*words):
+    """Run a command that succeeds; return what it printed as data."""
+    result = invoke(*words)
+    assert result.exit_code == 0, result.stderr
+    return result.stdout
+
+
+def refused(*words, status=1):
+    """Run a command that is refused with one line; return the line."""
+    result = invoke(*words)
+    assert result.exit_code == status, (result.stdout, result.stderr, result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ")
+    return result.stderr
+
+
+def program(*words, **options):
+    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, check=False, **options)
+
+
+# Encode and decode --------------------------------------------------------------------------------
+
+
+def test_encodes_and_decodes(tmp_path, ply):
+    target, back = tmp_path / "out.csplat", tmp_path / "back.ply"
+    result = invoke("encode", ply, target)
+    assert result.exit_code == 0
+    assert result.stdout == ""
+    assert "200 splats" in result.stderr
+    assert "bytes per splat" in result.stderr
+    assert "covariance" in result.stderr
+    assert call("decode", target, back) == ""
+    assert len(read_ply(back)) == 200
+
+
+def test_quiet_says_nothing(tmp_path, ply):
+    result = invoke("encode", ply, tmp_path / "out.csplat", "--quiet")
+    assert (result.stdout, result.stderr) == ("", "")
+
+
+def test_reports_as_json(tmp_path, ply):
+    report = json.loads(call("encode", ply, tmp_path / "out.csplat", "--json", "--preset", "fast"))
+    size = (tmp_path / "out.csplat").stat().st_size
+    assert report["size_bytes"] == size
+    assert report["splats"] == 200
+    assert report["ratio"] == ply.stat().st_size / size
+    assert report["bytes_per_splat"] == size / 200
+    assert {"means", "covariance", "opacities", "sh0", "sh1", "sh2"} == set(report["stated_errors"])
+    assert report["options"]["asked"] == {"preset": "fast"}
+
+
+def test_every_knob_of_the_encoder_is_an_option():
+    assert {field.name for field in fields(EncodeOptions)} <= set(inspect.signature(encode_command).parameters)
+
+
+def test_knobs_reach_the_encoder(tmp_path, ply):
+    words = ("--sh-degree", 1, "--position-bits", 9, "--opacity-levels", 17, "--quat-levels", 33, "--tile-splats", 50)
+    report = json.loads(call("encode", ply, tmp_path / "out.csplat", "--json", *words))
+    asked = report["options"]["asked"]
+    assert asked == {
+        "preset": "balanced",
+        "sh_degree": 1,
+        "position_bits": 9,
+        "opacity_levels": 17,
+        "quat_levels": 33,
+        "tile_splats": 50,
+    }
+    assert report["tiles"] >= 4
+    assert decode((tmp_path / "out.csplat").read_bytes()).sh_degree == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--preset", "slow"),
+        ("--position-bits", "40"),
+        ("--position-bits", "many"),
+        ("--sh-coding", "x"),
+        ("--no-such-option",),
+        ("--json", "-"),
+    ],
+)
+def test_wrong_options_are_usage_errors(tmp_path, ply, words):
+    target = [] if "-" in words else [tmp_path / "out.csplat"]
+    result = invoke("encode", ply, *target, *words)
+    assert result.exit_code == 2
+    assert not (tmp_path / "out.csplat").exists()
+
+
+def test_says_what_the_ply_does_not(tmp_path, ply):
+    facts = ("--axes", "RDF", "--unit-metres", "0.5", "--antialiased", "--licence", "CC0")
+    call("encode", ply, tmp_path / "out.csplat", *facts)
+    model = decode((tmp_path / "out.csplat").read_bytes())
+    assert model.coordinate_system == "RDF"
+    assert model.unit_metres == 0.5
+    assert model.antialiased
+    assert model.metadata["licence"] == "CC0"
+
+
+def test_refuses_axes_that_are_none(tmp_path, ply):
+    assert "coordinate_system" in refused("encode", ply, tmp_path / "out.csplat", "--axes", "RRR", "--quiet")
+
+
+def test_repairs_are_reported_and_strict_refuses_them(tmp_path, make_model):
+    model = make_model(20, 0, extra={"object_id": np.arange(20, dtype=np.int32)})
+    write_ply(tmp_path / "extra.ply", model)
+    result = invoke("encode", tmp_path / "extra.ply", tmp_path / "a.csplat")
+    assert "extra-columns" in result.stderr
+    assert "extra-columns" in refused("encode", tmp_path / "extra.ply", tmp_path / "b.csplat", "--strict", "--quiet")
+    assert not (tmp_path / "b.csplat").exists()
+    call("encode", tmp_path / "extra.ply", tmp_path / "c.csplat", "--strict", "--keep-extra")
+    kept = decode((tmp_path / "c.csplat").read_bytes()).extra["object_id"]
+    assert sorted(kept) == list(range(20))
+
+
+def test_takes_importance_from_a_file(tmp_path, ply):
+    np.save(tmp_path / "weights.npy", np.linspace(0, 1, 200))
+    call("encode", ply, tmp_path / "out.csplat", "--importance", tmp_path / "weights.npy")
+    np.save(tmp_path / "short.npy", np.ones(3))
+    line = refused("encode", ply, tmp_path / "no.csplat", "--importance", tmp_path / "short.npy", "--quiet")
+    assert "importance" in line
+    (tmp_path / "text.npy").write_text("not an array")
+    line = refused("encode", ply, tmp_path / "no.csplat", "--importance", tmp_path / "text.npy", "--quiet")
+    assert "text.npy is not a NumPy array file" in line
+
+
+def test_refuses_pickled_arrays(tmp_path, ply):
+    np.save(tmp_path / "pickled.npy", np.array([{}], dtype=object), allow_pickle=True)
+    refused("encode", ply, tmp_path / "no.csplat", "--importance", tmp_path / "pickled.npy")
+
+
+def test_decodes_fewer_bands(tmp_path, csplat_file):
+    call("decode", csplat_file, tmp_path / "d1.ply", "--sh-degree", 1)
+    call("decode", csplat_file, tmp_path / "d2.ply", "--sh-degree", 3)
+    one, two = read_ply(tmp_path / "d1.ply"), read_ply(tmp_path / "d2.ply")
+    assert (one.sh_degree, two.sh_degree) == (1, 2)
+    np.testing.assert_array_equal(one.shN, two.shN[:, :3])
+
+
+def test_decodes_absolute_positions(tmp_path, make_model):
+    model = make_model(20, 0, origin=(1e7, -2e6, 3.0))
+    write_ply(tmp_path / "geo.ply", model)
+    call("encode", tmp_path / "geo.ply", tmp_path / "geo.csplat")
+    call("decode", tmp_path / "geo.csplat", tmp_path / "abs.ply", "--absolute")
+    call("decode", tmp_path / "geo.csplat", tmp_path / "rel.ply")
+    absolute, relative = read_ply(tmp_path / "abs.ply"), read_ply(tmp_path / "rel.ply")
+    assert absolute.origin == relative.origin == model.origin
+    np.testing.assert_array_equal(absolute.means, relative.means)
+    assert b"property double x" in (tmp_path / "abs.ply").read_bytes()
+
+
+def test_refuses_more_splats_than_allowed(tmp_path, csplat_file):
+    assert "E_LIMIT" in refused("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 199)
+    call("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 200)
+
+
+def test_an_empty_scene_goes_there_and_back(tmp_path, make_model):
+    write_ply(tmp_path / "empty.ply", make_model(0, 1))
+    report = json.loads(call("encode", tmp_path / "empty.ply", tmp_path / "empty.csplat", "--json"))
+    assert report["bytes_per_splat"] is None
+    for words in (("info",), ("info", "--json"), ("verify", "--source", tmp_path / "empty.ply")):
+        call(words[0], tmp_path / "empty.csplat", *words[1:])
+    call("decode", tmp_path / "empty.csplat", tmp_path / "back.ply")
+    assert len(read_ply(tmp_path / "back.ply")) == 0
+
+
+# Files: nothing half-written, nothing replaced ----------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["encode", "decode"])
+def test_replaces_nothing_without_force(tmp_path, ply, csplat_file, command):
+    source = ply if command == "encode" else csplat_file
+    target = tmp_path / "there"
+    target.write_text("precious")
+    assert "--force" in refused(command, source, target)
+    assert target.read_text() == "precious"
+    call(command, source, target, "--force")
+    assert target.read_bytes() != b"precious"
+
+
+def test_refuses_its_own_input_as_output(ply, csplat_file):
+    before = ply.read_bytes()
+    assert "is the input" in refused("encode", ply, ply, "--force")
+    assert ply.read_bytes() == before
+    assert "is the input" in refused("decode", csplat_file, csplat_file, "--force")
+
+
+def test_a_failure_leaves_the_old_file_and_no_other(tmp_path, ply, monkeypatch):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "old.csplat").write_text("precious")
+
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    assert "No space left" in refused("encode", ply, folder / "old.csplat", "--force", "--quiet")
+    assert [path.name for path in folder.iterdir()] == ["old.csplat"]
+    assert (folder / "old.csplat").read_text() == "precious"
+
+
+def test_a_damaged_file_gives_no_ply(tmp_path, csplat_file):
+    data = bytearray(csplat_file.read_bytes())
+    data[-10] ^= 1
+    csplat_file.write_bytes(data)
+    target = tmp_path / "out.ply"
+    assert refused("decode", csplat_file, target).startswith("error: E_CRC at byte ")
+    assert not target.exists()
+    refused("decode", csplat_file, target, "--sh-degree", 0)  # the damage is in band 2
+    assert not target.exists()
+
+
+def test_files_have_the_usual_permissions(csplat_file):
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert csplat_file.stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("encode", "absent.ply", "out.csplat"), "absent.ply: No such file"),
+        (("decode", "absent.csplat", "out.ply"), "absent.csplat: No such file"),
+        (("info", "absent.csplat"), "No such file"),
+        (("verify", "absent.csplat"), "No such file"),
+        (("lint", "absent.ply"), "No such file"),
+        (("info", "."), "Is a directory"),
+        (("encode", "scene.ply", "."), "is a folder"),
+        (("encode", "scene.ply", "no/such/folder/out.csplat"), "No such file"),
+    ],
+)
+def test_what_is_not_there_is_one_line(tmp_path, ply, monkeypatch, words, part):
+    assert ply.name == "scene.ply"
+    monkeypatch.chdir(tmp_path)
+    assert part in refused(*words)
+
+
+# Wrong kinds of files -----------------------------------------------------------------------------
+
+
+def test_a_csplat_is_not_encoded_and_a_ply_not_decoded(tmp_path, ply, csplat_file):
+    renamed = tmp_path / "renamed.ply"
+    renamed.write_bytes(csplat_file.read_bytes())
+    for path in (csplat_file, renamed):
+        assert "csplat decode" in refused("encode", path, tmp_path / "out")
+        assert "csplat decode" in refused("lint", path)
+    for words in (("decode", ply, tmp_path / "out"), ("info", ply), ("verify", ply)):
+        assert "csplat encode" in refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("name", "head"),
+    [
+        ("a.spz", gzip.compress(b"NGSP" + bytes(60))),
+        ("a.splat", bytes(320)),
+        ("a.compressed.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+         b"property uint packed_position\nend_header\n" + bytes(4)),
+    ],
+)  # fmt: skip
+def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
+    path = tmp_path / name
+    path.write_bytes(head)
+    assert "splat-transform" in refused("encode", path, tmp_path / "out.csplat", "--quiet")
+
+
+# Info ---------------------------------------------------------------------------------------------
+
+
+def test_info_accounts_for_every_byte(csplat_file):
+    described = json.loads(call("info", csplat_file, "--json"))
+    size = csplat_file.stat().st_size
+    attributes = sum(one["size_bytes"] for one in described["attributes"].values())
+    assert attributes + sum(described["overhead"].values()) == size == described["size_bytes"]
+    assert list(described["attributes"]) == ["opacities", "scales", "quats", "means", "sh0", "sh1", "sh2"]
+    assert list(described["layers"]) == ["geometry", "sh1", "sh2"]
+    assert described["stated_errors"]["source_splats"] == 200
+    assert described["options"]["asked"]["preset"] == "balanced"
+
+
+def test_info_is_for_people_too(csplat_file):
+    text = call("info", csplat_file)
+    assert "splats       200, SH degree 2" in text
+    assert "bits/splat" in text
+    assert "stated error" in text
+
+
+def test_info_refuses_every_prefix(tmp_path, csplat_file):
+    data = csplat_file.read_bytes()
+    for length in (0, 1, 63, 64, 100, len(data) // 2, len(data) - 1):
+        (tmp_path / "prefix").write_bytes(data[:length])
+        assert "E_TRUNCATED" in refused("info", tmp_path / "prefix")
+    (tmp_path / "longer").write_bytes(data + b"x")
+    assert "E_TRAILING" in refused("info", tmp_path / "longer")
+
+
+# Verify -------------------------------------------------------------------------------------------
+
+
+def test_verifies_integrity(csplat_file):
+    assert "intact" in call("verify", csplat_file)
+    assert json.loads(call("verify", csplat_file, "--json"))["holds"]
+    assert call("verify", csplat_file, "--quiet") == ""
+
+
+def test_a_damaged_file_is_not_verified(csplat_file):
+    data = bytearray(csplat_file.read_bytes())
+    data[len(data) // 2] ^= 0x40
+    csplat_file.write_bytes(data)
+    result = invoke("verify", csplat_file, "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert report["holds"] is False
+    assert report["error"]["code"] == "E_CRC"
+    assert report["error"]["clause"] == "CHK-1"
+
+
+def test_proves_the_stated_errors(tmp_path, ply, csplat_file):
+    with_index = ("--source", ply, "--source-index", tmp_path / "index.npy")
+    assert "the stated errors hold" in call("verify", csplat_file, *with_index)
+    report = json.loads(call("verify", csplat_file, *with_index, "--json"))
+    assert report["proof"]["rms_and_counts_proved"]
+    assert all(one["holds"] for one in report["proof"]["measures"].values())
+    text = call("verify", csplat_file, "--source", ply)
+    assert "the stated maxima hold" in text
+    assert "rms and counts are not proved" in text
+
+
+def test_another_source_does_not_prove_them(tmp_path, ply, csplat_file):
+    model = read_ply(ply)
+    model.means[7] += 1.0
+    model.opacities[9] = 1.0 - model.opacities[9]
+    other = tmp_path / "other.ply"
+    write_ply(other, model)
+    result = invoke("verify", csplat_file, "--source", other)
+    assert result.exit_code == 1
+    assert "2 splats of the file have no splat of the source" in result.stderr
+    result = invoke("verify", csplat_file, "--source", other, "--source-index", tmp_path / "index.npy")
+    assert result.exit_code == 1
+    assert "error: means: max" in result.stderr
+    assert "error: opacities: rms" in result.stderr
+
+
+def test_a_source_of_other_size_is_refused(tmp_path, csplat_file, make_model):
+    write_ply(tmp_path / "other.ply", make_model(201, 2))
+    assert "200 splats" in invoke("verify", csplat_file, "--source", tmp_path / "other.ply").stderr
+
+
+def test_a_wrong_index_is_refused(tmp_path, ply, csplat_file):
+    index = np.load(tmp_path / "index.npy")
+    assert sorted(index) == list(range(200))
+    wrong = tmp_path / "wrong.npy"
+    np.save(wrong, index[:-1])
+    assert "200" in refused("verify", csplat_file, "--source", ply, "--source-index", wrong, "--quiet")
+    np.save(wrong, index.astype(np.float64))
+    refused("verify", csplat_file, "--source", ply, "--source-index", wrong)
+    np.save(wrong, index + 1)
+    refused("verify", csplat_file, "--source", ply, "--source-index", wrong)
+    index[0] = index[1]
+    np.save(wrong, index)
+    result = invoke("verify", csplat_file, "--source", ply, "--source-index", wrong)
+    assert result.exit_code == 1
+    assert "199 splats for 200" in result.stderr
+    assert invoke("verify", csplat_file, "--source-index", wrong).exit_code == 2
+
+
+def test_a_file_with_fewer_bands_proves_them_against_zero(tmp_path, ply):
+    target, index = tmp_path / "d0.csplat", tmp_path / "d0.npy"
+    call("encode", ply, target, "--sh-degree", 0, "--source-index", index)
+    call("verify", target, "--source", ply, "--source-index", index)
+    call("verify", target, "--source", ply)
+
+
+# Lint ---------------------------------------------------------------------------------------------
+
+
+def damaged_ply(path, make_model):
+    model = make_model(50, 1)
+    write_ply(path, model)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start : start + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(data + b"trailing")
+    return path
+
+
+def test_lint_names_defects_with_their_counts(tmp_path, make_model):
+    path = damaged_ply(tmp_path / "bad.ply", make_model)
+    result = invoke("lint", path, "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert {one["id"]: one["count"] for one in report["findings"]} == {"trailing-bytes": 8, "nonfinite-rows": 1}
+    assert not report["clean"]
+    text = invoke("lint", path).stdout
+    assert "trailing-bytes" in text
+    assert "nonfinite-rows" in text
+
+
+def test_lint_writes_a_repaired_file(tmp_path, make_model):
+    path = damaged_ply(tmp_path / "bad.ply", make_model)
+    call("lint", path, "--fix", tmp_path / "good.ply")
+    assert len(read_ply(tmp_path / "good.ply", strict=True)) == 49
+    assert call("lint", tmp_path / "good.ply") == "nothing found\n"
+    assert json.loads(call("lint", tmp_path / "good.ply", "--json"))["clean"]
+
+
+def test_lint_does_not_fix_what_would_be_guesswork(tmp_path, ply):
+    data = ply.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n")
+    ply.write_bytes(data)
+    result = invoke("lint", ply, "--fix", tmp_path / "good.ply")
+    assert result.exit_code == 1
+    assert "missing-columns" in result.stdout
+    assert not (tmp_path / "good.ply").exists()
+
+
+# Conformance, help, version -----------------------------------------------------------------------
+
+
+def test_runs_the_conformance_suite():
+    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/*", "--json").stdout)
+    assert report["failed"] == 0
+    assert report["passed"] == len(report["vectors"]) > 0
+
+
+def test_a_filter_that_finds_nothing_fails():
+    assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
+
+
+@pytest.mark.parametrize("command", ["encode", "decode", "info", "verify", "lint", "conformance"])
+def test_help_gives_an_example(command):
+    text = call(command, "--help")
+    assert "Examples:" in text
+    assert f"csplat {command} " in text
+
+
+def test_version_names_program_and_format():
+    assert call("--version").startswith("csplat 0.1.0, format 0.1")
+
+
+# As a process -------------------------------------------------------------------------------------
+
+
+def test_works_in_pipes(ply):
+    encoded = program("encode", "-", "-", input=ply.read_bytes())
+    assert encoded.returncode == 0, encoded.stderr
+    assert b"200 splats" in encoded.stderr
+    assert len(decode(encoded.stdout)) == 200
+    for words in (("info", "-"), ("verify", "-")):
+        assert program(*words, input=encoded.stdout).returncode == 0
+    back = program("decode", "-", "-", input=encoded.stdout)
+    assert back.returncode == 0
+    assert back.stdout.startswith(b"ply\n")
+    linted = program("lint", "-", "--json", input=back.stdout)
+    assert json.loads(linted.stdout)["clean"]
+    assert b"standard input" in program("encode", "-", "-", input=b"nonsense").stderr
+
+
+def test_a_closed_pipe_is_no_traceback(csplat_file):
+    with subprocess.Popen(
+        [*PROGRAM, "info", str(csplat_file), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        running.stdout.close()  # before it has begun to write
+        assert running.stderr.read() == b""
+        assert running.wait(20) == 1
+
+
+def test_the_same_input_gives_the_same_bytes(ply):
+    first = program("encode", ply, "-", "-q").stdout
+    assert first == program("encode", ply, "-", "-q", "--threads", 1).stdout
+
+
+def test_writes_no_binary_to_a_terminal(ply, csplat_file):
+    for words in (("encode", ply, "-"), ("decode", csplat_file, "-")):
+        main, terminal = pty.openpty()
+        done = subprocess.run(
+            [*PROGRAM, *map(str, words)], stdout=terminal, stderr=subprocess.PIPE, check=False
+        )  # fmt: skip
+        os.close(terminal)
+        os.close(main)
+        assert done.returncode == 1
+        assert b"terminal" in done.stderr
+
+
+def test_bars_are_for_terminals(tmp_path, ply):
+    main, terminal = pty.openpty()
+    done = subprocess.run(
+        [*PROGRAM, "encode", str(ply), str(tmp_path / "out.csplat")],
+        stderr=terminal,
+        stdout=subprocess.PIPE,
+        check=False,
+        env={**os.environ, "TERM": "xterm"},
+    )
+    os.close(terminal)
+    shown = os.read(main, 1 << 16)
+    os.close(main)
+    assert done.returncode == 0
+    assert b"tiles" in shown
+    assert b"\x1b" in shown
+    assert b"\x1b" not in program("encode", ply, tmp_path / "two.csplat").stderr
+
+
+def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
+    target = tmp_path / "out.csplat"
+    with subprocess.Popen(
+        [*PROGRAM, "encode", "-", str(target)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
+        assert running.stdin is not None
+        running.stdin.write(bytes(1 << 20))  # more than a pipe holds: it has begun to read
+        running.send_signal(signal.SIGINT)
+        assert running.wait(20) == 130
+        assert running.stderr is not None
+        assert running.stderr.read() == b"interrupted\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_keeps_its_extremes(tmp_path):
+    count = 4
+    model = SplatModel(
+        means=np.array([[0, 0, 0], [1e30, 0, 0], [1e-30, 0, 0], [0, -1e7, 0]], np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.array([[60] * 3, [-60] * 3, [0] * 3, [-60, 0, 60]], np.float32),
+        opacities=np.array([0, 1, 0.5, 0.25], np.float32),
+        sh0=np.array([[1e6] * 3, [-1e6] * 3, [0] * 3, [1e-6] * 3], np.float32),
+    )
+    write_ply(tmp_path / "extreme.ply", model)
+    call("encode", tmp_path / "extreme.ply", tmp_path / "e.csplat", "--source-index", tmp_path / "e.npy")
+    call("info", tmp_path / "e.csplat", "--json")
+    call("verify", tmp_path / "e.csplat", "--source", tmp_path / "extreme.ply")
+    call("verify", tmp_path / "e.csplat", "--source", tmp_path / "extreme.ply", "--source-index", tmp_path / "e.npy")

@@ -1,0 +1,216 @@
+"""The conformance vectors against our own decoder, and the recipes against the vectors."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+
+import pytest
+
+import csplat
+from csplat.decoder import Limits, iter_tiles
+from csplat_conformance import manifest, runner
+from csplat_conformance.builder import build
+from csplat_conformance.manifest import VECTORS, load, summarise
+from csplat_conformance.repair import repair
+from csplat_conformance.samples import rich_scene
+
+VECTOR_LIST = load()
+VALID = [vector for vector in VECTOR_LIST if not vector.error]
+INVALID = [vector for vector in VECTOR_LIST if vector.error]
+FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def by_name(vectors):
+    return pytest.mark.parametrize("vector", vectors, ids=lambda vector: vector.name)
+
+
+def named(name):
+    return next(vector for vector in VECTOR_LIST if vector.name == name)
+
+
+@by_name(VALID)
+def test_integers_are_those_of_the_manifest(vector):
+    assert vector.expect["integers"] == summarise(csplat.decode_integers(vector.data))
+
+
+@by_name(VALID)
+def test_floats_are_those_of_the_manifest_bit_for_bit(vector):
+    model = csplat.decode(vector.data)
+
+    assert vector.expect["floats"] == summarise({name: getattr(model, name) for name in FLOATS})
+    assert vector.expect["extra"] == summarise(model.extra)
+
+
+@by_name(INVALID)
+def test_refusals_name_code_clause_and_offset_of_the_defect(vector):
+    with pytest.raises(csplat.CsplatError) as caught:
+        csplat.decode(vector.data)
+
+    wanted = vector.error
+    found = (caught.value.code, caught.value.clause, caught.value.offset)
+    assert (wanted["code"], wanted["clause"], wanted["offset"]) == found
+
+
+@by_name(INVALID)
+def test_integers_are_refused_with_the_same_code(vector):
+    with pytest.raises(csplat.CsplatError) as caught:
+        csplat.decode_integers(vector.data)
+
+    assert vector.error["code"] == caught.value.code
+
+
+def test_the_built_in_run_passes_every_vector():
+    results = runner.run_builtin()
+
+    assert len(VECTOR_LIST) == len(results)
+    assert [] == [result for result in results if not result.passed]
+
+
+def test_the_built_in_run_takes_a_pattern():
+    assert {vector.name for vector in VALID if vector.name.startswith("valid/codebook")} == {
+        result.name for result in runner.run_builtin("valid/codebook*")
+    }
+
+
+def test_files_are_those_that_the_manifest_names():
+    found = {
+        path.relative_to(VECTORS).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in VECTORS.rglob("*.csplat")
+    }
+
+    assert {vector.file: vector.sha256 for vector in VECTOR_LIST} == found
+
+
+def test_every_error_code_of_files_has_a_vector():
+    from csplat import _spec
+
+    codes = {vector.error["code"] for vector in INVALID}
+
+    assert set(_spec.ERROR_NAMES) - {_spec.ERROR_INPUT} == codes
+
+
+def test_vectors_and_annexes_are_what_the_recipes_make():
+    command = [sys.executable, "-m", "csplat_conformance.recipes", "--check"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert (0, "") == (run.returncode, run.stderr)
+
+
+def test_vectors_stay_well_below_a_megabyte():
+    assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 900_000
+
+
+def test_repair_leaves_a_valid_file_as_it_is():
+    for vector in VALID:
+        assert vector.data == repair(vector.data)
+
+
+def test_a_file_beyond_the_splat_budget_is_refused_before_its_tiles_are_read():
+    # LIM-1
+    built = build(rich_scene())
+    damaged = built.patched({"TILE.0.0/head.block_count": 0})
+
+    with pytest.raises(csplat.LimitError) as caught:
+        csplat.decode(damaged, limits=Limits(splats=4))
+
+    assert (csplat.LimitError, "E_LIMIT", "LIM-1") == (type(caught.value), caught.value.code, caught.value.clause)
+
+
+def test_a_file_beyond_the_byte_budget_is_refused():
+    # LIM-1
+    data = named("extreme/tile_of_65536").data
+
+    with pytest.raises(csplat.LimitError):
+        csplat.decode(data, limits=Limits(bytes=1_000_000))
+
+
+@by_name(
+    [vector for vector in INVALID if vector.name in ("invalid/digest", "invalid/chunk_crc", "invalid/metadata_crc")]
+)
+def test_every_way_of_decoding_checks_the_whole_file(vector):
+    ways = (
+        lambda data: csplat.decode(data, threads=1),
+        lambda data: csplat.decode(data, threads=2),
+        lambda data: csplat.decode_integers(data, threads=1),
+        lambda data: list(iter_tiles(data)),
+    )
+    for decode in ways:
+        with pytest.raises(csplat.FormatError) as caught:
+            decode(vector.data)
+        assert vector.error["code"] == caught.value.code
+
+
+def test_a_wrong_hash_fails_the_run(monkeypatch):
+    vector = named("valid/quats")
+    digest = vector.expect["floats"]["quats"]
+    wrong = vector.expect | {"floats": vector.expect["floats"] | {"quats": [*digest[:2], "0" * 64]}}
+    monkeypatch.setattr(runner, "load", lambda: [dataclasses.replace(vector, expect=wrong)])
+
+    (result,) = runner.run_builtin()
+
+    assert not result.passed
+    assert "floats.quats" in result.message
+
+
+def test_an_accepted_broken_file_fails_the_run(monkeypatch):
+    vector = named("valid/quats")
+    error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": False}
+    monkeypatch.setattr(runner, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
+
+    (result,) = runner.run_builtin()
+
+    assert (False, "decode_integers accepted it") == (result.passed, result.message)
+
+
+# A decoder for the protocol of `run_command`: ours, in a process of its own, with faults to order.
+OTHER_DECODER = """
+import json, os, sys, time
+import numpy as np
+from pathlib import Path
+from urllib.parse import quote
+import csplat
+from csplat_conformance import runner
+
+fault, source, outdir = sys.argv[1], Path(sys.argv[2]).read_bytes(), Path(sys.argv[3])
+if fault == "crash":
+    os.abort()
+try:
+    found = runner._decoded(source)
+except csplat.CsplatError as error:
+    print(json.dumps({"code": error.code}))
+    sys.exit(1)
+(outdir / "header.json").write_text(json.dumps(found["header"]))
+model = csplat.decode(source)
+arrays = {"floats." + name: getattr(model, name) for name in runner._FLOATS}
+arrays |= {"extra." + quote(name, safe=""): column for name, column in model.extra.items()}
+if fault == "rounding":
+    arrays["floats.means"] = np.nextafter(arrays["floats.means"], np.float32(9))
+for name, array in arrays.items():
+    (outdir / (name + ".bin")).write_bytes(array.tobytes())
+"""
+
+
+@pytest.fixture
+def other_decoder(tmp_path):
+    script = tmp_path / "decoder.py"
+    script.write_text(OTHER_DECODER)
+    return lambda fault: f"{sys.executable} {script} {fault} {{input}} {{outdir}}"
+
+
+@pytest.mark.parametrize("pattern", ["valid/rich", "valid/extras", "invalid/chunk_crc"])
+def test_another_decoder_passes_by_the_protocol(other_decoder, pattern):
+    assert [True] == [result.passed for result in runner.run_command(other_decoder("none"), pattern)]
+
+
+@pytest.mark.parametrize(("fault", "message"), [("rounding", "floats.means"), ("crash", "crash: exit status -6")])
+def test_another_decoder_fails_by_the_protocol(other_decoder, fault, message):
+    (result,) = runner.run_command(other_decoder(fault), "valid/rich")
+
+    assert (False, message) == (result.passed, result.message)
+
+
+def test_a_manifest_entry_round_trips():
+    text = manifest.to_json(VECTOR_LIST)
+
+    assert text == (VECTORS / "manifest.json").read_text(encoding="utf-8")

@@ -1,0 +1,72 @@
+"""Damage that no checksum was repaired for: every prefix and every flipped bit of small files is refused."""
+
+import pytest
+
+import csplat
+from csplat_conformance.builder import build
+from csplat_conformance.manifest import VECTORS
+from csplat_conformance.repair import repair, seal
+from csplat_conformance.samples import rich_scene
+
+SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
+RICH = build(rich_scene()).data
+
+
+@pytest.mark.parametrize("data", [SMALL, RICH], ids=["small", "rich"])
+def test_every_prefix_is_refused_as_truncated(data):
+    # CNF-3
+    for size in range(len(data)):
+        with pytest.raises(csplat.FormatError) as caught:
+            csplat.decode(data[:size])
+        assert "E_TRUNCATED" == caught.value.code
+
+
+def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
+    for size in range(64, len(SMALL)):
+        cut = bytearray(SMALL[:size])
+        cut[20:28] = size.to_bytes(8, "little")
+        with pytest.raises(csplat.CsplatError):
+            csplat.decode(repair(bytes(cut)))
+
+
+@pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 7)], ids=["small", "rich"])
+def test_every_flipped_bit_is_refused(data, stride):
+    # CNF-3; of the larger file every seventh bit, which reaches each place within a byte
+    for bit in range(0, 8 * len(data), stride):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(csplat.CsplatError):
+            csplat.decode(bytes(damaged))
+
+
+def test_every_flipped_bit_behind_the_header_is_refused_by_a_crc_when_the_digest_is_repaired():
+    for bit in range(8 * 64, 8 * len(SMALL)):
+        damaged = bytearray(SMALL)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(csplat.FormatError) as caught:
+            csplat.decode(seal(damaged))
+        assert caught.value.code in ("E_CRC", "E_INDEX")
+
+
+def test_every_flipped_bit_with_all_checksums_repaired_is_refused_or_decoded():
+    for bit in range(8 * len(SMALL)):
+        damaged = bytearray(SMALL)
+        damaged[bit // 8] ^= 1 << bit % 8
+        try:
+            model = csplat.decode(repair(bytes(damaged)))
+        except csplat.CsplatError:
+            continue
+        assert 2 == len(model)
+
+
+@pytest.mark.parametrize("extra", [b"\0", b"\n", SMALL], ids=["zero", "line feed", "itself"])
+def test_trailing_bytes_are_refused(extra):
+    with pytest.raises(csplat.FormatError) as caught:
+        csplat.decode(SMALL + extra)
+
+    assert ("E_TRAILING", len(SMALL)) == (caught.value.code, caught.value.offset)
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_any_buffer_is_decoded(kind):
+    assert 2 == len(csplat.decode(kind(SMALL)))

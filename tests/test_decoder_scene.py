@@ -1,0 +1,256 @@
+"""Whole files and parts of them; the files come from the conformance suite's writer, never from our encoder."""
+
+import mmap
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csplat import SplatModel, _spec
+from csplat.decoder import Limits, decode, decode_integers, decode_scene, iter_tiles, read_header, read_metadata
+from csplat.errors import FormatError, InputError, LimitError, UnsupportedError
+from csplat_conformance.builder import build
+from csplat_conformance.reference import expected
+from csplat_conformance.samples import (
+    attributes,
+    axis,
+    book,
+    coded,
+    means_rows,
+    morton,
+    offset,
+    rich_scene,
+    rows_of,
+    scene,
+    signed,
+    tile,
+)
+from csplat_conformance.scene import Chunk, Codebook, Stream
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+RICH = build(rich_scene()).data
+SH0 = _spec.ATTRIBUTE_SH0
+
+
+def assert_same(one, other, rows=slice(None), coefficients=None):
+    for name in ARRAYS:
+        want = getattr(one, name)[rows]
+        want = want[:, :coefficients] if name == "shN" else want
+        assert want.shape == getattr(other, name).shape, name
+        assert want.tobytes() == getattr(other, name).tobytes(), name
+
+
+def assert_decodes(described):
+    data = build(described).data
+    wanted = expected(described)
+    model, integers = decode(data), decode_integers(data)
+    for name in ARRAYS:
+        assert wanted.floats[name].tobytes() == getattr(model, name).tobytes(), name
+        assert wanted.floats[name].shape == getattr(model, name).shape, name
+    assert set(wanted.integers) == set(integers)
+    for name, array in wanted.integers.items():
+        assert (array.dtype, array.shape) == (integers[name].dtype, integers[name].shape), name
+        assert array.tobytes() == integers[name].tobytes(), name
+    return model
+
+
+def test_a_file_with_everything_gives_what_the_slow_reference_says():
+    assert_decodes(rich_scene())
+
+
+def test_an_empty_scene():
+    model = assert_decodes(scene(3, ()))
+    assert (0, 15, 3) == model.shN.shape
+
+
+@pytest.mark.parametrize("ycocg", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_degree_and_colour_mapping(degree, ycocg):
+    described = scene(degree, (tile(1, 3, degree), tile(2, 5, degree)))
+    assert_decodes(replace(described, attributes=attributes(degree, ycocg=ycocg, chroma_shift=3 * ycocg)))
+
+
+@pytest.mark.parametrize("stages", [1, 2, 4])
+@pytest.mark.parametrize("escaped", [False, True])
+def test_one_codebook_for_all_bands(stages, escaped):
+    entries = tuple(
+        {band: rows_of(9 * stage + band, 5, 3 * (2 * band + 1), -60, 60) for band in (1, 2, 3)}
+        for stage in range(stages)
+    )
+    indices = ((0, 5 if escaped else 4, 3, 1), *(((2, 0, 1, 4),) * (stages - 1)))
+    escapes = {
+        1: signed(rows_of(1, 1, 9, -900, 900), Stream(2)),
+        2: offset(rows_of(2, 1, 15, -9, 9)),
+        3: signed(rows_of(3, 1, 21, -9, 9)),
+    }
+    blocks = {
+        SH0 + band: book(4, indices if band == 1 else (), escapes[band] if escaped else None) for band in (1, 2, 3)
+    }
+    described = scene(3, (tile(1, 4, 0, blocks), tile(2, 3, 3)))
+    described = replace(
+        described,
+        attributes=attributes(3, ycocg=True, chroma_shift=1),
+        codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 3)),),
+    )
+    assert_decodes(described)
+    full = decode(build(described).data)
+    for degree in (0, 1, 2):
+        assert_same(full, decode(build(described).data, sh_degree=degree), coefficients=(degree + 1) ** 2 - 1)
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_tiles_longer_than_a_run_of_the_decoder(stages):
+    count = 17_000
+    entries = tuple({1: rows_of(stage, 5, 9, -60, 60)} for stage in range(stages))
+    index = [row[0] for row in rows_of(1, count, 1, 0, 5)]
+    escapes = signed(rows_of(2, index.count(5), 9, -900, 900), Stream(2))
+    rest = tuple([value % 5 for value in index] for _ in range(stages - 1))
+    many = tile(3, count, 0, {SH0 + 1: book(4, (tuple(index), *map(tuple, rest)), escapes)})
+    described = replace(scene(1, (many, tile(2, 3, 1))), attributes=attributes(1, ycocg=True))
+    assert_decodes(replace(described, codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),)))
+
+
+@pytest.mark.parametrize("how", [(), (1,), (2,), (1, 2), (1, 2, 3), (4,), (3, 4), (1, 2, 3, 4)])
+@pytest.mark.parametrize("coder", ["stored", "deflate_fixed", "deflate_dynamic"])
+def test_every_transform_and_coder(how, coder):
+    described = scene(1, (tile(1, 6, 1),))
+    assert_decodes(coded(described, lambda stream: replace(stream, transforms=how, coder=coder)))
+
+
+@pytest.mark.parametrize("width", [2, 3, 7])
+def test_morton_of_any_width(width):
+    rows = means_rows(1, 9, 31)
+    assert_decodes(scene(0, (tile(1, 9, 0, {_spec.ATTRIBUTE_MEANS: morton(rows, 5, Stream(width))}),)))
+
+
+def test_corners_and_axes_at_their_largest():
+    rows = [[0, 0, 0], [2**24 - 1, 5, 2**24 - 1]]
+    corner = (2**53 - 2**24 + 1, -(2**53), 0)
+    assert_decodes(scene(0, (tile(1, 2, 0, {_spec.ATTRIBUTE_MEANS: axis(rows, Stream(3))}, corner=corner),)))
+
+
+def test_zstd_is_read_in_the_archive_profile_only():
+    described = coded(scene(0), lambda stream: replace(stream, coder="zstd_raw"))
+    assert_decodes(replace(described, profile=_spec.PROFILE_ARCHIVE))
+    with pytest.raises(UnsupportedError, match="STR-7"):
+        decode(build(described).data)
+
+
+def test_the_model_passes_its_own_constructor():
+    model = decode(RICH)
+    SplatModel(**vars(model))
+    assert {"title": "rich"} == model.metadata
+    assert [5, 0, 65535, 1, 2] == model.extra["label"].tolist()
+    assert np.dtype("<u2") == model.extra["label"].dtype
+
+
+def test_any_buffer_will_do(tmp_path):
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(RICH)
+    full = decode(RICH)
+    with path.open("rb") as file:
+        for data in (bytearray(RICH), memoryview(RICH), mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)):
+            assert_same(full, decode(data))
+    for data in ("text", 5, None, memoryview(RICH)[::2]):
+        with pytest.raises(InputError):
+            decode(data)
+
+
+@pytest.mark.parametrize("tiles", [[0], [1], [1, 0], []])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_parts_equal_the_same_parts_of_the_whole(tiles, degree):
+    full, header = decode(RICH), read_header(RICH)
+    rows = [i for t in tiles for i in range(header.tiles[t].start, header.tiles[t].start + header.tiles[t].splat_count)]
+    part = decode(RICH, tiles=tiles, sh_degree=degree)
+    assert_same(full, part, np.array(rows, int), (min(degree, 2) + 1) ** 2 - 1)
+    assert full.extra["label"][rows].tolist() == part.extra["label"].tolist()
+    everything, integers = decode_integers(RICH), decode_integers(RICH, tiles=tiles, sh_degree=degree)
+    for name in ("opacities", "scales", "quats", "means", "sh0"):
+        assert everything[name][rows].tolist() == integers[name].tolist()
+    assert everything["exponents"][tiles, : integers["exponents"].shape[1]].tolist() == integers["exponents"].tolist()
+
+
+def test_tiles_one_by_one():
+    full = decode(RICH)
+    found = list(iter_tiles(RICH))
+    assert [0, 1] == [one.tile.index for one in found]
+    for one in found:
+        start, count = one.tile.start, one.tile.splat_count
+        assert_same(full, one, slice(start, start + count))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7])
+def test_threads_change_nothing(threads):
+    assert_same(decode(RICH), decode(RICH, threads=threads))
+
+
+def test_a_whole_decode_says_which_checks_it_made():
+    assert "digest" in decode_scene(RICH).checks
+    assert "digest" not in decode_scene(RICH, tiles=[0]).checks
+    assert 0.25 == decode_scene(RICH).stated_errors.records[0].rms
+
+
+def test_a_wrong_digest_spares_parts_only():
+    data = bytearray(RICH)
+    data[40] ^= 1
+    with pytest.raises(FormatError, match="HDR-8"):
+        decode(data)
+    with pytest.raises(FormatError, match="HDR-8"):
+        next(iter_tiles(data))
+    decode(data, sh_degree=1)
+
+
+def test_the_header_needs_no_more_than_the_index():
+    header = read_header(RICH)
+    assert header == read_header(RICH[: _spec.HEADER_SIZE + header.index_size])
+    with pytest.raises(FormatError, match="E_TRUNCATED"):
+        read_header(RICH[: _spec.HEADER_SIZE + header.index_size - 1])
+
+
+def test_an_unknown_chunk_is_skipped_and_its_crc_checked():
+    built = build(scene(0, chunks=(Chunk(b"zzzz", payload=b"anything", flags=0),)))
+    assert read_metadata(built.data) is None
+    decode(built.data)
+    offset_, size = next(span for name, span in built.spans.items() if "zzzz" in name)
+    data = bytearray(built.data)
+    data[offset_ + size - 6] ^= 1
+    with pytest.raises(FormatError, match=r"E_CRC at byte \d+ \(CHK-1\)"):
+        decode(data)
+    decode(data, tiles=[0])
+
+
+@pytest.mark.parametrize(
+    ("limits", "name"),
+    [(Limits(splats=4), "splats"), (Limits(bytes=5 * (14 + 24) * 4), "bytes"), (Limits(json_bytes=15), "json_bytes")],
+)
+def test_limits(limits, name):
+    with pytest.raises(LimitError, match="E_LIMIT at byte") as caught:
+        decode(RICH, limits=limits)
+    assert name == caught.value.limit
+    decode(RICH, limits=Limits(splats=5, json_bytes=16))
+
+
+def test_limits_bind_the_chosen_tiles_and_tiles_one_by_one():
+    assert 2 == len(decode(RICH, limits=Limits(splats=2), tiles=[1]))
+    assert 2 == len(list(iter_tiles(RICH, limits=Limits(splats=0))))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 4}, {"sh_degree": -1}, {"threads": 0}]
+)
+def test_arguments_at_fault(arguments):
+    with pytest.raises(InputError):
+        decode(RICH, **arguments)
+
+
+def test_codebooks_that_no_tile_names_are_checked_and_counted():
+    entries = ({1: rows_of(1, 40, 9, -60, 60)},)
+    described = replace(scene(1), codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),))
+    built = build(described)
+    assert 2 == len(decode(built.data))
+    with pytest.raises(LimitError):
+        decode(built.data, limits=Limits(bytes=2000))
+    decode(built.data, limits=Limits(bytes=2000), tiles=[0])
+    name = next(name for name in built.fields if name.startswith("CODB") and name.endswith("count"))
+    with pytest.raises(FormatError):
+        decode(built.patched({name: 7}))

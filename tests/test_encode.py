@@ -1,0 +1,290 @@
+"""What goes in comes back within the errors that the file states; or it is refused."""
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import csplat
+from csplat import SplatModel
+from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
+from csplat.encoder.measure import measure_errors
+from csplat.errors import CsplatError, InputError
+
+PRESET_NAMES = tuple(PRESETS)
+
+
+def round_trip(model: SplatModel, **options: object):
+    """Encode, decode, and check the stated errors against the measured ones."""
+    result = encode_with_report(model, EncodeOptions(**options))
+    decoded = csplat.decode(result.data)
+    assert len(model) == len(decoded)
+    assert sorted(result.source_index.tolist()) == list(range(len(model)))
+    measured = measure_errors(model, decoded, result.source_index)
+    for name, (largest, rms) in measured.items():
+        stated_largest, stated_rms = result.report.errors[name]
+        assert largest <= stated_largest, name
+        assert rms <= stated_rms, name
+    return decoded, result
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_comes_back_within_stated_errors(make_model, preset, degree):
+    decoded, _ = round_trip(make_model(500, degree), preset=preset)
+    assert degree >= decoded.sh_degree
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 99, 100, 101, 300])
+def test_any_count_comes_back(make_model, count):
+    round_trip(make_model(count, 1), tile_splats=100)
+
+
+@pytest.mark.parametrize("coding", ["codebook", "scalar", "none"])
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_every_sh_coding_comes_back(make_model, coding, degree):
+    decoded, result = round_trip(make_model(400, degree), sh_coding=coding, tile_splats=150)
+    assert (0 if coding == "none" else degree) == decoded.sh_degree
+    assert coding == result.report.options["sh_coding"]
+
+
+@pytest.mark.parametrize("stages", [1, 2, 4])
+@pytest.mark.parametrize("escapes", [0.0, 0.1, 1.0])
+def test_codebooks_with_stages_and_escapes_come_back(make_model, stages, escapes):
+    round_trip(
+        make_model(300, 2), sh_coding="codebook", codebook_size=16, codebook_stages=stages, escape_fraction=escapes
+    )
+
+
+@pytest.mark.parametrize("profile", ["base", "archive"])
+@pytest.mark.parametrize("means_coding", ["morton", "axis"])
+@pytest.mark.parametrize("deflate", ["libdeflate", "zlib"])
+def test_codings_change_bytes_but_not_what_is_decoded(make_model, profile, means_coding, deflate):
+    model = make_model(300, 1)
+    decoded, result = round_trip(model, profile=profile, means_coding=means_coding, deflate=deflate)
+    reference, other = round_trip(model)
+    np.testing.assert_array_equal(
+        decoded.means[np.argsort(result.source_index)], reference.means[np.argsort(other.source_index)]
+    )
+
+
+def test_what_a_ply_forgets_comes_back(make_model):
+    model = make_model(
+        20,
+        1,
+        origin=(4.5e6, -1e7, 12.25),
+        coordinate_system="RDF",
+        unit_metres=0.5,
+        antialiased=True,
+        flat=True,
+        cameras=[{"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4}],
+        metadata={"title": "Übung", "comments": ["one"]},
+        extra={"id": np.arange(20, dtype=np.int32), "weight": np.linspace(0, 1, 20)},
+    )
+    decoded, result = round_trip(model, keep_extra=True)
+    for name in ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "cameras", "metadata"):
+        assert getattr(model, name) == getattr(decoded, name), name
+    for name, column in model.extra.items():
+        np.testing.assert_array_equal(column[result.source_index], decoded.extra[name])
+        assert column.dtype == decoded.extra[name].dtype
+
+
+def test_extra_columns_stay_behind_unless_asked_for(make_model):
+    model = make_model(20, 0, extra={"id": np.arange(20, dtype=np.int32)})
+    assert {} == dict(round_trip(model)[0].extra)
+
+
+def test_absent_bands_cost_nothing(make_model):
+    model = make_model(3000, 1)
+    silent = replace(model, shN=np.zeros((3000, 15, 3), np.float32))
+    plain = replace(model, shN=np.zeros((3000, 0, 3), np.float32))
+    assert len(encode(silent)) - len(encode(plain)) < 200
+
+
+def test_sh_degree_cuts_bands_and_states_what_that_costs(make_model):
+    model = make_model(200, 3)
+    decoded, result = round_trip(model, sh_degree=1)
+    assert 1 == decoded.sh_degree
+    assert float(np.abs(model.shN[:, 8:]).max()) == pytest.approx(result.report.errors["sh3"][0], rel=1e-4)
+
+
+@pytest.mark.parametrize("bits", [4, 10, 16])
+def test_means_in_bits_err_by_less_than_a_step_of_the_box(make_model, bits):
+    model = make_model(1000, 0)
+    decoded, result = round_trip(model, position_bits=bits)
+    extent = float(np.ptp(model.means, axis=0).max())
+    error = np.abs(decoded.means - model.means[result.source_index]).max()
+    assert float(error) <= extent * 2.0**-bits + np.spacing(np.abs(model.means).max())
+
+
+@pytest.mark.parametrize("magnitude", [1e-30, 1e-10, 1.0, 1e7, 1e30])
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_coordinates_of_any_magnitude(make_model, magnitude, preset):
+    model = make_model(300, 0)
+    round_trip(replace(model, means=(model.means * magnitude).astype(np.float32)), preset=preset)
+
+
+def test_a_scene_far_from_zero_keeps_what_float32_has(make_model):
+    model = make_model(300, 0)
+    far = replace(model, means=(model.means * 50 + np.float32(1e7)).astype(np.float32))
+    decoded, result = round_trip(far, position_bits=16)
+    assert float(np.abs(decoded.means - far.means[result.source_index]).max()) <= np.spacing(np.float32(1e7))
+
+
+def test_an_origin_keeps_a_far_scene_as_accurate_as_one_at_zero(make_model):
+    model = make_model(300, 0)
+    near, _ = round_trip(model)
+    far, _ = round_trip(replace(model, origin=(1e7, -1e7, 1e7)))
+    np.testing.assert_array_equal(near.means, far.means)
+
+
+def test_all_splats_in_one_point(make_model):
+    model = make_model(100, 0)
+    same = replace(model, means=np.full((100, 3), 3.14159, np.float32))
+    decoded, _ = round_trip(same, position_bits=16)
+    np.testing.assert_allclose(decoded.means, same.means, atol=float(np.spacing(np.float32(3.14159))))
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_extreme_values_come_back(make_model, preset):
+    model = make_model(64, 3)
+    scales = model.scales.copy()
+    scales[:8], scales[8:16] = 60, -60
+    opacities = model.opacities.copy()
+    opacities[:16], opacities[16:32] = 0, 1
+    sh_rest = model.shN.copy()
+    sh_rest[3], sh_rest[4] = 1e6, -1e6
+    sh0 = model.sh0.copy()
+    sh0[5] = [1e6, -1e6, 0]
+    extreme = replace(model, scales=scales, opacities=opacities, shN=sh_rest, sh0=sh0)
+    decoded, result = round_trip(extreme, preset=preset)
+    back = decoded.opacities[np.argsort(result.source_index)]
+    np.testing.assert_array_equal(back[:16], 0)
+    np.testing.assert_array_equal(back[16:32], 1)
+
+
+def test_an_outlier_harms_nobody(make_model):
+    model = make_model(3000, 0)
+    alone, first = round_trip(model)
+    outlier = np.concatenate([model.means, [[1000.0, 0, 0]]]).astype(np.float32)
+    rows = np.append(np.arange(3000), 0)
+    decoded, second = round_trip(replace(model.select(rows), means=outlier))
+    before = np.abs(alone.means - model.means[first.source_index]).max()
+    core = second.source_index < 3000
+    assert float(np.abs(decoded.means - outlier[second.source_index])[core].max()) <= float(before) * 1.0001
+
+
+floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+magnitudes = st.sampled_from([1e-38, 1e-30, 1e-7, 1e-3, 1.0, 1e3, 1e7, 1e20, 1e30, 1e38])
+
+
+@st.composite
+def wild_models(draw):
+    """Splats whose magnitudes differ as much as float32 lets them."""
+    count = draw(st.integers(0, 12))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+
+    def wild(*shape: int) -> np.ndarray:
+        chosen = np.array(draw(st.lists(magnitudes, min_size=1, max_size=3)))
+        values = rng.standard_normal((count, *shape)) * rng.choice(chosen, (count,) + (1,) * len(shape))
+        return np.clip(values, -3e38, 3e38).astype(np.float32)
+
+    return SplatModel(
+        means=wild(3),
+        quats=csplat.model.normalise_quats(wild(4)),
+        scales=np.clip(wild(3), -60, 60),
+        opacities=rng.random(count).astype(np.float32),
+        sh0=wild(3),
+        shN=wild((draw(st.integers(1, 4))) ** 2 - 1, 3),
+    )
+
+
+@given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
+    with suppress(InputError):
+        round_trip(model, preset=preset, sh_coding=coding)
+
+
+@pytest.mark.parametrize("coding", ["scalar", "codebook"])
+def test_bytes_do_not_depend_on_threads(make_model, coding):
+    model = make_model(2000, 2)
+    options = {"sh_coding": coding, "tile_splats": 500, "codebook_size": 64}
+    one, two, four = (encode(model, EncodeOptions(threads=n, **options)) for n in (1, 2, 4))
+    assert one == two == four
+
+
+def test_bytes_do_not_depend_on_blas_threads():
+    code = (
+        "import hashlib, numpy as np, csplat.model; r = np.random.default_rng(0);"
+        "f = lambda *s: r.standard_normal((3000, *s)).astype('f4');"
+        "q = csplat.model.normalise_quats(f(4));"
+        "m = csplat.SplatModel(means=f(3), quats=q, scales=f(3), opacities=r.random(3000).astype('f4'), sh0=f(3),"
+        " shN=f(15, 3));"
+        "o = csplat.EncodeOptions(sh_coding='codebook', codebook_size=128);"
+        "print(hashlib.sha256(csplat.encode(m, o)).hexdigest())"
+    )
+    digests = set()
+    for threads in ("1", "2"):
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        digests.add(done.stdout)
+    assert 1 == len(digests)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("preset", "tiny"), ("position_bits", 17), ("sh_degree", 4), ("quat_levels", 2), ("effort", 0), ("scale_step", 0)],
+)
+def test_refuses_options_out_of_range(name, value):
+    with pytest.raises(InputError, match=name):
+        EncodeOptions(**{name: value})
+
+
+@pytest.mark.parametrize("bad", [np.ones(3), -np.ones(10), np.full(10, np.nan)])
+def test_refuses_an_importance_that_does_not_fit(make_model, bad):
+    with pytest.raises(InputError, match="importance"):
+        encode_with_report(make_model(10, 1), importance=bad)
+
+
+def test_refuses_metadata_that_is_not_json(make_model):
+    with pytest.raises(InputError, match="JSON"):
+        encode(make_model(3, 0, metadata={"title": {1, 2}}))
+
+
+def test_importance_decides_who_is_coded_finely(make_model):
+    model = make_model(2000, 3)
+    importance = np.where(np.arange(2000) < 200, 1.0, 1e-6)
+    options = EncodeOptions(preset="small")
+    result = encode_with_report(model, options, importance=importance)
+    decoded = csplat.decode(result.data)
+    error = ((decoded.shN - model.shN[result.source_index]) ** 2).sum(axis=(1, 2))
+    favoured = result.source_index < 200
+    assert float(error[favoured].mean()) < 0.5 * float(error[~favoured].mean())
+
+
+def test_options_stand_in_the_file(make_model):
+    result = encode_with_report(make_model(10, 1), EncodeOptions(preset="small", seed=7))
+    assert {"preset": "small", "seed": 7} == result.report.options["asked"]
+    assert json.dumps(result.report.options, sort_keys=True)
+
+
+def test_progress_names_its_stages_and_ends_at_one(make_model):
+    seen: dict[str, float] = {}
+    encode_with_report(
+        make_model(500, 2),
+        EncodeOptions(sh_coding="codebook", tile_splats=100),
+        progress=seen.__setitem__,
+    )
+    assert {"codebook": 1.0, "tiles": 1.0} == seen
+
+
+def test_errors_are_ours():
+    assert issubclass(InputError, CsplatError)

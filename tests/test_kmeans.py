@@ -1,0 +1,331 @@
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from csplat.encoder import nearest
+from csplat.encoder.kmeans import (
+    assign,
+    cluster,
+    cluster_residual,
+    distortion,
+    rank_by_frequency,
+)
+from csplat.encoder.nearest import search
+from csplat.errors import InputError
+
+
+def blobs(count=3000, width=9, centres=40, spread=3.0, seed=0):
+    rng = np.random.default_rng(seed)
+    middle = rng.integers(-90, 91, (centres, width))
+    noise = rng.normal(0, spread, (count, width))
+    points = np.rint(middle[rng.integers(0, centres, count)] + noise).astype(np.int16)
+    return points, rng.random(count).astype(np.float32)
+
+
+def ones(points):
+    return np.ones(len(points), np.float32)
+
+
+def squared_distances(points, entries):
+    difference = points[:, None].astype(np.int64) - entries[None].astype(np.int64)
+    return (difference**2).sum(2)
+
+
+# Nearest entries.
+
+
+@pytest.mark.parametrize("entry_count", [1, 2, 300, nearest._COLUMNS + 3])
+def test_assign_finds_the_first_nearest_entry(entry_count):
+    rng = np.random.default_rng(1)
+    points = rng.integers(-3, 4, (600, 4)).astype(np.int16)  # many equal distances
+    entries = rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)
+    expected = squared_distances(points, entries)
+    index, error = search(points, entries)
+    assert index.dtype == np.uint32
+    np.testing.assert_array_equal(expected.argmin(1), index)
+    np.testing.assert_array_equal(expected.min(1), error)
+
+
+def test_search_is_exact_just_below_the_bound():
+    rng = np.random.default_rng(2)
+    points = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
+    entries = points[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)
+    assert nearest._shift(points, entries) == 0
+    expected = squared_distances(points, entries)
+    index, error = search(points, entries)
+    np.testing.assert_array_equal(expected.argmin(1), index)
+    np.testing.assert_array_equal(expected.min(1), error)
+
+
+@pytest.mark.parametrize("largest", [4000, 2**20, 2**31 - 1])
+def test_shift_keeps_every_partial_sum_below_the_bound(largest):
+    points = np.full((2, 45), largest, np.int32)
+    points[1] = -largest - 1
+    shift = nearest._shift(points, points)
+    small = nearest._shifted(points, shift)
+    norm = float((small**2).sum(1).max())
+    assert shift > 0
+    assert norm * 1.5 < nearest._EXACT
+    assert nearest._shifted(points, shift - 1).max() ** 2 * 45 * 1.5 > nearest._EXACT / 4
+
+
+@pytest.mark.parametrize("entry_count", [2, 300, nearest._COLUMNS + 3])
+def test_search_for_another_entry_skips_the_own_one(entry_count):
+    points = np.random.default_rng(6).integers(-9, 10, (entry_count, 4)).astype(np.int32)
+    points[-1] = points[0]
+    expected = squared_distances(points, points)
+    np.fill_diagonal(expected, 10**6)
+    index, error = search(points, points, other=True)
+    np.testing.assert_array_equal(expected.argmin(1), index)
+    np.testing.assert_array_equal(expected.min(1), error)
+
+
+def test_large_points_are_assigned_to_nearly_nearest_entries():
+    rng = np.random.default_rng(3)
+    points = rng.integers(-30000, 30000, (800, 5)).astype(np.int16)
+    entries = rng.integers(-30000, 30000, (50, 5)).astype(np.int32)
+    exact = squared_distances(points, entries)
+    found = exact[np.arange(800), assign(points, entries)]
+    assert np.sqrt(found).max() > 10000
+    assert np.all(np.sqrt(found) <= np.sqrt(exact.min(1)) + 60 * np.sqrt(5))
+
+
+def test_searching_near_groups_loses_less_than_two_per_cent():
+    points, _ = blobs(4000, 12, 900, 8.0)
+    entries = points[:1024].astype(np.int32)
+    exact, near = search(points, entries), search(points, entries, near_groups=8)
+    assert np.all(near[1] >= exact[1])
+    assert near[1].sum() <= 1.02 * exact[1].sum()
+    found = squared_distances(points[:500], entries)[np.arange(500), near[0][:500]]
+    np.testing.assert_array_equal(found, near[1][:500])
+
+
+def test_searching_all_groups_is_the_full_search():
+    points, _ = blobs()
+    entries = points[:100].astype(np.int32)
+    np.testing.assert_array_equal(search(points, entries)[1], search(points, entries, near_groups=10)[1])
+
+
+def test_assign_gives_no_index_for_no_points():
+    assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
+
+
+# Clusters.
+
+
+def check_clusters(points, entries, index, size):
+    assert entries.dtype == np.int32
+    assert index.dtype == np.uint32
+    assert len(index) == len(points)
+    assert len(entries) <= size
+    assert len(np.unique(entries, axis=0)) == len(entries)
+    np.testing.assert_array_equal(np.arange(len(entries)), np.unique(index))
+
+
+@pytest.mark.parametrize("near_groups", [0, 5])
+@pytest.mark.parametrize("dtype", [np.int16, np.int32])
+def test_clusters_are_distinct_used_and_close(dtype, near_groups):
+    points, weights = blobs()
+    points = points.astype(dtype)
+    entries, index = cluster(points, weights, 40, seed=0, iterations=6, near_groups=near_groups)
+    check_clusters(points, entries, index, 40)
+    assert len(entries) == 40
+    assert distortion(points, weights, entries, index) < 2.0 * 9 * 3.0**2
+
+
+def test_more_iterations_and_entries_lower_the_distortion():
+    points, weights = blobs(spread=30.0)
+
+    def run(size, iterations):
+        found = cluster(points, weights, size, seed=0, iterations=iterations)
+        return distortion(points, weights, *found)
+
+    assert run(64, 10) < run(64, 0)
+    assert run(256, 4) < 0.9 * run(64, 4)
+
+
+def test_first_entries_beat_uniform_ones():
+    points, _ = blobs(6000, 9, 200, 2.0)
+    points[:4000] = points[0] + np.random.default_rng(4).integers(-2, 3, (4000, 9))
+    uniform = points[np.random.default_rng(5).choice(6000, 200, replace=False)].astype(np.int32)
+    entries, index = cluster(points, ones(points), 200, seed=0, iterations=0)
+    found = distortion(points, ones(points), entries, index)
+    assert found < 0.5 * distortion(points, ones(points), uniform, assign(points, uniform))
+
+
+def test_heavy_points_keep_their_values():
+    points, _ = blobs(5000, 6, 500, 20.0)
+    weights = np.full(5000, 1e-12, np.float32)
+    heavy = np.arange(0, 5000, 250)
+    weights[heavy] = 1e6
+    entries, index = cluster(points, weights, 64, seed=0, iterations=4, sample_per_entry=8)
+    check_clusters(points, entries, index, 64)
+    np.testing.assert_array_equal(points[heavy], entries[index[heavy]])
+
+
+def test_weights_matter_by_ratio_only():
+    points, weights = blobs()
+    first = cluster(points, weights, 30, seed=0, iterations=3)
+    second = cluster(points, weights * np.float32(2**-40), 30, seed=0, iterations=3)
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+
+
+def test_weights_of_zero_alone_mean_equal_weights():
+    points, _ = blobs()
+    first = cluster(points, ones(points), 30, seed=0, iterations=3)
+    second = cluster(points, 0 * ones(points), 30, seed=0, iterations=3)
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+
+
+@pytest.mark.parametrize("positive", [0, 1, 5, 20])
+def test_few_positive_weights_leave_no_unused_entry(positive):
+    points, _ = blobs(500)
+    weights = np.zeros(500, np.float32)
+    weights[:positive] = 2.0
+    entries, index = cluster(points, weights, 16, seed=0, iterations=3, sample_per_entry=2)
+    check_clusters(points, entries, index, 16)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 16])
+def test_fewer_points_than_entries_are_kept_exactly(count):
+    points = blobs(16)[0][:count]
+    entries, index = cluster(points, ones(points), 16, seed=0, iterations=3)
+    check_clusters(points, entries, index, 16)
+    np.testing.assert_array_equal(points, entries[index])
+
+
+@pytest.mark.parametrize("value_count", [1, 2, 10])
+@pytest.mark.parametrize("near_groups", [0, 2])
+def test_fewer_values_than_entries_are_kept_exactly(value_count, near_groups):
+    values = blobs(value_count, 5)[0]
+    points = values[np.arange(900) % value_count]
+    entries, index = cluster(points, ones(points), 32, seed=0, iterations=3, near_groups=near_groups)
+    check_clusters(points, entries, index, 32)
+    assert len(entries) == value_count
+    np.testing.assert_array_equal(points, entries[index])
+
+
+def test_points_beyond_the_exact_norm_are_clustered_on_a_coarser_lattice():
+    points, weights = blobs(2000, 9, 30, 2.0)
+    large = points.astype(np.int32) * 1000
+    entries, index = cluster(large, weights, 30, seed=0, iterations=5)
+    check_clusters(large, entries, index, 30)
+    assert distortion(large, weights, entries, index) < 2.0 * 9 * 2000.0**2
+
+
+def test_progress_counts_to_the_end():
+    points, weights = blobs(500)
+    calls = []
+    cluster(points, weights, 8, seed=0, iterations=3, progress=lambda done, of: calls.append((done, of)))
+    assert [(i, 5) for i in range(1, 6)] == calls
+
+
+def test_rejects_what_is_out_of_range():
+    points, weights = blobs(50)
+    for bad in (weights[:-1], -weights, weights * np.inf, weights * np.nan):
+        with pytest.raises(InputError, match="weights"):
+            cluster(points, bad, 8, seed=0, iterations=1)
+    for bad in (points.astype(np.float32), points[0], points[:, :0]):
+        with pytest.raises(InputError, match="points"):
+            cluster(bad, weights, 8, seed=0, iterations=1)
+    with pytest.raises(InputError, match="size"):
+        cluster(points, weights, 0, seed=0, iterations=1)
+    with pytest.raises(InputError, match="no entries"):
+        assign(points, np.empty((0, 9), np.int32))
+    with pytest.raises(InputError, match="entries"):
+        assign(points, np.empty((4, 8), np.int32))
+    with pytest.raises(InputError, match="no points"):
+        distortion(points[:0], weights[:0], np.zeros((1, 9), np.int32), np.zeros(0, np.uint32))
+    with pytest.raises(InputError, match="2\\*\\*30"):
+        cluster_residual(np.full((9, 2), 2**30, np.int32), ones(points)[:9], (1, 1), seed=0)
+
+
+# Residual stages, ranks.
+
+
+def test_residual_stages_add_up():
+    points, weights = blobs(spread=20.0)
+    stages = cluster_residual(points, weights, (32, 32), seed=0, iterations=4)
+    rest = points.astype(np.int32)
+    errors = []
+    for entries, index in stages:
+        check_clusters(points, entries, index, 32)
+        errors.append(distortion(rest, weights, entries, index))
+        rest = rest - entries[index]
+    one = cluster(points, weights, 32, seed=0, iterations=4)
+    np.testing.assert_array_equal(one[0], stages[0][0])
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_ranks_follow_frequency_and_keep_the_order_of_equals():
+    index = np.array([3, 3, 1, 0, 1, 2, 3], np.uint32)
+    entries = np.array([[10], [11], [12], [13], [14]], np.int32)
+    ranked, ordered = rank_by_frequency(index, entries)
+    assert [0, 0, 1, 2, 1, 3, 0] == ranked.tolist()
+    assert [13, 11, 10, 12, 14] == ordered.ravel().tolist()
+    assert ranked.dtype == np.uint32
+    np.testing.assert_array_equal(entries[index], ordered[ranked])
+
+
+# The same bytes at any thread count.
+
+
+def digest(threads=None):
+    """SHA-256 over clusters of two kinds of search; also run by the subprocesses below."""
+    points, weights = blobs(9000, 45, 300, 12.0)
+    state = hashlib.sha256()
+    for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
+        found = cluster_residual(
+            points.astype(np.int32) * scale,
+            weights,
+            (200, 50),
+            seed=7,
+            iterations=3,
+            near_groups=near_groups,
+            threads=threads,
+        )
+        for entries, index in found:
+            state.update(entries.tobytes() + index.tobytes())
+    return state.hexdigest()
+
+
+def test_our_threads_do_not_change_the_bytes():
+    assert digest(1) == digest(2) == digest(5)
+
+
+@pytest.mark.parametrize("control", [True, False])
+def test_blas_threads_do_not_change_the_bytes(control):
+    program = (
+        "import runpy, sys; from csplat.encoder import nearest\n"
+        f"if not {control}: nearest._openblas = lambda: None\n"
+        f"print(runpy.run_path({__file__!r})['digest']())"
+    )
+    found = set()
+    for threads in ("1", "2"):
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        run = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=300,
+        )
+        found.add(run.stdout)
+    assert {digest() + "\n"} == found
+
+
+def test_blas_keeps_its_own_thread_count():
+    control = nearest._openblas()
+    if control is None:
+        pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
+    before = control[0]()
+    with nearest._one_blas_thread():
+        assert control[0]() == 1
+    assert control[0]() == before

@@ -1,0 +1,148 @@
+import time
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat.model import SplatModel, normalise_quats
+
+
+def test_defaults_fill_what_is_not_given(make_model):
+    model = make_model(4, 0)
+    bare = SplatModel(
+        means=model.means,
+        quats=model.quats,
+        scales=model.scales,
+        opacities=model.opacities,
+        sh0=model.sh0,
+    )
+    assert (4, 0, 3) == bare.shN.shape
+    assert (0.0, 0.0, 0.0) == bare.origin
+    assert "unspecified" == bare.coordinate_system
+    assert (None, None) == (bare.unit_metres, bare.cameras)
+    assert (False, False) == (bare.antialiased, bare.flat)
+    assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_sh_degree_follows_from_the_shape(make_model, degree):
+    assert degree == make_model(5, degree).sh_degree
+
+
+def test_length_is_the_number_of_splats(make_model):
+    assert 7 == len(make_model(7))
+    assert 0 == len(make_model(0))
+
+
+def test_repr_is_short(make_model):
+    assert "SplatModel(7 splats, sh_degree=2)" == repr(make_model(7, 2))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("means", np.zeros((10, 2), np.float32), r"means has shape \[10, 2\]"),
+        ("means", np.float32(1), "means is a float32, wanted a float32 array"),
+        ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], wanted \[10, 4\]"),
+        ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], wanted \[10, 3\]"),
+        ("opacities", np.zeros((10, 1), np.float32), "opacities has shape"),
+        ("sh0", np.zeros((10, 3)), "sh0 is float64, wanted float32"),
+        ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, wanted float32"),
+        ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, wanted 0, 3, 8"),
+        ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
+        ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
+        ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
+        ("opacities", np.full(10, -0.1, np.float32), "not logits"),
+        ("quats", np.zeros((10, 4), np.float32), "10 rows that are not unit length"),
+        ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not unit length"),
+        ("origin", (1.0, 2.0), "wanted three numbers"),
+        ("origin", (1.0, 2.0, float("nan")), "wanted finite numbers"),
+        ("coordinate_system", "XYZ", "coordinate_system is 'XYZ'"),
+        ("coordinate_system", "RLU", "coordinate_system is 'RLU'"),
+        ("coordinate_system", "RDFF", "coordinate_system is 'RDFF'"),
+        ("unit_metres", 0.0, "unit_metres is 0.0"),
+        ("unit_metres", float("inf"), "unit_metres is inf"),
+        ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
+        ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
+    ],
+)
+def test_refuses_what_is_no_model(make_model, field, value, message):
+    with pytest.raises(InputError, match=message):
+        make_model(10, **{field: value})
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_refuses_values_that_are_not_finite(make_model, field, value):
+    array = getattr(make_model(), field).copy()
+    array.flat[-1] = value
+    with pytest.raises(InputError, match=f"{field} holds 1 values that are NaN or infinite"):
+        make_model(**{field: array})
+
+
+def test_accepts_finite_values_whose_sum_overflows(make_model):
+    means = np.full((10, 3), 3e38, np.float32)
+    assert np.array_equal(make_model(means=means).means, means)
+
+
+def test_accepts_alpha_of_exactly_0_and_1(make_model):
+    assert 2 == len(make_model(2, opacities=np.array([0, 1], np.float32)))
+
+
+@pytest.mark.parametrize("letters", ["RDF", "RUB", "LUF", "FRU", "BLD"])
+def test_accepts_coordinate_systems_of_three_directions(make_model, letters):
+    assert letters == make_model(coordinate_system=letters).coordinate_system
+
+
+def test_origin_may_be_any_three_numbers(make_model):
+    assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
+
+
+def test_a_model_does_not_copy_its_arrays(make_model):
+    model = make_model()
+    again = make_model(means=model.means)
+    assert again.means is model.means
+
+
+@pytest.mark.parametrize("index", [slice(2, 5), np.array([4, 1, 1]), np.arange(10) % 3 == 0, slice(0, 0)])
+def test_select_keeps_rows_of_every_array(make_model, index):
+    model = make_model(10, extra={"id": np.arange(10)}, origin=(1.0, 2.0, 3.0), coordinate_system="RDF")
+    part = model.select(index)
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(part, name), getattr(model, name)[index])
+    assert np.array_equal(part.extra["id"], model.extra["id"][index])
+    assert (model.origin, model.coordinate_system) == (part.origin, part.coordinate_system)
+
+
+def test_normalised_quats_are_unit_and_stay_so():
+    rng = np.random.default_rng(1)
+    quats = (rng.standard_normal((10_000, 4)) * rng.choice([1e-30, 1, 1e30], (10_000, 1))).astype(np.float32)
+    once = normalise_quats(quats)
+    length = np.sqrt(np.sum(once.astype(np.float64) ** 2, 1))
+    assert np.abs(length - 1).max() < 2**-23
+    assert np.array_equal(normalise_quats(once), once)
+
+
+def test_zero_huge_and_denormal_quats_are_normalised():
+    quats = np.array([[0, 0, 0, 0], [3e38, 0, 3e38, 0], [0, 1e-45, 0, 0], [0, 0, 0, -2]], np.float32)
+    half = np.float32(np.sqrt(0.5))
+    expected = [[1, 0, 0, 0], [half, 0, half, 0], [0, 1, 0, 0], [0, 0, 0, -1]]
+    assert np.array_equal(normalise_quats(quats), np.array(expected, np.float32))
+
+
+def test_checking_a_million_splats_takes_a_fraction_of_a_second():
+    count = 1_000_000
+    fields = {
+        "means": np.ones((count, 3), np.float32),
+        "quats": np.full((count, 4), 0.5, np.float32),
+        "scales": np.ones((count, 3), np.float32),
+        "opacities": np.ones(count, np.float32),
+        "sh0": np.ones((count, 3), np.float32),
+        "shN": np.ones((count, 15, 3), np.float32),
+    }
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        SplatModel(**fields)
+        times.append(time.process_time() - start)
+    assert min(times) < 0.15

@@ -1,0 +1,271 @@
+"""What `verify` and `info` are made of: errors of pairs, partners without an index, the walk through the blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csplat.decoder import decode_scene, read_header
+from csplat.encoder import EncodeOptions, encode, encode_with_report
+from csplat.encoder.measure import measure_errors
+from csplat.errors import CsplatError, InputError
+from csplat.model import normalise_quats
+from csplat_tools.match import UNDECIDED, UNMATCHED, match
+from csplat_tools.pairs import differences, measure_pairs
+from csplat_tools.proof import prove
+from csplat_tools.reading import describe_file
+
+
+def moved(model, rng, sigma=1e-3):
+    """The same scene, each number a little different."""
+    return replace(
+        model,
+        means=model.means + rng.normal(0, sigma, model.means.shape).astype(np.float32),
+        quats=normalise_quats(model.quats + rng.normal(0, sigma, model.quats.shape).astype(np.float32)),
+        scales=model.scales + rng.normal(0, sigma, model.scales.shape).astype(np.float32),
+        opacities=np.clip(model.opacities + np.float32(sigma), 0, 1),
+        sh0=model.sh0 + rng.normal(0, sigma, model.sh0.shape).astype(np.float32),
+        shN=model.shN + rng.normal(0, sigma, model.shN.shape).astype(np.float32),
+    )
+
+
+def covariance(quat, scales):
+    """A slow twin, from the definition."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return rotation @ np.diag(np.exp(2 * scales)) @ rotation.T
+
+
+# Errors of pairs ----------------------------------------------------------------------------------
+
+
+def test_covariance_errors_are_those_of_the_definition(make_model):
+    source = make_model(60, 0)
+    decoded = moved(source, np.random.default_rng(1), 0.1)
+    rows = np.arange(60)
+    found = differences(source, decoded, rows, rows)["covariance"][:, 0]
+    for row in rows:
+        theirs = covariance(source.quats[row].astype(float), source.scales[row].astype(float))
+        ours = covariance(decoded.quats[row].astype(float), decoded.scales[row].astype(float))
+        assert found[row] == pytest.approx(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs), rel=1e-9)
+
+
+def test_no_log_scale_is_too_large(make_model):
+    source = make_model(3, 0, scales=np.array([[60, 60, 60], [-60, -60, -60], [60, -60, 0]], np.float32))
+    decoded = replace(source, scales=source.scales + np.float32(0.0078125))
+    found = differences(source, decoded, np.arange(3), np.arange(3))["covariance"]
+    np.testing.assert_allclose(found, np.expm1(2 * 0.0078125), rtol=1e-12)
+
+
+def test_what_leaves_float64_is_infinite(make_model):
+    source = make_model(1, 0, scales=np.full((1, 3), -1e6, np.float32))
+    decoded = replace(source, scales=np.full((1, 3), 1e6, np.float32))
+    assert measure_pairs(source, decoded, np.zeros(1, int))["covariance"] == (np.inf, np.inf)
+
+
+def test_equal_descriptions_of_one_rotation_have_no_error(make_model):
+    source = make_model(50, 0)
+    decoded = replace(source, quats=-source.quats)
+    assert measure_pairs(source, decoded, np.arange(50))["covariance"][0] < 1e-15
+
+
+def test_agrees_with_what_the_encoder_measures(make_model):
+    source = make_model(9000, 3)
+    rng = np.random.default_rng(2)
+    index = rng.permutation(9000)[:8500]
+    decoded = moved(source.select(index), rng)
+    ours, theirs = measure_pairs(source, decoded, index), measure_errors(source, decoded, index)
+    assert set(ours) == set(theirs)
+    for name, pair in ours.items():
+        assert pair == pytest.approx(theirs[name], rel=1e-5), name
+
+
+def test_does_not_depend_on_threads(make_model):
+    source = make_model(20000, 1)
+    decoded = moved(source, np.random.default_rng(3))
+    index = np.arange(20000)
+    assert measure_pairs(source, decoded, index, threads=1) == measure_pairs(source, decoded, index, threads=3)
+
+
+def test_bands_that_one_model_lacks_are_zero_there(make_model):
+    source = make_model(30, 2)
+    decoded = replace(source, shN=np.ascontiguousarray(source.shN[:, :3]))
+    errors = measure_pairs(source, decoded, np.arange(30))
+    assert errors["sh1"] == (0.0, 0.0)
+    assert errors["sh2"][0] == np.abs(source.shN[:, 3:]).max()
+
+
+def test_refuses_an_index_that_leaves_the_source(make_model):
+    model = make_model(5, 0)
+    for index in (np.array([0, 1, 2, 3, 5]), np.array([-1, 0, 1, 2, 3]), np.arange(4), np.arange(5.0)):
+        with pytest.raises(InputError, match="source index"):
+            measure_pairs(model, model, index)
+
+
+# Partners without an index ------------------------------------------------------------------------
+
+
+def bounds_of(source, decoded, index):
+    return {name: pair[0] for name, pair in measure_pairs(source, decoded, index).items()}
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-4, 0.1])
+def test_finds_partners(make_model, sigma):
+    source = make_model(5000, 1)
+    rng = np.random.default_rng(4)
+    index = rng.permutation(5000)
+    decoded = moved(source.select(index), rng, sigma)
+    bounds = bounds_of(source, decoded, index)
+    found = match(source, decoded, bounds, np.full(5000, sigma))
+    assert (found >= 0).all()
+    errors = differences(source, decoded, found, np.arange(5000))
+    assert all(np.abs(errors[name]).max() <= bounds[name] * (1 + 1e-9) + 1e-12 for name in bounds)
+
+
+def test_a_radius_that_is_too_small_costs_time_only(make_model):
+    source = make_model(500, 0)
+    decoded = moved(source, np.random.default_rng(5), 0.05)
+    bounds = bounds_of(source, decoded, np.arange(500))
+    assert (match(source, decoded, bounds, np.full(500, 1e-9)) >= 0).all()
+    assert (match(source, decoded, bounds, np.zeros(500)) >= 0).all()
+
+
+@pytest.mark.parametrize("attribute", ["means", "scales", "opacities", "sh0", "shN"])
+def test_misses_a_splat_that_has_no_partner(make_model, attribute):
+    source = make_model(300, 1)
+    decoded = moved(source, np.random.default_rng(6))
+    bounds = bounds_of(source, decoded, np.arange(300))
+    array = getattr(decoded, attribute).copy()
+    array[17] = 0.5 * array[17] + 0.3
+    found = match(source, replace(decoded, **{attribute: array}), bounds, np.full(300, 1e-3))
+    assert list(np.flatnonzero(found == UNMATCHED)) == [17]
+
+
+def test_coordinates_of_all_magnitudes_find_partners(make_model):
+    means = np.array([[1e30, 0, 0], [1e-30, 0, 0], [0, -1e7, 1e7], [0, 0, 0], [1e-45, 1, 1]], np.float32)
+    source = make_model(5, 0, means=means)
+    bounds = bounds_of(source, source, np.arange(5))
+    assert list(match(source, source, bounds, np.zeros(5))) == list(range(5))
+    assert list(match(source, source, {**bounds, "means": 1e-3}, np.full(5, 1e-30))) == [0, 1, 2, 3, 4]
+
+
+def test_gives_up_on_scenes_of_equals(make_model):
+    count = 300
+    ones = {
+        "means": np.zeros((count, 3), np.float32),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        "scales": np.zeros((count, 3), np.float32),
+        "opacities": np.ones(count, np.float32),
+        "sh0": np.zeros((count, 3), np.float32),
+    }
+    source = make_model(count, 1, **ones)
+    decoded = replace(source, shN=source.shN[::-1].copy())
+    bounds = bounds_of(source, source, np.arange(count))
+    assert (match(source, decoded, bounds, np.zeros(count)) == np.arange(count)[::-1]).all()
+    found = match(source, decoded, bounds, np.zeros(count), candidates_max=20)
+    assert set(found[found < 0]) == {UNDECIDED}
+
+
+def test_an_empty_source_has_no_partners(make_model):
+    model = make_model(3, 0)
+    bounds = bounds_of(model, model, np.arange(3))
+    assert list(match(make_model(0, 0), model, bounds, np.zeros(3))) == [UNMATCHED] * 3
+
+
+# Proofs -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced", "small"])
+def test_what_the_encoder_states_is_proved(make_model, preset):
+    source = make_model(3000, 3)
+    result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=700))
+    scene = decode_scene(result.data)
+    proof = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
+    assert proof.failures == ()
+    assert proof.rms_proved
+    proof = prove(source, scene.model, scene.header, scene.stated_errors)
+    assert proof.failures == ()
+    assert not proof.rms_proved
+
+
+def test_too_small_a_statement_is_not_proved(make_model):
+    source = make_model(500, 1)
+    result = encode_with_report(source)
+    scene = decode_scene(result.data)
+    assert scene.stated_errors is not None
+    for number, record in enumerate(scene.stated_errors.records):
+        records = list(scene.stated_errors.records)
+        records[number] = replace(record, max=record.max * 0.99)
+        stated = replace(scene.stated_errors, records=tuple(records))
+        assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
+        assert not prove(source, scene.model, scene.header, stated).holds
+        records[number] = replace(record, rms=record.rms * 0.99)
+        stated = replace(scene.stated_errors, records=tuple(records))
+        assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
+
+
+def test_a_refitted_or_silent_file_is_not_proved(make_model):
+    source = make_model(50, 0)
+    scene = decode_scene(encode(source))
+    assert scene.stated_errors is not None
+    refitted = replace(scene.stated_errors, refitted=True)
+    assert "renders" in prove(source, scene.model, scene.header, refitted).failures[0]
+    assert "states no errors" in prove(source, scene.model, scene.header, None).failures[0]
+
+
+def test_extra_columns_are_part_of_the_proof(make_model):
+    source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
+    result = encode_with_report(source, EncodeOptions(keep_extra=True))
+    scene = decode_scene(result.data)
+    assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    other = replace(source, extra={"label": np.zeros(50, np.int16)})
+    proof = prove(other, scene.model, scene.header, scene.stated_errors, result.source_index)
+    assert proof.failures == ("the extra column 'label' is not the source's",)
+
+
+# The walk through the blocks ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        EncodeOptions(),
+        EncodeOptions(preset="fast", tile_splats=64),
+        EncodeOptions(sh_coding="codebook", codebook_size=16, codebook_stages=2, escape_fraction=0.1),
+        EncodeOptions(sh_coding="none"),
+        EncodeOptions(profile="archive", means_coding="axis", keep_extra=True),
+    ],
+)
+def test_a_description_accounts_for_every_byte(make_model, options):
+    model = make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)})
+    data = encode(model, options)
+    described = describe_file(data)
+    sizes = sum(one["size_bytes"] for one in described["attributes"].values())
+    assert sizes + sum(described["overhead"].values()) == len(data)
+    header = read_header(data)
+    frames = sum(len(tile.layers) for tile in header.tiles) * (12 + 8 + 4)
+    assert described["overhead"]["tile_frames"] == frames
+    layers = sum(one["size_bytes"] for one in described["layers"].values())
+    others = sum(chunk.size for chunk in header.directory if chunk.type != b"CODB")
+    assert layers + others + 64 + header.index_size == len(data)
+
+
+def test_damage_is_described_or_refused_but_never_a_crash(make_model):
+    data = encode(make_model(12, 1), EncodeOptions(sh_coding="codebook", codebook_size=4))
+    for place in range(len(data)):
+        for change in (0x01, 0xFF):
+            damaged = bytearray(data)
+            damaged[place] ^= change
+            try:
+                describe_file(bytes(damaged))
+            except CsplatError:
+                continue
+    for length in range(len(data)):
+        with pytest.raises(CsplatError):
+            describe_file(data[:length])

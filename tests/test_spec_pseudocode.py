@@ -1,0 +1,159 @@
+"""The pseudo-code of the spec, run as it stands, against the decoder's vectorised functions."""
+
+import math
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from csplat import _spec
+from csplat.decoder.blocks import Columns
+from csplat.decoder.morton import morton_axes
+from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
+from csplat.decoder.streams import _undo_run_length, undo_transforms
+
+ROOT = Path(__file__).resolve().parent.parent
+PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
+
+
+@pytest.fixture(scope="module")
+def spec() -> SimpleNamespace:
+    text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+    names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp}
+    blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(block, names)  # noqa: S102 - the text is the project's own
+    return SimpleNamespace(**names)
+
+
+def elements(width: int) -> list[int]:
+    top = 2 ** (8 * width)
+    rng = np.random.default_rng(width)
+    edges = [0, 1, 2, top - 1, top - 2, top // 2, top // 2 - 1, top // 2 + 1, 0, top - 1]
+    return edges + [int.from_bytes(rng.bytes(width), "little") for _ in range(50)]
+
+
+def packed(values: list[int], width: int) -> bytes:
+    return b"".join(value.to_bytes(width, "little") for value in values)
+
+
+@pytest.mark.parametrize("width", range(1, 9))
+def test_delta(spec, width):
+    values = elements(width)
+    found = undo_transforms(packed(values, width), DELTA, len(values), width)
+    assert spec.undo_delta(values, width) == found.tolist()
+
+
+@pytest.mark.parametrize("width", range(1, 9))
+def test_zigzag(spec, width):
+    values = elements(width)
+    found = undo_transforms(packed(values, width), ZIGZAG, len(values), width)
+    assert spec.undo_zigzag(values, width) == found.tolist()
+
+
+@pytest.mark.parametrize("width", range(1, 9))
+def test_all_three_transforms_are_undone_from_the_last_to_the_first(spec, width):
+    data = packed(elements(width), width)
+    count = len(data) // width
+    joined = spec.undo_byte_planes(data, count, width)
+    assert joined == undo_transforms(data, PLANES, count, width).tolist()
+    expected = spec.undo_delta(spec.undo_zigzag(joined, width), width)
+    assert expected == undo_transforms(data, b"\1\2\3\0", count, width).tolist()
+
+
+@pytest.mark.parametrize("width", range(1, 9))
+def test_elements_without_transforms_are_little_endian(width):
+    values = elements(width)
+    assert values == undo_transforms(packed(values, width), PLAIN, len(values), width).tolist()
+
+
+def test_run_length(spec):
+    data = bytes([7, 8, 9]) + bytes([0, 255, 2]) + bytes([0, 255, 1])
+    expected = spec.undo_run_length(data)
+    assert 1 + 65536 + 259 == len(expected)
+    assert expected == _undo_run_length(data, len(expected), 0).tobytes()
+
+
+def test_morton(spec):
+    rng = np.random.default_rng(0)
+    codes = [0, 1, 2, 4, 2**51 - 1, 2**50, 2**49, 2**48, *(int(c) for c in rng.integers(0, 2**51, 200))]
+    found = morton_axes(np.array(codes, np.uint64))
+    assert [spec.morton_axes(code) for code in codes] == found.T.tolist()
+
+
+def record(attribute: int, mapping: int, **fields: float) -> _spec.AttributeRecord:
+    values = {"chroma_shift": 0, "levels": 0, "step": 1.0} | fields
+    return _spec.AttributeRecord(attribute, mapping, values["chroma_shift"], 0, values["levels"], values["step"])
+
+
+def columns(rows: list[list[int]], exponent: int = 0) -> Columns:
+    """[n][C] integers as a block; wide ones, as an offset and elements make them."""
+    return Columns(np.array(rows, np.int64).T, (0,) * len(rows[0]), exponent, 0)
+
+
+@pytest.mark.parametrize("shift", [0, 1, 5, 15, 16])
+@pytest.mark.parametrize("bound", [0, 1, 127, 2**13, 2**15, 2**31, 2**50])
+def test_colour_lifting(spec, shift, bound):
+    rng = np.random.default_rng(shift)
+    chroma = bound >> shift
+    rows = [[bound, -chroma, chroma], [-bound, chroma, chroma], [bound, chroma, -chroma], [-bound, -chroma, -chroma]]
+    rows += [
+        [int(rng.integers(-bound, bound + 1)), *(int(v) for v in rng.integers(-chroma, chroma + 1, 2))]
+        for _ in range(40)
+    ]
+    colour = record(_spec.ATTRIBUTE_SH0, _spec.MAPPING_YCOCG, chroma_shift=shift)
+    ((_, _, parts),) = lattice_rows(columns(rows), colour, len(rows))
+    expected = [list(spec.rgb_from_ycocg(*row, shift)) for row in rows]
+    assert expected == np.concatenate(parts).T.tolist()
+
+
+@pytest.mark.parametrize(
+    ("step", "exponent"),
+    [(1.0, 0), (0.1, 0), (0.1, -3), (1e-30, 0), (2.0**-1022, 0), (1e300, -2000), (2.0**-1022, 1100), (1e-12, 5)],
+)
+def test_lattice_values(spec, step, exponent):
+    rng = np.random.default_rng(1)
+    integers = [0, 1, -1, 2, 3, -3, 255, 2**24 + 1, 2**31, -(2**49) + 1, *(int(v) for v in rng.integers(-999, 999, 90))]
+    with np.errstate(over="ignore"):
+        expected = [spec.lattice_value(n, step, exponent) for n in integers]
+    keep = [i for i, value in enumerate(expected) if np.isfinite(value)]
+    rows = [[integers[i]] * 3 for i in keep]
+    out = np.empty((len(rows), 3), np.float32)
+    largest = write_lattice(columns(rows, exponent), record(_spec.ATTRIBUTE_SCALES, 0, step=step), out)
+    assert max(integers[i] for i in keep) == largest
+    assert np.array([expected[i] for i in keep], np.float32).tobytes() == out[:, 1].tobytes()
+
+
+def test_bands_are_laid_out_by_channel_then_coefficient(spec):
+    rows = np.random.default_rng(2).integers(-2000, 2000, (30, 15)).tolist()
+    out = np.empty((30, 5, 3), np.float32)
+    write_colour(columns(rows), record(_spec.ATTRIBUTE_SH2, 0, step=0.02), out)
+    for i, row in enumerate(rows):
+        for m in range(5):
+            for channel in range(3):
+                assert spec.lattice_value(row[channel * 5 + m], 0.02, 0) == out[i, m, channel]
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3, 63, 255, 256, 65535])
+def test_opacities(spec, levels):
+    linear = opacity_table(record(1, _spec.MAPPING_LINEAR, levels=levels, step=0.0))
+    square = opacity_table(record(1, _spec.MAPPING_SQUARE, levels=levels, step=0.0))
+    for q in {0, 1, levels // 2, levels - 1, levels, *range(0, levels, 97)}:
+        assert spec.opacity_linear(q, levels) == linear[q]
+        assert spec.opacity_square(q, levels) == square[q]
+    assert (0.0, 1.0) == (linear[0], linear[-1]) == (square[0], square[-1])
+
+
+@pytest.mark.parametrize("levels", [3, 4, 127, 255, 32767])
+def test_quats(spec, levels):
+    rng = np.random.default_rng(levels)
+    rows = [[0, 0, 0], [levels, levels, 0], [-levels, 0, levels], [1, -1, levels]]
+    rows += rng.integers(-levels, levels + 1, (300, 3)).tolist()
+    rows = [row for row in rows if 2 * levels**2 >= sum(q * q for q in row)]
+    out = np.empty((len(rows), 4), np.float32)
+    write_quats(columns(rows), record(3, _spec.MAPPING_UNIT_W, levels=levels, step=0.0), out)
+    expected = np.array([spec.quat(*row, levels) for row in rows], np.float32)
+    assert expected.tobytes() == out.tobytes()

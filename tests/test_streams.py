@@ -1,0 +1,98 @@
+"""Streams read back, by the definition of the transforms in the spec, as what was written."""
+
+import zlib
+
+import numpy as np
+import pytest
+import zstandard
+
+from csplat import _spec
+from csplat.encoder.streams import Coding, signed_stream, unsigned_stream
+from csplat.errors import InputError
+
+
+def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
+    """Undo a stream as spec 6 says, one integer at a time."""
+    head = _spec.unpack_stream_head(stream)
+    coded = stream[_spec.STREAM_HEAD_SIZE :]
+    assert head.coded_size == len(coded)
+    packed = {
+        _spec.CODER_STORED: lambda: coded,
+        _spec.CODER_DEFLATE: lambda: zlib.decompress(coded, -15),
+        _spec.CODER_ZSTD: lambda: zstandard.ZstdDecompressor().decompress(coded),
+    }[head.coder]()
+    assert head.packed_size == len(packed)
+    transforms = [step for step in head.transforms if step]
+    assert transforms == sorted(set(transforms))
+    if _spec.TRANSFORM_RUN_LENGTH in transforms:
+        runs = len(packed) // 3
+        lengths = [1 + packed[runs + i] + 256 * packed[2 * runs + i] for i in range(runs)]
+        packed = b"".join(bytes([packed[i]]) * lengths[i] for i in range(runs))
+    n, w = head.count, head.width
+    assert n * w == len(packed)
+    if _spec.TRANSFORM_BYTE_PLANES in transforms:
+        values = [sum(packed[plane * n + i] << (8 * plane) for plane in range(w)) for i in range(n)]
+    else:
+        values = [int.from_bytes(packed[i * w : i * w + w], "little") for i in range(n)]
+    if _spec.TRANSFORM_ZIGZAG in transforms:
+        values = [v >> 1 if v % 2 == 0 else 2 ** (8 * w) - 1 - (v >> 1) for v in values]
+    if _spec.TRANSFORM_DELTA in transforms:
+        for i in range(1, n):
+            values[i] = (values[i] + values[i - 1]) % 2 ** (8 * w)
+    return head, values
+
+
+RNG = np.random.default_rng(0)
+UNSIGNED = {
+    "one": np.array([7]),
+    "zeros": np.zeros(3000, np.int64),
+    "long runs": np.repeat(RNG.integers(0, 255, 5), 80_000),
+    "bytes": RNG.integers(0, 255, 500),
+    "two bytes": RNG.integers(0, 65535, 500),
+    "three bytes": RNG.integers(0, 2**24, 500),
+    "seven bytes": RNG.integers(0, 2**51, 500),
+    "ascending": np.sort(RNG.integers(0, 2**48, 500)),
+}
+
+
+@pytest.mark.parametrize("library", ["libdeflate", "zlib"])
+@pytest.mark.parametrize("mode", ["plain", "delta", "signed_delta"])
+@pytest.mark.parametrize("name", UNSIGNED)
+def test_unsigned_streams_read_back(name, mode, library):
+    values = UNSIGNED[name].astype(np.int64)
+    stream = unsigned_stream(values, Coding(6, library), delta=mode == "delta", signed_delta=mode == "signed_delta")
+    assert values.tolist() == read(stream)[1]
+
+
+@pytest.mark.parametrize("effort", [1, 6, 12])
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32])
+def test_signed_streams_read_back_at_every_width(dtype, effort):
+    limits = np.iinfo(dtype)
+    values = np.array([0, 1, -1, limits.min, limits.max, 5, -5] * 50, dtype)
+    head, read_back = read(signed_stream(values, Coding(effort)))
+    assert np.dtype(dtype).itemsize == head.width
+    assert [int(v) % 2 ** (8 * head.width) for v in values] == read_back
+
+
+def test_elements_are_no_wider_than_the_largest_needs():
+    assert 1 == read(signed_stream(np.array([-128, 127], np.int32), Coding()))[0].width
+    assert 2 == read(signed_stream(np.array([-129], np.int32), Coding()))[0].width
+    assert 3 == read(unsigned_stream(np.array([1 << 16]), Coding()))[0].width
+
+
+def test_a_constant_plane_costs_a_few_bytes():
+    assert len(unsigned_stream(np.full(65536, 200), Coding(1))) <= _spec.STREAM_HEAD_SIZE + 3
+
+
+def test_archive_uses_zstandard_where_it_is_smaller():
+    values = np.tile(RNG.integers(0, 255, 40_000), 4)
+    assert _spec.CODER_DEFLATE == read(unsigned_stream(values, Coding(9)))[0].coder
+    head, read_back = read(unsigned_stream(values, Coding(9, zstandard=True)))
+    assert _spec.CODER_ZSTD == head.coder
+    assert values.tolist() == read_back
+
+
+@pytest.mark.parametrize("arguments", [(0,), (13,), (6, "gzip")])
+def test_refuses_an_effort_or_library_that_does_not_exist(arguments):
+    with pytest.raises(InputError):
+        Coding(*arguments)

@@ -1,0 +1,1 @@
+"""Command line, conversion, comparison and reports around the csplat codec."""

@@ -1,0 +1,61 @@
+"""The commands together: what `csplat` runs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import csplat
+from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat_tools.commands.conformance import conformance
+from csplat_tools.commands.decode import decode
+from csplat_tools.commands.encode import encode
+from csplat_tools.commands.info import info
+from csplat_tools.commands.lint import lint
+from csplat_tools.commands.verify import verify
+from csplat_tools.console import say
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    name="csplat",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        say(f"csplat {csplat.__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions of program and format."),
+    ] = False,
+) -> None:
+    r"""csplat: 3D Gaussian splats, compressed.
+
+    Status 0: done. 1: refused or failed, with one line on standard error.
+    2: the command line is wrong.
+
+    \b
+    Examples:
+      csplat encode scene.ply scene.csplat
+      csplat info scene.csplat
+      csplat decode scene.csplat scene.ply
+    """
+
+
+app.command()(encode)
+app.command()(decode)
+app.command()(info)
+app.command()(verify)
+app.command()(lint)
+app.add_typer(conformance, name="conformance")

@@ -1,0 +1,204 @@
+"""`csplat encode`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from csplat._spec import MEASURE_NAMES, TILE_SPLATS_MAX
+from csplat.encoder import PRESETS, EncodeOptions
+from csplat.errors import InputError
+from csplat_tools.console import format_bytes, format_table, guarded, note, progress_bar, say_json
+from csplat_tools.convert import Encoded, SceneFacts, encode_file
+from csplat_tools.inout import STANDARD_STREAM, check_output
+
+__all__ = ["encode"]
+
+_SCENE = "What the PLY may not say"
+_PRECISION = "Precision (the preset decides where nothing is given)"
+_COLOUR = "Spherical harmonics"
+_CODING = "Coding"
+
+
+@guarded
+def encode(
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A 3DGS PLY, or - for standard input.")],
+    target: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or - for standard output.")],
+    preset: Annotated[str, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")] = "balanced",
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse a PLY with defects instead of repairing it.")
+    ] = False,
+    keep_extra: Annotated[
+        bool, typer.Option("--keep-extra", help="Carry columns that splats do not have, bit for bit.")
+    ] = False,
+    source_index: Annotated[
+        str | None, typer.Option(metavar="FILE.npy", help="Write which splat of the PLY each splat of the file is.")
+    ] = None,
+    importance: Annotated[
+        str | None, typer.Option(metavar="FILE.npy", help="Weights of the splats, instead of opacity x size.")
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(metavar="RDF", rich_help_panel=_SCENE, help="Directions of +x, +y, +z: R/L, U/D, F/B."),
+    ] = None,
+    unit_metres: Annotated[
+        float | None, typer.Option(metavar="METRES", rich_help_panel=_SCENE, help="Length of one scene unit.")
+    ] = None,
+    antialiased: Annotated[
+        bool | None,
+        typer.Option("--antialiased/--no-antialiased", rich_help_panel=_SCENE, help="Trained with mip-splatting."),
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, help="Into the metadata.")
+    ] = None,
+    quality: Annotated[
+        float | None, typer.Option(metavar="DB", rich_help_panel=_PRECISION, help="PSNR that each attribute keeps.")
+    ] = None,
+    position_bits: Annotated[
+        int | None, typer.Option(metavar="2..16", rich_help_panel=_PRECISION, help="Bits per axis of a tile.")
+    ] = None,
+    position_step: Annotated[
+        float | None, typer.Option(metavar="UNITS", rich_help_panel=_PRECISION, help="Step of the means.")
+    ] = None,
+    scale_step: Annotated[
+        float | None, typer.Option(metavar="STEP", rich_help_panel=_PRECISION, help="Step of the log scales.")
+    ] = None,
+    opacity_levels: Annotated[
+        int | None, typer.Option(metavar="1..65535", rich_help_panel=_PRECISION, help="Levels of opacity.")
+    ] = None,
+    quat_levels: Annotated[
+        int | None, typer.Option(metavar="3..32767", rich_help_panel=_PRECISION, help="Levels of rotation.")
+    ] = None,
+    sh0_step: Annotated[
+        float | None, typer.Option(metavar="STEP", rich_help_panel=_PRECISION, help="Step of the base colour.")
+    ] = None,
+    sh_step: Annotated[
+        float | None, typer.Option(metavar="STEP", rich_help_panel=_PRECISION, help="Step of the SH bands.")
+    ] = None,
+    chroma_shift: Annotated[
+        int | None,
+        typer.Option(metavar="0..16", rich_help_panel=_PRECISION, help="Chroma is coarser by this power of two."),
+    ] = None,
+    adaptive: Annotated[
+        float | None,
+        typer.Option(metavar="0..1", rich_help_panel=_PRECISION, help="How much coarser unimportant splats may be."),
+    ] = None,
+    sh_degree: Annotated[
+        int | None, typer.Option(metavar="0..3", rich_help_panel=_COLOUR, help="Keep the bands up to this one.")
+    ] = None,
+    sh_coding: Annotated[
+        str, typer.Option(metavar="auto|codebook|scalar|none", rich_help_panel=_COLOUR, help="How SH is coded.")
+    ] = "auto",
+    codebook_size: Annotated[
+        int | None, typer.Option(metavar="1..65536", rich_help_panel=_COLOUR, help="Entries of the codebook.")
+    ] = None,
+    codebook_stages: Annotated[
+        int | None, typer.Option(metavar="1..4", rich_help_panel=_COLOUR, help="Residual stages of the codebook.")
+    ] = None,
+    escape_fraction: Annotated[
+        float | None,
+        typer.Option(metavar="0..1", rich_help_panel=_COLOUR, help="Share of splats that bypass the codebook."),
+    ] = None,
+    profile: Annotated[
+        str, typer.Option(metavar="base|archive", rich_help_panel=_CODING, help="Base is read everywhere.")
+    ] = "base",
+    means_coding: Annotated[
+        str, typer.Option(metavar="auto|morton|axis", rich_help_panel=_CODING, help="How the means are coded.")
+    ] = "auto",
+    tile_splats: Annotated[
+        int, typer.Option(metavar="1..65536", rich_help_panel=_CODING, help="Splats of a tile at most.")
+    ] = TILE_SPLATS_MAX,
+    effort: Annotated[int | None, typer.Option(metavar="1..12", rich_help_panel=_CODING, help="DEFLATE level.")] = None,
+    deflate: Annotated[
+        str, typer.Option(metavar="auto|libdeflate|zlib", rich_help_panel=_CODING, help="Which library deflates.")
+    ] = "auto",
+    seed: Annotated[int, typer.Option(min=0, rich_help_panel=_CODING, help="Seed of the clustering.")] = 0,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, rich_help_panel=_CODING, help="Threads, one per core by default; the bytes stay the same."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Report on standard output, for programs.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
+) -> None:
+    r"""Compress a trained 3DGS scene.
+
+    Reads the PLY of any 3DGS trainer, repairs what is safe to repair (and
+    says so), and states in the file how far its splats lie from the source.
+
+    \b
+    Examples:
+      csplat encode scene.ply scene.csplat
+      csplat encode scene.ply scene.csplat --preset small --sh-degree 2
+      csplat encode scene.ply scene.csplat --source-index scene.npy && \
+        csplat verify scene.csplat --source scene.ply --source-index scene.npy
+      gunzip -c scene.ply.gz | csplat encode - - | wc -c
+    """
+    try:
+        options = EncodeOptions(
+            preset=preset,
+            quality=quality,
+            profile=profile,
+            position_bits=position_bits,
+            position_step=position_step,
+            means_coding=means_coding,
+            scale_step=scale_step,
+            opacity_levels=opacity_levels,
+            quat_levels=quat_levels,
+            sh0_step=sh0_step,
+            sh_step=sh_step,
+            chroma_shift=chroma_shift,
+            sh_degree=sh_degree,
+            sh_coding=sh_coding,
+            codebook_size=codebook_size,
+            codebook_stages=codebook_stages,
+            escape_fraction=escape_fraction,
+            adaptive=adaptive,
+            tile_splats=tile_splats,
+            effort=effort,
+            deflate=deflate,
+            keep_extra=keep_extra,
+            seed=seed,
+            threads=threads,
+        )
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    if as_json and target == STANDARD_STREAM:
+        raise typer.BadParameter("--json and - both want standard output")
+    if source_index == STANDARD_STREAM:
+        raise typer.BadParameter("--source-index wants the name of a file")
+    check_output(target, force=force, inputs=(source,))
+    if source_index is not None:
+        check_output(source_index, force=force, inputs=(source, target))
+    with progress_bar(quiet=quiet) as progress:
+        encoded = encode_file(
+            source,
+            target,
+            options,
+            facts=SceneFacts(axes, unit_metres, antialiased, licence),
+            strict=strict,
+            importance=importance,
+            source_index=source_index,
+            progress=progress,
+        )
+    if as_json:
+        say_json(encoded.as_json())
+    elif not quiet:
+        _report(encoded)
+
+
+def _report(encoded: Encoded) -> None:
+    report = encoded.result.report
+    for finding in encoded.findings:
+        note(str(finding))
+    per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
+    ratio = encoded.source_bytes / report.size_bytes
+    note(
+        f"{report.splat_count} splats in {report.tile_count} tiles: {format_bytes(encoded.source_bytes)} ->"
+        f" {format_bytes(report.size_bytes)} ({ratio:.1f} times smaller{per_splat}), {encoded.seconds:.2f} s"
+    )
+    if report.errors:
+        names = sorted(report.errors, key=list(MEASURE_NAMES.values()).index)
+        rows = [(name, *(f"{value:.4g}" for value in report.errors[name])) for name in names]
+        note(format_table(("stated error", "max", "rms"), rows))

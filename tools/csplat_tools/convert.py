@@ -1,0 +1,221 @@
+"""PLY to .csplat and back: what `csplat encode` and `csplat decode` do, apart from the command line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from csplat.decoder import Limits, decode, decode_scene
+from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_tools.inout import mapped_csplat, ply_path, read_array, write_array, write_bytes, write_model
+from csplat_tools.proof import Proof, prove
+
+__all__ = [
+    "Encoded",
+    "SceneFacts",
+    "Verified",
+    "decode_file",
+    "encode_file",
+    "findings_as_json",
+    "verify_file",
+]
+
+#: What is told how far a stage has come: its name, and 0 to 1.
+Report = Callable[[str, float], None]
+
+_SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What a PLY may not say of its scene; `None` keeps what it says.
+
+    Attributes:
+        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
+        licence: goes into the metadata.
+    """
+
+    coordinate_system: str | None = None
+    unit_metres: float | None = None
+    antialiased: bool | None = None
+    licence: str | None = None
+
+    def applied(self, model: SplatModel) -> SplatModel:
+        """Return the model with these facts."""
+        changes: dict[str, Any] = {
+            name: value
+            for name in ("coordinate_system", "unit_metres", "antialiased")
+            if (value := getattr(self, name)) is not None
+        }
+        if self.licence is not None:
+            changes["metadata"] = {**model.metadata, "licence": self.licence}
+        return replace(model, **changes) if changes else model
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A file that is intact.
+
+    Attributes:
+        splat_count: its splats.
+        checks: names of the checks that were made.
+        proof: of its stated errors; `None` where no source was given.
+    """
+
+    splat_count: int
+    checks: tuple[str, ...]
+    proof: Proof | None
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """What an encoding took and gave.
+
+    Attributes:
+        result: of the encoder.
+        findings: what lint noticed in the PLY.
+        source_bytes: size of the PLY.
+        seconds: reading, encoding and writing.
+    """
+
+    result: EncodeResult
+    findings: tuple[Finding, ...]
+    source_bytes: int
+    seconds: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        report = self.result.report
+        count = report.splat_count
+        return {
+            "splats": count,
+            "size_bytes": report.size_bytes,
+            "source_bytes": self.source_bytes,
+            "ratio": self.source_bytes / report.size_bytes,
+            "bytes_per_splat": report.size_bytes / count if count else None,
+            "tiles": report.tile_count,
+            "seconds": round(self.seconds, 3),
+            "defects": findings_as_json(self.findings),
+            "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
+            "options": report.options,
+        }
+
+
+def encode_file(
+    source: str,
+    target: str,
+    options: EncodeOptions,
+    *,
+    facts: SceneFacts | None = None,
+    strict: bool = False,
+    importance: str | None = None,
+    source_index: str | None = None,
+    progress: Report | None = None,
+) -> Encoded:
+    """Read a PLY, encode it, write the file.
+
+    Args:
+        source: a PLY, or `-`.
+        target: the file to write, or `-`. Whether it may be replaced has been settled before.
+        options: of the encoder; `keep_extra` holds for reading too.
+        facts: what the PLY does not say.
+        strict: refuse what would be repaired.
+        importance: a .npy file with one weight per splat of the PLY as read.
+        source_index: a .npy file to write: which splat of the PLY each splat of the file is.
+        progress: is told the stages.
+
+    Raises:
+        CsplatError: the PLY or the options cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    start = time.perf_counter()
+    weights = None if importance is None else read_array(importance)
+    findings: list[Finding] = []
+    if progress is not None:
+        progress("reading", 0.0)
+    with ply_path(source) as path:
+        model = read_ply(path, strict=strict, keep_extra=options.keep_extra, report=findings)
+        source_bytes = path.stat().st_size
+    if progress is not None:
+        progress("reading", 1.0)
+    model = (facts or SceneFacts()).applied(model)
+    result = encode_with_report(model, options, importance=weights, progress=progress)
+    write_bytes(target, result.data)
+    if source_index is not None:
+        write_array(source_index, result.source_index)
+    return Encoded(result, tuple(findings), source_bytes, time.perf_counter() - start)
+
+
+def decode_file(
+    source: str, target: str, *, sh_degree: int | None = None, absolute: bool = False, max_splats: int | None = None
+) -> None:
+    """Read a .csplat file, write a PLY.
+
+    Args:
+        source: the file, or `-`.
+        target: the PLY to write, or `-`. Whether it may be replaced has been settled before.
+        sh_degree: leave out the bands above.
+        absolute: add the origin and write doubles.
+        max_splats: budget; the default is the decoder's.
+
+    Raises:
+        CsplatError: the file is not valid, or too large.
+        OSError: a file cannot be read or written.
+    """
+    with mapped_csplat(source) as data:
+        # All bands, even if not all are wanted: the digest is that of the whole file.
+        model = decode(data, limits=_limits(max_splats))
+    if sh_degree is not None and sh_degree < model.sh_degree:
+        model = replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
+    write_model(target, model, absolute=absolute)
+
+
+def verify_file(
+    path: str,
+    source: str | None = None,
+    source_index: str | None = None,
+    *,
+    max_splats: int | None = None,
+    progress: Report | None = None,
+) -> Verified:
+    """Decode a file with all checks; prove its stated errors where a source is given.
+
+    Args:
+        path: the file, or `-`.
+        source: the PLY that it was made from.
+        source_index: the .npy file that the encoder wrote.
+        max_splats: budget; the default is the decoder's.
+        progress: is told how far matching has come.
+
+    Raises:
+        CsplatError: the file is not valid; or source or index cannot be read.
+        OSError: a file cannot be read.
+    """
+    rows = None if source_index is None else read_array(source_index)
+    with mapped_csplat(path) as data:
+        scene = decode_scene(data, limits=_limits(max_splats))
+    proof = None
+    if source is not None:
+        with ply_path(source) as ply:
+            model = read_ply(ply, keep_extra=bool(scene.header.extras))
+        proof = prove(model, scene.model, scene.header, scene.stated_errors, rows, progress=progress)
+    return Verified(len(scene.model), scene.checks, proof)
+
+
+def _limits(max_splats: int | None) -> Limits:
+    """The decoder's budgets, or as many as that many splats can take."""
+    if max_splats is None:
+        return Limits()
+    return Limits(splats=max_splats, bytes=max(Limits().bytes, max_splats * _SPLAT_BYTES_MAX))
+
+
+def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
+    """Return findings as JSON-compatible values."""
+    return [{"id": one.id, "kind": one.kind, "count": one.count, "text": one.text} for one in findings]

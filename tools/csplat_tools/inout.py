@@ -1,0 +1,195 @@
+"""Files, standard input and standard output of the commands.
+
+`-` is standard input or output. A file appears under its name only when it is complete, and none
+is replaced unless asked.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat._spec import MAGIC
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.model import SplatModel
+from csplat.ply import write_ply
+
+__all__ = [
+    "STANDARD_STREAM",
+    "check_output",
+    "mapped_csplat",
+    "ply_path",
+    "read_array",
+    "write_array",
+    "write_bytes",
+    "write_model",
+]
+
+STANDARD_STREAM = "-"
+
+_PLY_MAGICS = (b"ply\n", b"ply\r")
+
+
+def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> None:
+    """Refuse an output before any work is done for it.
+
+    Args:
+        path: the file to be written, or `-`.
+        force: an existing file may be replaced.
+        inputs: files that the command reads; none of them may be the output, force or not.
+
+    Raises:
+        InputError: the file exists, is an input, or is a terminal.
+        OSError: its folder does not exist.
+    """
+    if path == STANDARD_STREAM:
+        if sys.stdout.isatty():
+            raise InputError("will not write binary data to a terminal: name a file, or use a pipe")
+        return
+    target = Path(path)
+    if target.is_dir():
+        raise InputError(f"{path} is a folder, wanted the name of a file")
+    if not target.exists():
+        target.parent.stat()  # an OSError that names the folder
+        return
+    for other in inputs:
+        if other != STANDARD_STREAM and Path(other).exists() and target.samefile(other):
+            raise InputError(f"{path} is the input: name another output")
+    if target.is_file() and not force:
+        raise InputError(f"{path} exists: --force replaces it")
+
+
+@contextmanager
+def ply_path(path: str) -> Iterator[Path]:
+    """Give the path of a PLY; standard input and named pipes go into a temporary file first.
+
+    Raises:
+        InputError: it is a .csplat file.
+        OSError: it cannot be read.
+    """
+    if path != STANDARD_STREAM and not Path(path).is_fifo():
+        _refuse_csplat(Path(path))
+        yield Path(path)
+        return
+    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
+        spool = Path(folder) / "standard input"
+        with spool.open("wb") as stream:
+            if path == STANDARD_STREAM:
+                shutil.copyfileobj(sys.stdin.buffer, stream, 1 << 20)
+            else:
+                with Path(path).open("rb") as pipe:
+                    shutil.copyfileobj(pipe, stream, 1 << 20)
+        _refuse_csplat(spool)
+        yield spool
+
+
+@contextmanager
+def mapped_csplat(path: str) -> Iterator[bytes | mmap.mmap]:
+    """Give the bytes of a .csplat file, memory-mapped where that is possible.
+
+    Whether they are valid is for the decoder to say; only a PLY is recognised and refused here.
+
+    Raises:
+        InputError: it is a PLY.
+        OSError: it cannot be read.
+    """
+    if path == STANDARD_STREAM:
+        data = sys.stdin.buffer.read()
+        _refuse_ply("standard input", data)
+        yield data
+        return
+    with Path(path).open("rb") as stream:
+        try:
+            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        except (ValueError, OSError, io.UnsupportedOperation):  # empty, or a pipe
+            data = stream.read()
+            _refuse_ply(path, data)
+            yield data
+            return
+        try:
+            _refuse_ply(path, mapped[:4])
+            yield mapped
+        finally:
+            _close(mapped)
+
+
+def read_array(path: str) -> NDArray[Any]:
+    """Read one array from a .npy file.
+
+    Raises:
+        InputError: it is not one.
+        OSError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            array = np.lib.format.read_array(stream, allow_pickle=False)
+    except (ValueError, EOFError, SyntaxError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{path} is not a NumPy array file (.npy)")
+    return array
+
+
+def write_array(path: str, array: NDArray[Any]) -> None:
+    """Write a .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_bytes(path: str, data: bytes) -> None:
+    """Write a file, or to standard output; devices and named pipes are written directly."""
+    if path == STANDARD_STREAM:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+    else:
+        with atomic_writer(path) as stream:
+            stream.write(data)
+
+
+def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:
+    """Write a PLY, or one to standard output."""
+    if path != STANDARD_STREAM:
+        write_ply(path, model, absolute=absolute)
+        return
+    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
+        spool = Path(folder) / "scene.ply"
+        write_ply(spool, model, absolute=absolute)
+        with spool.open("rb") as stream:
+            shutil.copyfileobj(stream, sys.stdout.buffer, 1 << 20)
+            sys.stdout.buffer.flush()
+
+
+def _refuse_csplat(path: Path) -> None:
+    if path.is_dir():
+        return  # may be an unbundled SOG: the PLY reader says so
+    with path.open("rb") as stream:
+        if stream.read(len(MAGIC)) == MAGIC:
+            raise InputError(
+                f"{path.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
+                " `csplat info` describes it"
+            )
+
+
+def _refuse_ply(name: str, data: bytes) -> None:
+    if data[:4] in _PLY_MAGICS:
+        raise InputError(f"{name} is a PLY, wanted a .csplat file: `csplat encode` makes one")
+
+
+def _close(mapped: mmap.mmap) -> None:
+    try:
+        mapped.close()
+    except BufferError:
+        return  # an error on its way up still holds a view; the garbage collector closes it

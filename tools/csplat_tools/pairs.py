@@ -1,0 +1,176 @@
+"""How far decoded splats lie from those of their source (spec 5.5), for `verify`.
+
+Written apart from what the encoder measures with, so that each finds the other's mistakes. Everything is
+float64, in blocks that stay in the cache; sums do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+
+__all__ = ["differences", "measure_names", "measure_pairs"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Rows = NDArray[Any]  # integers that name splats
+
+_BLOCK = 4096  # splats: 45 float64 SH coefficients of each are 1.5 MB
+
+
+def measure_names(source: SplatModel, decoded: SplatModel) -> list[str]:
+    """Name the measures of a pair of models, in the order of the registry."""
+    degree = max(source.sh_degree, decoded.sh_degree)
+    bands = [f"sh{band}" for band in range(1, degree + 1)]
+    return ["means", "covariance", "opacities", "sh0", *bands]
+
+
+def measure_pairs(
+    source: SplatModel, decoded: SplatModel, source_index: Rows, *, threads: int | None = None
+) -> dict[str, tuple[float, float]]:
+    """Measure the errors of decoded splats against the splats that they stand for.
+
+    Args:
+        source: the model that was handed to the encoder.
+        decoded: what its file decodes to, N splats.
+        source_index: [N] integers; decoded splat i stands for source splat `source_index[i]`.
+        threads: how many to use, one per core by default. The result does not depend on it.
+
+    Returns:
+        Maximum and rms by measure. The maximum is over components, a vector's square the sum over
+        them. A band that one of the models has not is zero there.
+
+    Raises:
+        InputError: `source_index` is not one valid index for each decoded splat.
+    """
+    _check_index(source_index, len(source), len(decoded))
+
+    def measure_block(start: int) -> dict[str, tuple[float, float]]:
+        rows = slice(start, min(start + _BLOCK, len(decoded)))
+        errors = differences(source, decoded, source_index[rows], rows)
+        return {name: _reduce(values) for name, values in errors.items()}
+
+    with ThreadPoolExecutor(threads) as pool:
+        blocks = list(pool.map(measure_block, range(0, len(decoded), _BLOCK)))
+    return {
+        name: (
+            max((block[name][0] for block in blocks), default=0.0),
+            math.sqrt(math.fsum(block[name][1] for block in blocks) / max(1, len(decoded))),
+        )
+        for name in measure_names(source, decoded)
+    }
+
+
+def differences(
+    source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice
+) -> dict[str, F64]:
+    """Differences of pairs of splats, by measure.
+
+    Args:
+        source, decoded: the models.
+        source_rows, decoded_rows: n splats each; pair k is splat k of both.
+
+    Returns:
+        [n, C] by measure: the distance of the centres, the relative Frobenius distance of the
+        covariances and the difference of alpha (C = 1), the differences of the coefficients
+        (C = 3 for sh0, 3 (2l + 1) for band l).
+    """
+    result = {
+        "means": _distances(source, decoded, source_rows, decoded_rows)[:, None],
+        "covariance": _covariance_errors(source, decoded, source_rows, decoded_rows)[:, None],
+        "opacities": _subtract(decoded.opacities[decoded_rows], source.opacities[source_rows])[:, None],
+        "sh0": _subtract(decoded.sh0[decoded_rows], source.sh0[source_rows]),
+    }
+    for band in range(1, max(source.sh_degree, decoded.sh_degree) + 1):
+        ours, theirs = _band(decoded, decoded_rows, band), _band(source, source_rows, band)
+        values = _subtract(ours, theirs)
+        result[f"sh{band}"] = values.reshape(len(values), -1)
+    return result
+
+
+def _check_index(source_index: Rows, source_count: int, decoded_count: int) -> None:
+    if source_index.shape != (decoded_count,) or source_index.dtype.kind not in "iu":
+        raise InputError(
+            f"the source index is {source_index.dtype} of shape {list(source_index.shape)}, wanted"
+            f" integers [{decoded_count}], one for each splat of the file"
+        )
+    if decoded_count:
+        low, high = int(source_index.min()), int(source_index.max())
+        if low < 0 or high >= source_count:
+            raise InputError(f"the source index reaches from {low} to {high}, the source holds {source_count} splats")
+
+
+def _reduce(values: F64) -> tuple[float, float]:
+    """Return the largest magnitude and the sum of squares. No BLAS: its sums depend on threads."""
+    largest = max(float(values.max()), -float(values.min()))
+    with np.errstate(over="ignore"):
+        return largest, float(np.square(values).sum())
+
+
+def _subtract(a: F32, b: F32) -> F64:
+    result: F64 = np.subtract(a, b, dtype=np.float64)
+    return result
+
+
+def _band(model: SplatModel, rows: Rows | slice, band: int) -> F32:
+    if band > model.sh_degree:
+        return np.zeros((1, 2 * band + 1, 3), np.float32)
+    return model.shN[rows, band * band - 1 : (band + 1) ** 2 - 1]
+
+
+def _distances(source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
+    moved = _subtract(decoded.means[decoded_rows], source.means[source_rows])
+    shift = np.subtract(decoded.origin, source.origin)
+    if shift.any():
+        moved += shift
+    # Squares of float32 values neither overflow nor vanish in float64: 1e-45 squared is 1e-90.
+    distances: F64 = np.sqrt(np.einsum("ij,ij->i", moved, moved))
+    return distances
+
+
+def _covariance_errors(source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
+    """Compute |S' - S| / |S|, both over the source's largest variance: any log scale will do."""
+    scales = source.scales[source_rows]
+    largest = scales.max(axis=1).astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        theirs = _covariances(source.quats[source_rows], scales, largest)
+        ours = _covariances(decoded.quats[decoded_rows], decoded.scales[decoded_rows], largest)
+        error = _frobenius(ours - theirs) / _frobenius(theirs)  # the norm is at least 1
+    error[np.isnan(error)] = np.inf  # infinite variances: beyond float64
+    return error
+
+
+def _covariances(quats: F32, scales: F32, largest: F64) -> F64:
+    """Return xx, yy, zz, xy, xz, yz of R diag(e^(2 (scales - largest))) Rt, [6, n]."""
+    w, x, y, z = quats.T.astype(np.float64)
+    f = 2.0 / (w * w + x * x + y * y + z * z)  # they are unit only within a tolerance
+    xx, yy, zz = f * x * x, f * y * y, f * z * z
+    xy, xz, yz = f * x * y, f * x * z, f * y * z
+    wx, wy, wz = f * w * x, f * w * y, f * w * z
+    rotation = (
+        (1.0 - yy - zz, xy - wz, xz + wy),
+        (xy + wz, 1.0 - xx - zz, yz - wx),
+        (xz - wy, yz + wx, 1.0 - xx - yy),
+    )
+    variances = np.exp(2.0 * (scales.T - largest))
+    entries = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    stacked: F64 = np.stack([_entry(rotation[i], rotation[j], variances) for i, j in entries])
+    return stacked
+
+
+def _entry(a: tuple[F64, F64, F64], b: tuple[F64, F64, F64], variances: F64) -> F64:
+    entry: F64 = a[0] * b[0] * variances[0] + a[1] * b[1] * variances[1] + a[2] * b[2] * variances[2]
+    return entry
+
+
+def _frobenius(entries: F64) -> F64:
+    squares = np.square(entries)
+    norms: F64 = np.sqrt(squares[:3].sum(axis=0) + 2.0 * squares[3:].sum(axis=0))
+    return norms

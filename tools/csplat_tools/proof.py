@@ -1,0 +1,187 @@
+"""Prove the errors that a file states against its source (spec 5.5).
+
+With a source index, maximum, rms and counts are proved. Without one, each splat of the file must have a splat of the
+source within the stated maxima; rms and counts are then not proved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder import SceneHeader, StatedErrors
+from csplat.model import SplatModel
+from csplat_tools.match import UNDECIDED, UNMATCHED, allowed, match
+from csplat_tools.pairs import measure_names, measure_pairs
+
+__all__ = ["MeasureProof", "Proof", "prove"]
+
+F64 = NDArray[np.float64]
+
+_RMS_TOLERANCE = 1e-4  # SER-5 lets an encoder round up by this much
+
+
+@dataclass(frozen=True)
+class MeasureProof:
+    """One measure: what is stated, what was found, and whether it holds.
+
+    Attributes:
+        name: of the registry of stated errors.
+        stated_max, stated_rms: of the file; `None` where it does not state the measure.
+        measured_max, measured_rms: of the pairs; `None` without a source index.
+        holds: nothing contradicts the statement.
+    """
+
+    name: str
+    stated_max: float | None
+    stated_rms: float | None
+    measured_max: float | None
+    measured_rms: float | None
+    holds: bool
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What became of the attempt.
+
+    Attributes:
+        measures: in the order of the registry.
+        failures: one line each; none when the file's statement holds.
+        rms_proved: whether rms and counts were proved too.
+    """
+
+    measures: tuple[MeasureProof, ...] = ()
+    failures: tuple[str, ...] = ()
+    rms_proved: bool = False
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything that could be looked at holds."""
+        return not self.failures
+
+
+def prove(
+    source: SplatModel,
+    decoded: SplatModel,
+    header: SceneHeader,
+    stated: StatedErrors | None,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Callable[[str, float], None] | None = None,
+) -> Proof:
+    """Compare a file's stated errors with its source.
+
+    Args:
+        source: the model that was encoded.
+        decoded: what the file decodes to.
+        header: the file's header and index.
+        stated: what it states, `None` where it states nothing.
+        source_index: [N] integers; which source splat each splat of the file is. `None`: not known.
+        progress: is told how far matching has come.
+
+    Raises:
+        InputError: `source_index` is not one index of a source splat for each splat of the file.
+    """
+    if stated is None:
+        return Proof(failures=("the file states no errors",))
+    if stated.refitted:
+        return Proof(
+            failures=("the file says that attributes were fitted anew: renders are its judge, not these bounds",)
+        )
+    failures = _compare_scenes(source, decoded, stated)
+    if failures:
+        return Proof(failures=tuple(failures))
+    if source_index is not None:
+        return _prove_pairs(source, decoded, stated, source_index)
+    return _prove_matches(source, decoded, header, stated, progress)
+
+
+def _compare_scenes(source: SplatModel, decoded: SplatModel, stated: StatedErrors) -> list[str]:
+    """What must be equal before splats are compared at all."""
+    failures = []
+    if len(source) != stated.source_count:
+        failures.append(f"the file stands for a source of {stated.source_count} splats, this one has {len(source)}")
+    if source.sh_degree != stated.source_sh_degree:
+        failures.append(
+            f"the file stands for a source of SH degree {stated.source_sh_degree}, this one has {source.sh_degree}"
+        )
+    if source.origin != decoded.origin:
+        failures.append(f"the file's origin is {decoded.origin}, the source's {source.origin}")
+    bounds = _bounds(stated)
+    failures += [
+        f"the file states no error of {name}"
+        for name in measure_names(source, decoded)
+        if name not in bounds and len(decoded)
+    ]
+    return failures
+
+
+def _bounds(stated: StatedErrors) -> dict[str, tuple[float, float]]:
+    return {record.measure: (record.max, record.rms) for record in stated.records}
+
+
+def _prove_pairs(source: SplatModel, decoded: SplatModel, stated: StatedErrors, source_index: NDArray[Any]) -> Proof:
+    measured = measure_pairs(source, decoded, source_index)
+    failures = []
+    different = len(np.unique(source_index))
+    if different != len(decoded):
+        failures.append(
+            f"the source index names {different} splats for {len(decoded)}: counts of kept and pruned are wrong"
+        )
+    for name, column in decoded.extra.items():
+        other = source.extra.get(name)
+        if other is None or column.tobytes() != other[source_index].astype(column.dtype).tobytes():
+            failures.append(f"the extra column {name!r} is not the source's")
+    measures = []
+    bounds = _bounds(stated)
+    for name, (largest, rms) in measured.items():
+        stated_max, stated_rms = bounds.get(name, (0.0, 0.0))
+        max_holds = largest <= allowed(name, stated_max)
+        rms_holds = math.isclose(rms, stated_rms, rel_tol=_RMS_TOLERANCE, abs_tol=allowed(name, 0.0))
+        if not max_holds:
+            failures.append(f"{name}: max {largest:.9g} is above the stated {stated_max:.9g}")
+        if not rms_holds:
+            failures.append(f"{name}: rms {rms:.9g} is not the stated {stated_rms:.9g}")
+        measures.append(MeasureProof(name, stated_max, stated_rms, largest, rms, max_holds and rms_holds))
+    return Proof(tuple(measures), tuple(failures), rms_proved=True)
+
+
+def _prove_matches(
+    source: SplatModel,
+    decoded: SplatModel,
+    header: SceneHeader,
+    stated: StatedErrors,
+    progress: Callable[[str, float], None] | None,
+) -> Proof:
+    bounds = {record.measure: record.max for record in stated.records}
+    found = match(source, decoded, bounds, _lattice_radii(decoded, header), progress=progress)
+    unmatched = int(np.count_nonzero(found == UNMATCHED))
+    undecided = int(np.count_nonzero(found == UNDECIDED))
+    failures = []
+    if unmatched:
+        failures.append(f"{unmatched} splats of the file have no splat of the source within the stated maxima")
+    if undecided:
+        failures.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
+    measures = tuple(
+        MeasureProof(name, *_bounds(stated).get(name, (0.0, 0.0)), None, None, not failures)
+        for name in measure_names(source, decoded)
+    )
+    return Proof(measures, tuple(failures), notes=("rms and counts are not proved without a source index",))
+
+
+def _lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
+    """Half the diagonal of each splat's lattice cell, and what rounding to float32 adds: how near its source lies."""
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+    radii = np.empty(len(decoded))
+    for tile in header.tiles:
+        rows = slice(tile.start, tile.start + tile.splat_count)
+        radii[rows] = 0.87 * math.ldexp(step, tile.exponent)
+        radii[rows] += np.abs(decoded.means[rows]).max(axis=1).astype(np.float64) * 2.0**-22
+    return radii
