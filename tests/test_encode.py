@@ -286,5 +286,14 @@ def test_progress_names_its_stages_and_ends_at_one(make_model):
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 
 
+def test_zlib_serves_where_libdeflate_is_absent(make_model, monkeypatch):
+    monkeypatch.setitem(sys.modules, "deflate", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    _, result = round_trip(make_model(50, 1))
+    assert "zlib" == result.report.options["deflate"]
+    with pytest.raises(InputError, match="deflate"):
+        encode(make_model(5, 0), EncodeOptions(deflate="libdeflate"))
+
+
 def test_errors_are_ours():
     assert issubclass(InputError, CsplatError)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import zlib
 from dataclasses import dataclass
 from typing import Any
 
-import deflate
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,8 +99,17 @@ def signed_stream(values: Integers, coding: Coding) -> bytes:
 
 
 def deflate_library(wanted: str) -> str:
-    """Resolve "auto" to the library that is used; it stands in the options chunk."""
-    return "libdeflate" if wanted == "auto" else wanted
+    """Resolve "auto" to the library that is used, libdeflate where its package is; it stands in the options chunk.
+
+    Raises:
+        InputError: libdeflate is wanted by name and its package is absent.
+    """
+    present = importlib.util.find_spec("deflate") is not None
+    if wanted == "libdeflate" and not present:
+        raise InputError("deflate: the package 'deflate' is not installed, use auto or zlib")
+    if wanted == "auto":
+        return "libdeflate" if present else "zlib"
+    return wanted
 
 
 def _entropy(symbols: NDArray[np.uint8]) -> float:
@@ -195,7 +204,13 @@ def _deflate(raw: bytes, coding: Coding) -> bytes:
         return _zlib(raw, min(coding.effort, 9), zlib.Z_DEFAULT_STRATEGY)
     if coding.effort <= _HUFFMAN_EFFORT and not _has_matches(raw):
         return _zlib(raw, 1, zlib.Z_HUFFMAN_ONLY)
-    return bytes(deflate.deflate_compress(raw, coding.effort))
+    return _libdeflate(raw, coding.effort)
+
+
+def _libdeflate(raw: bytes, level: int) -> bytes:
+    import deflate  # absent where its package has no wheel
+
+    return bytes(deflate.deflate_compress(raw, level))
 
 
 def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
@@ -207,7 +222,7 @@ def _has_matches(raw: bytes) -> bool:
     """Judge on samples whether a fast search for matches beats Huffman codes alone."""
     step = max(_SAMPLE, len(raw) // 4)
     sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
-    return len(deflate.deflate_compress(sample, 1)) < len(_zlib(sample, 1, zlib.Z_HUFFMAN_ONLY))
+    return len(_libdeflate(sample, 1)) < len(_zlib(sample, 1, zlib.Z_HUFFMAN_ONLY))
 
 
 def _zstandard(raw: bytes, effort: int) -> bytes:
