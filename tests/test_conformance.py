@@ -126,7 +126,10 @@ def test_a_file_beyond_the_byte_budget_is_refused():
 
 
 @by_name(
-    [vector for vector in INVALID if vector.name in ("invalid/digest", "invalid/chunk_crc", "invalid/metadata_crc")]
+    [
+        named(f"invalid/{name}")
+        for name in ("digest", "chunk_crc", "metadata_crc", "stated_errors_crc", "unknown_chunk_crc")
+    ]
 )
 def test_every_way_of_decoding_checks_the_whole_file(vector):
     ways = (

@@ -171,6 +171,7 @@ def test_parts_equal_the_same_parts_of_the_whole(tiles, degree):
 
 
 def test_tiles_one_by_one():
+    # CNF-4
     full = decode(RICH)
     found = list(iter_tiles(RICH))
     assert [0, 1] == [one.tile.index for one in found]

@@ -21,9 +21,9 @@ from csplat.errors import CsplatError, InputError
 PRESET_NAMES = tuple(PRESETS)
 
 
-def round_trip(model: SplatModel, **options: object):
+def round_trip(model: SplatModel, importance: np.ndarray | None = None, **options: object):
     """Encode, decode, and check the stated errors against the measured ones."""
-    result = encode_with_report(model, EncodeOptions(**options))
+    result = encode_with_report(model, EncodeOptions(**options), importance=importance)
     decoded = csplat.decode(result.data)
     assert len(model) == len(decoded)
     assert sorted(result.source_index.tolist()) == list(range(len(model)))
@@ -38,6 +38,7 @@ def round_trip(model: SplatModel, **options: object):
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_comes_back_within_stated_errors(make_model, preset, degree):
+    # CNF-5
     decoded, _ = round_trip(make_model(500, degree), preset=preset)
     assert degree >= decoded.sh_degree
 
@@ -99,6 +100,15 @@ def test_what_a_ply_forgets_comes_back(make_model):
 def test_extra_columns_stay_behind_unless_asked_for(make_model):
     model = make_model(20, 0, extra={"id": np.arange(20, dtype=np.int32)})
     assert {} == dict(round_trip(model)[0].extra)
+
+
+@pytest.mark.parametrize("dtype", ["<i4", ">i4", "<f8", ">f8", ">u2", "i1"])
+def test_extra_columns_keep_their_bits_in_any_byte_order(make_model, dtype):
+    bits = np.random.default_rng(0).bytes(20 * np.dtype(dtype).itemsize)
+    model = make_model(20, 0, extra={"id": np.frombuffer(bits, dtype)})
+    decoded, result = round_trip(model, keep_extra=True)
+    kept = decoded.extra["id"].astype(dtype)
+    assert model.extra["id"][result.source_index].tobytes() == kept.tobytes()
 
 
 def test_absent_bands_cost_nothing(make_model):
@@ -170,10 +180,34 @@ def test_extreme_values_come_back(make_model, preset):
     np.testing.assert_array_equal(back[16:32], 1)
 
 
-def test_an_outlier_harms_nobody(make_model):
+@pytest.mark.parametrize("step", [1e-250, 1e250])
+@pytest.mark.parametrize("magnitude", [1e-38, 1.0, 3e38])
+def test_any_step_for_any_magnitude(make_model, step, magnitude):
+    model = make_model(60, 0)
+    round_trip(replace(model, means=np.sign(model.means) * np.float32(magnitude)), position_step=step)
+
+
+def test_an_error_that_no_file_can_state_is_refused(make_model):
+    model = make_model(10, 0)
+    model.scales[:] = -300
+    with pytest.raises(InputError, match="covariance"):
+        encode(model, EncodeOptions(scale_step=1e3))
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_the_ends_of_float32_come_back(make_model, preset):
+    model = make_model(64, 1)
+    model.means[0], model.means[1] = 3e38, -3e38
+    model.scales[2] = 3e38
+    model.sh0[3] = 3e38
+    round_trip(model, preset=preset)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e12, 3e38])
+def test_an_outlier_harms_nobody(make_model, far):
     model = make_model(3000, 0)
     alone, first = round_trip(model)
-    outlier = np.concatenate([model.means, [[1000.0, 0, 0]]]).astype(np.float32)
+    outlier = np.concatenate([model.means, [[far, 0, 0]]]).astype(np.float32)
     rows = np.append(np.arange(3000), 0)
     decoded, second = round_trip(replace(model.select(rows), means=outlier))
     before = np.abs(alone.means - model.means[first.source_index]).max()
@@ -209,6 +243,7 @@ def wild_models(draw):
 @given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
+    # CNF-6
     with suppress(InputError):
         round_trip(model, preset=preset, sh_coding=coding)
 
@@ -241,14 +276,36 @@ def test_bytes_do_not_depend_on_blas_threads():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("preset", "tiny"), ("position_bits", 17), ("sh_degree", 4), ("quat_levels", 2), ("effort", 0), ("scale_step", 0)],
+    [
+        ("preset", "tiny"),
+        ("position_bits", 17),
+        ("position_bits", 8.5),
+        ("sh_degree", 4),
+        ("quat_levels", 2),
+        ("effort", 0),
+        ("scale_step", 0),
+        ("scale_step", float("nan")),
+        ("sh_step", "0.1"),
+        ("tile_splats", None),
+        ("seed", -1),
+        ("threads", 0),
+    ],
 )
 def test_refuses_options_out_of_range(name, value):
     with pytest.raises(InputError, match=name):
         EncodeOptions(**{name: value})
 
 
-@pytest.mark.parametrize("bad", [np.ones(3), -np.ones(10), np.full(10, np.nan)])
+def test_numpys_numbers_are_numbers(make_model):
+    model = make_model(20, 1)
+    options = EncodeOptions(position_bits=np.int64(12), scale_step=np.float32(0.25), sh_step=np.float64(0.1))
+    assert encode(model, options) == encode(model, EncodeOptions(position_bits=12, scale_step=0.25, sh_step=0.1))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [np.ones(3), -np.ones(10), np.full(10, np.nan), np.ones(10, complex), np.full(10, "1"), np.zeros(10, "M8[s]")],
+)
 def test_refuses_an_importance_that_does_not_fit(make_model, bad):
     with pytest.raises(InputError, match="importance"):
         encode_with_report(make_model(10, 1), importance=bad)
@@ -268,6 +325,46 @@ def test_importance_decides_who_is_coded_finely(make_model):
     error = ((decoded.shN - model.shN[result.source_index]) ** 2).sum(axis=(1, 2))
     favoured = result.source_index < 200
     assert float(error[favoured].mean()) < 0.5 * float(error[~favoured].mean())
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_most_splats_may_have_no_importance(make_model, preset):
+    model = make_model(600, 2)
+    importance = np.zeros(600)
+    importance[:10] = 1.0
+    decoded, result = round_trip(model, preset=preset, sh_coding="scalar", importance=importance)
+    error = ((decoded.shN - model.shN[result.source_index]) ** 2).sum(axis=(1, 2))
+    favoured = result.source_index < 10
+    assert (
+        float(error[favoured].mean()) < float(error[~favoured].mean()) < float((model.shN**2).sum(axis=(1, 2)).mean())
+    )
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2])
+@pytest.mark.parametrize("reach", [0.62, 163.8])
+def test_coarse_chroma_does_not_wrap_at_the_end_of_its_type(make_model, shift, reach):
+    model = make_model(500, 1)
+    model.shN[:] = np.clip(model.shN * reach, -reach, reach)
+    model.shN[:, :, 2] = -model.shN[:, :, 0]
+    importance = np.where(np.arange(500) < 100, 1.0, 1e-8)
+    round_trip(model, importance, preset="fast", chroma_shift=shift, sh_step=0.01, adaptive=1.0)
+
+
+@pytest.mark.parametrize("coding", ["codebook", "scalar"])
+def test_invisible_splats_are_no_special_case(make_model, coding):
+    model = make_model(600, 2, opacities=np.zeros(600, np.float32))
+    decoded, _ = round_trip(model, preset="small", sh_coding=coding, adaptive=1.0)
+    assert decoded.shN.any()
+
+
+def test_wild_colours_of_an_invisible_splat_do_not_decide_how_sh_is_coded(make_model):
+    model = make_model(600, 2)
+    model.shN[5] = 1e3
+    model.opacities[5] = 0.0
+    decoded, result = round_trip(model, sh_coding="codebook", escape_fraction=0.0)
+    assert "codebook" == result.report.options["sh_coding"]
+    place = int(np.flatnonzero(result.source_index == 5)[0])
+    assert np.abs(decoded.shN[place] - 1e3).max() < 1.0  # it was clipped for the clustering, so it escapes
 
 
 def test_options_stand_in_the_file(make_model):

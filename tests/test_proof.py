@@ -194,7 +194,8 @@ def test_what_the_encoder_states_is_proved(make_model, preset):
     assert not proof.rms_proved
 
 
-def test_too_small_a_statement_is_not_proved(make_model):
+def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
+    # SER-5
     source = make_model(500, 1)
     result = encode_with_report(source)
     scene = decode_scene(result.data)
@@ -205,9 +206,14 @@ def test_too_small_a_statement_is_not_proved(make_model):
         stated = replace(scene.stated_errors, records=tuple(records))
         assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
         assert not prove(source, scene.model, scene.header, stated).holds
-        records[number] = replace(record, rms=record.rms * 0.99)
-        stated = replace(scene.stated_errors, records=tuple(records))
-        assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
+        for wrong in (
+            replace(record, rms=record.rms * 0.99999),
+            replace(record, rms=record.rms * 1.001),
+            replace(record, max=record.max * 1.001),
+        ):
+            records[number] = wrong
+            stated = replace(scene.stated_errors, records=tuple(records))
+            assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
 
 
 def test_a_refitted_or_silent_file_is_not_proved(make_model):

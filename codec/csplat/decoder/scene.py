@@ -179,8 +179,7 @@ def decode_integers(
         write_integers(source, header, part, out["exponents"][place])
 
     _read_side_chunks(job)
-    for kind in (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS):
-        read_json(job.view, header, kind, job.limits.json_bytes)
+    _check_json(job)
     _run(job, work, threads)
     return out
 
@@ -194,8 +193,8 @@ def iter_tiles(
 ) -> Iterator[DecodedTile]:
     """Decode tile by tile, in memory for one tile and the codebooks.
 
-    An iteration over all tiles checks the digest and the CRC of all chunks before it gives the
-    first. `limits.splats` does not apply, `limits.bytes` to one tile at a time.
+    An iteration over all tiles checks the digest, and the CRC of every chunk but the tiles' own,
+    before it gives the first. `limits.splats` does not apply, `limits.bytes` to one tile at a time.
 
     Args:
         data: the whole file; an `mmap` need not fit the memory.
@@ -249,6 +248,12 @@ def _read_side_chunks(job: _Job) -> tuple[dict[str, Any] | None, StatedErrors | 
         check_unnamed_codebooks(job.view, job.header)
     options = read_json(job.view, job.header, _spec.CHUNK_OPTIONS, job.limits.json_bytes)
     return options, read_serr(job.view, job.header)
+
+
+def _check_json(job: _Job) -> None:
+    """Read metadata and cameras where nobody asks what is in them."""
+    for kind in (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS):
+        read_json(job.view, job.header, kind, job.limits.json_bytes)
 
 
 def _run(job: _Job, work: Callable[[int, Tile, int, dict[int, Codebook]], None], threads: int | None) -> None:
@@ -305,6 +310,7 @@ def _iterate(job: _Job) -> Iterator[DecodedTile]:
     if job.whole:
         check_digest(job.view, header.digest)
         _read_side_chunks(job)
+        _check_json(job)
     with np.errstate(all="ignore"):
         books = read_codebooks(job.view, header, job.tiles, job.degree)
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))

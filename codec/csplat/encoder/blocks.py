@@ -82,7 +82,7 @@ def codebook_block(
 
 def raw_block(column: int, values: NDArray[Any], coding: Coding) -> bytes:
     """RAW: the bits of an extra column's values [n]."""
-    bits = np.ascontiguousarray(values).view(f"u{values.itemsize}")
+    bits = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
     params = _spec.pack_raw_params(_spec.RawParams(column, 0))
     stream = unsigned_stream(bits, coding, fixed_width=values.itemsize)
     return _head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + params + stream

@@ -33,6 +33,7 @@ _LEAST = 256  # splats for which a codebook may pay
 _MANY = 4096  # entries from which on searching near groups saves more than it loses
 _ENOUGH = 1 << 15  # splats whose share of entries a smaller scene gets too, if it has users for them
 _USERS = 6  # splats per entry below which an entry does not pay for itself
+_IMPORTANT = 0.95  # quantile of the weights from which on a splat is quantised on the full lattice
 _CODEBOOK_ID = 0
 
 
@@ -83,8 +84,7 @@ def choose_sh(
         threads: how many to use; the result does not depend on it.
         report: progress.
     """
-    reference = 1.0 if weights is None or not len(weights) else float(np.quantile(weights, 0.95))
-    tables = ShTables(weights, reference, extras=extras)
+    tables = ShTables(weights, _reference(weights), extras=extras)
     scalar = Books(replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), tables)
     if plan.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
         return scalar
@@ -96,6 +96,16 @@ def choose_sh(
     if plan.sh_coding == "auto" and not _codebook_pays(model, weights, stages, books, sample[:_SAMPLE], plan):
         return scalar
     return books
+
+
+def _reference(weights: F32 | None) -> float:
+    """Return the weight of a splat that matters: the 95th percentile, of positive weights where most are 0."""
+    if weights is None or not len(weights):
+        return 1.0
+    if (reference := float(np.quantile(weights, _IMPORTANT))) > 0.0:
+        return reference
+    positive = weights[weights > 0.0]
+    return float(np.quantile(positive, _IMPORTANT)) if len(positive) else 1.0
 
 
 def _train(
@@ -117,7 +127,8 @@ def _train(
     ranked = [rank_by_frequency(index, entries) for entries, index in found]
     indices = [index.astype(np.int32) for index, _ in ranked]
     entries = [entry for _, entry in ranked]
-    errors = _errors(model.shN, indices, entries, plan) * weights
+    errors = _errors(model.shN, indices, entries, plan)
+    np.multiply(errors, weights, out=errors, where=np.isfinite(errors))  # infinity × 0 would be NaN
     escaped = _escapes(errors, plan, options)
     errors[escaped] = 0.0
     indices[0][escaped] = len(entries[0])

@@ -123,7 +123,8 @@ def quantise_rows(source: F32, plan: Plan, coarse: I32 | None) -> tuple[Integers
     largest = max(abs(float(source.max(initial=0.0))), abs(float(source.min(initial=0.0))))
     exponent = lattice_exponent(2.0 * largest, plan.sh_step)
     step = lattice_step(plan.sh_step, exponent)
-    columns = np.empty((3, coefficients, n), _narrowest(2.0 * largest / step + 2.0))
+    coarsest = 0 if coarse is None else int(coarse.max(initial=0))
+    columns = np.empty((3, coefficients, n), _narrowest(2.0 * largest / step + 1.0 + 2.0**coarsest))
     decoded = np.empty(source.shape, np.float32)
     real = np.float32 if exponent == 0 else np.float64
     for at in range(0, n, _ROWS):

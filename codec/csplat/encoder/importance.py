@@ -30,20 +30,23 @@ def splat_weights(model: SplatModel, importance: NDArray[Any] | None) -> F32:
         importance: [N], finite, >= 0, or None.
 
     Raises:
-        InputError: an importance of another shape, negative or not finite.
+        InputError: an importance of another shape or type, negative or not finite.
     """
     if importance is None:
         weights = np.empty(len(model), np.float32)
         for at in range(0, len(model), _BLOCK):
             part = slice(at, at + _BLOCK)
             scales = model.scales[part]
-            size = (scales.sum(axis=1) - scales.min(axis=1)) * np.float32(0.5)
+            with np.errstate(over="ignore"):  # infinity is clipped like all that is too large
+                size = (scales.sum(axis=1) - scales.min(axis=1)) * np.float32(0.5)
             np.clip(size, -_LARGEST_LOG, _LARGEST_LOG, out=size)
             weights[part] = model.opacities[part] * np.exp(size)
         return weights
     given = np.asarray(importance)
     if given.shape != (len(model),):
         raise InputError(f"importance has shape {given.shape}, wanted ({len(model)},)")
+    if given.dtype.kind not in "biuf":
+        raise InputError(f"importance has dtype {given.dtype}, wanted real numbers")
     values = given.astype(np.float64)
     if not (np.isfinite(values).all() and (values >= 0).all()):
         raise InputError("importance has negative or non-finite values")

@@ -5,6 +5,7 @@ The functions on columns serve the encoder, tile by tile; `measure_errors` serve
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -38,9 +39,17 @@ class ErrorSums:
         return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
 
     def stated(self) -> dict[str, tuple[float, float]]:
-        """Return `bounds()` a hair wider: whoever checks them may round in another order (spec SER-5)."""
+        """Return `bounds()` a hair wider: whoever checks them may round in another order (spec SER-5).
+
+        Raises:
+            InputError: an error that float64 does not hold; a file cannot state it (SER-2).
+        """
         result = {}
         for name, (largest, rms) in self.bounds().items():
+            if not (math.isfinite(largest) and math.isfinite(rms)):
+                raise InputError(
+                    f"the error of {name} is too large to be stated: the step is too coarse for the values"
+                )
             floor = _ROUNDING if name == "covariance" else 0.0  # a ratio, whose rounding does not shrink with it
             result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
         return result
@@ -102,9 +111,10 @@ def covariance_errors(
         decoded = np.exp(np.minimum(2.0 * (scales[:, part] - top), 600.0))
         difference = _covariance(quats[:, part], decoded)
         difference -= _covariance(source_quats[:, part], variances)
-        difference *= difference
-        difference[3:] *= 2.0  # each entry beside the diagonal stands twice
-        error = difference.sum(axis=0)
+        with np.errstate(over="ignore"):  # infinity is what `stated` refuses
+            difference *= difference
+            difference[3:] *= 2.0  # each entry beside the diagonal stands twice
+            error = difference.sum(axis=0)
         error /= (variances * variances).sum(axis=0)
         squares += float(error.sum())
         largest = max(largest, float(error.max()))

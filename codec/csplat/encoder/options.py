@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any
 
 from csplat import _spec
@@ -36,7 +38,7 @@ class EncodeOptions:
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). By default only where an importance is given.
         tile_splats: splats per tile at most, 1 to 65536.
-        effort: DEFLATE level, 1 to 12.
+        effort: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: carry the model's extra columns.
         seed: of the k-means.
@@ -72,10 +74,15 @@ class EncodeOptions:
         for name, words in _WORDS.items():
             if getattr(self, name) not in words:
                 raise InputError(f"{name} is {getattr(self, name)!r}, wanted one of {', '.join(words)}")
-        for name, (low, high) in _RANGES.items():
+        for name, (kind, low, high) in _RANGES.items():
             value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
+            if value is None and name not in _NEVER_NONE:
+                continue
+            number = _number(value, kind)
+            if number is None or not low <= number <= high:
+                what = "an integer, " if kind is int else ""
+                raise InputError(f"{name} is {value!r}, wanted {what}{low:g} to {high:g}")
+            object.__setattr__(self, name, number)  # a plain number: NumPy's are no JSON
 
     def chosen(self) -> dict[str, Any]:
         """Return what the caller set, by name, without what cannot change the bytes (`threads`)."""
@@ -125,22 +132,32 @@ _WORDS = {
     "sh_coding": ("auto", "codebook", "scalar", "none"),
     "deflate": ("auto", "libdeflate", "zlib"),
 }
-_TINY, _HUGE = 1e-300, 1e300
-_RANGES: dict[str, tuple[float, float]] = {
-    "quality": (10, 120),
-    "position_bits": (2, 16),
-    "position_step": (_TINY, _HUGE),
-    "scale_step": (1e-6, 1e3),
-    "opacity_levels": (1, _spec.OPACITY_LEVELS_MAX),
-    "quat_levels": (_spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX),
-    "sh0_step": (1e-6, 1e3),
-    "sh_step": (1e-6, 1e3),
-    "chroma_shift": (0, _spec.CHROMA_SHIFT_MAX),
-    "sh_degree": (0, _spec.SH_DEGREE_MAX),
-    "codebook_size": (1, _spec.CODEBOOK_ENTRIES_MAX),
-    "codebook_stages": (1, _spec.STAGES_MAX),
-    "escape_fraction": (0, 1),
-    "adaptive": (0, 1),
-    "tile_splats": (1, _spec.TILE_SPLATS_MAX),
-    "effort": (1, 12),
+_TINY, _HUGE = 1e-250, 1e250  # a float32 over the one, and the other over a float32, stay within float64
+_RANGES: dict[str, tuple[type[int | float], float, float]] = {
+    "quality": (float, 10, 120),
+    "position_bits": (int, 2, 16),
+    "position_step": (float, _TINY, _HUGE),
+    "scale_step": (float, 1e-6, 1e3),
+    "opacity_levels": (int, 1, _spec.OPACITY_LEVELS_MAX),
+    "quat_levels": (int, _spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX),
+    "sh0_step": (float, 1e-6, 1e3),
+    "sh_step": (float, 1e-6, 1e3),
+    "chroma_shift": (int, 0, _spec.CHROMA_SHIFT_MAX),
+    "sh_degree": (int, 0, _spec.SH_DEGREE_MAX),
+    "codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
+    "codebook_stages": (int, 1, _spec.STAGES_MAX),
+    "escape_fraction": (float, 0, 1),
+    "adaptive": (float, 0, 1),
+    "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
+    "effort": (int, 1, 12),
+    "seed": (int, 0, math.inf),
+    "threads": (int, 1, math.inf),
 }
+_NEVER_NONE = ("tile_splats", "seed")
+
+
+def _number(value: Any, kind: type[int | float]) -> int | float | None:
+    """Return a Python number of that kind, or None where the value is none."""
+    if kind is int:
+        return int(value) if isinstance(value, Integral) else None
+    return float(value) if isinstance(value, Real) else None

@@ -169,13 +169,15 @@ def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattic
     rows = slice(None, None, max(1, len(model) // _SAMPLE))
     points = np.sort(model.means[rows].astype(np.float64), axis=0)
     edge = int(len(points) * _EDGE)
-    extent = float((points[len(points) - 1 - edge] - points[edge]).max()) or float((points[-1] - points[0]).max())
+    core = points[[edge, len(points) - 1 - edge]]
+    extent = float((core[1] - core[0]).max()) or float((points[-1] - points[0]).max())
+    reach = float(np.abs(core).max())
     if options.position_bits is not None:
-        return Lattice(_usable(extent / ((1 << options.position_bits) - 2), points), options.position_bits, True)
-    return Lattice(_usable(wanted or extent / (1 << _MOST_BITS), points), _MOST_BITS)
+        return Lattice(_usable(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
+    return Lattice(_usable(wanted or extent / (1 << _MOST_BITS), reach), _MOST_BITS)
 
 
-def _usable(step: float, points: NDArray[np.float64]) -> float:
-    """Keep the step normal, and no finer than float32 is about the scene's farthest splat."""
-    step = max(step, float(np.abs(points).max()) * 2.0**-40)
+def _usable(step: float, reach: float) -> float:
+    """Keep the step normal, and no finer than float32 is at the end of the scene's core."""
+    step = max(step, reach * 2.0**-40)
     return step if np.isfinite(step) and step > _LEAST_STEP else 1.0

@@ -52,7 +52,7 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
     for name, column in model.extra.items():
         text = name.encode()
-        kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}".replace("b8", "u8")
+        kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}"
         if kind not in ids:
             raise InputError(f"extra column {name!r} has dtype {column.dtype}, wanted one of {', '.join(ids)}")
         if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):

@@ -23,6 +23,7 @@ _RUNS = 16  # of neighbours among them
 _APART = 8  # places in Morton order
 _CORE = 0.8  # share of the splats within the scene's reach
 _BITS = 16
+_LARGEST = 1e38  # of float32
 _COLOUR_PER_SH0 = 0.28209479177387814
 
 
@@ -75,11 +76,12 @@ def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> f
 def _neighbours(means: NDArray[np.float32], centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
     """Return runs of splats in Morton order: all of a small scene, some of a large one."""
     codes = np.empty(len(means), np.int64)
-    scale, top = np.float32(1.0 / reach), (1 << _BITS) - 1
+    scale, top = np.float32(min(1.0 / reach, _LARGEST)), (1 << _BITS) - 1
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)
     for at in range(0, len(means), _SAMPLE):
-        place = means[at : at + _SAMPLE].T * scale + shift[:, None]
-        codes[at : at + _SAMPLE] = morton_codes(np.clip(place * top, 0, top).astype(np.int32))
+        with np.errstate(over="ignore"):  # infinity is clipped like all that is out of reach
+            place = means[at : at + _SAMPLE].T * scale + shift[:, None]
+        codes[at : at + _SAMPLE] = morton_codes((np.clip(place, 0, 1) * top).astype(np.int32))
     if len(means) <= 2 * _SAMPLE:
         return [np.argsort(codes, kind="stable")]
     bounds = np.sort(codes[:: len(codes) // _SAMPLE])

@@ -61,7 +61,10 @@ def _chunks() -> list[Recipe]:
         patched("chunk_size_zero", "a size of 0", "CHK-3", "E_INDEX", one, {f"{first}.size": 0}),
         patched("chunk_crc", "a tile's CRC alone is wrong", "CHK-1", "E_CRC", one, {f"{tail}crc": 7}),
         patched(
-            "metadata_crc",
+            "metadata_crc", "the CRC of the metadata alone is wrong", "CHK-1 CHK-2", "E_CRC", base, {"META/crc": 7}
+        ),
+        patched(
+            "stated_errors_crc",
             "the CRC of a chunk that decoding does not need",
             "CHK-1 CHK-2",
             "E_CRC",
