@@ -1,0 +1,119 @@
+// The chunks that describe a scene: META, CAMS, OPTS (spec 5.4) and SERR (5.5).
+
+import { fault } from './errors.mjs';
+import { Payload } from './payload.mjs';
+import { nameOf } from './registry.mjs';
+import * as spec from './spec.mjs';
+import { readJson } from './streams.mjs';
+
+const { ERROR_JSON, ERROR_RESERVED, ERROR_VALUE } = spec;
+
+/**
+ * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
+ * @typedef {import('./decoder.d.ts').Description} Description
+ * @typedef {import('./decoder.d.ts').StatedErrors} StatedErrors
+ * @typedef {import('./inflate.mjs').Inflate} Inflate
+ */
+
+/** @type {() => Description} */
+export const emptyDescription = () => ({ metadata: null, cameras: null, options: null, statedErrors: null });
+
+/**
+ * Read an ancillary chunk that this version knows into its place in `into`.
+ *
+ * @param {Description} into
+ * @param {DirectoryRecord} record
+ * @param {Uint8Array<ArrayBuffer>} bytes payload
+ * @param {{splatCount: number, jsonBytes: number, inflate: Inflate}} scene
+ */
+export async function describe(into, record, bytes, { splatCount, jsonBytes, inflate }) {
+  const { type } = record;
+  const base = record.offset + spec.CHUNK_HEADER_SIZE;
+  if (type === spec.CHUNK_STATED_ERRORS) {
+    into.statedErrors = readStatedErrors(new Payload(bytes, base, 'SER-3'), splatCount);
+    return;
+  }
+  const { value, offset } = await readJson(new Payload(bytes, base, 'JSN-2'), jsonBytes, inflate);
+  if (type === spec.CHUNK_CAMERAS) {
+    if (!Array.isArray(value) || !value.every(isObject))
+      throw fault(ERROR_JSON, offset, 'JSN-1', 'CAMS is not an array of objects');
+    into.cameras = value;
+  } else {
+    if (!isObject(value)) throw fault(ERROR_JSON, offset, 'JSN-1', `${type} is not an object`);
+    into[type === spec.CHUNK_METADATA ? 'metadata' : 'options'] = value;
+  }
+}
+
+/**
+ * @param {unknown} value
+ * @returns {value is Record<string, unknown>}
+ */
+const isObject = (value) => typeof value === 'object' && value !== null && !Array.isArray(value);
+
+/**
+ * @param {Payload} payload
+ * @param {number} splatCount
+ * @returns {StatedErrors}
+ */
+function readStatedErrors(payload, splatCount) {
+  const { fields: head, offset } = payload.read(
+    spec.unpackStatedErrorsHead,
+    spec.STATED_ERRORS_HEAD_SIZE,
+    {},
+    'the head of SERR',
+  );
+  const { source_count: source, pruned_count: pruned } = head;
+  // SER-4: integers, not modulo 2^64
+  if (source - pruned !== BigInt(splatCount)) {
+    throw fault(ERROR_VALUE, offset, 'SER-4', `${source} splats less ${pruned}, the file holds ${splatCount}`);
+  }
+  if (head.error_flags & ~spec.ERROR_FLAG_REFITTED) {
+    throw fault(ERROR_RESERVED, offset + 17, 'RES-1', `flags ${head.error_flags} of the stated errors`);
+  }
+  /** @type {StatedErrors} */
+  const stated = {
+    sourceCount: Number(source),
+    prunedCount: Number(pruned),
+    sourceShDegree: head.source_sh_degree,
+    refitted: (head.error_flags & spec.ERROR_FLAG_REFITTED) !== 0,
+    errors: {},
+  };
+  let last = 0;
+  for (let i = 0; i < head.record_count; i++) last = readStatedError(payload, last, stated);
+  payload.finish();
+  return stated;
+}
+
+/**
+ * @param {Payload} payload
+ * @param {number} last measure of the record before
+ * @param {StatedErrors} stated
+ * @returns {number} this record's measure
+ */
+function readStatedError(payload, last, stated) {
+  const { fields, offset } = payload.read(
+    spec.unpackStatedErrorRecord,
+    spec.STATED_ERROR_RECORD_SIZE,
+    { reserved_0: 1, reserved_1: 2, reserved_2: 4 },
+    'a stated error',
+  );
+  const { measure, max, rms } = fields;
+  const name = nameOf(spec.MEASURE_NAMES, measure);
+  if (name === undefined || measure <= last)
+    throw fault(ERROR_VALUE, offset, 'SER-1', `measure ${measure} after ${last}`);
+  const components = Math.sqrt(measureComponents(measure));
+  const room = 1 + 2 ** -20;
+  // Negated, so that NaN is refused; max = Infinity would let every rms pass.
+  if (!(max >= 0 && rms >= 0 && Number.isFinite(max) && rms <= max * components * room)) {
+    throw fault(ERROR_VALUE, offset + 8, 'SER-2', `${name}: maximum ${max}, rms ${rms}`);
+  }
+  stated.errors[name] = { max, rms };
+  return measure;
+}
+
+/**
+ * Components of a measure (spec 5.5): 3 (2l + 1) for SH band l, 1 for the others.
+ *
+ * @param {number} measure
+ */
+const measureComponents = (measure) => (measure < spec.MEASURE_SH0 ? 1 : 3 * (2 * (measure - spec.MEASURE_SH0) + 1));

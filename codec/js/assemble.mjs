@@ -1,0 +1,70 @@
+// From decoded layers to what the caller gets.
+
+import { FloatArrays, IntegerArrays, arrayBytes } from './arrays.mjs';
+import { allocate, fault } from './errors.mjs';
+import { ExtraArrays } from './extras.mjs';
+import * as spec from './spec.mjs';
+
+/**
+ * @typedef {import('./decoder.d.ts').Header} Header
+ * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./tile.mjs').Layer} Layer
+ */
+
+/** The arrays of some tiles, one after the other. */
+export class Assembly {
+  /**
+   * @param {Header} header
+   * @param {TileRecord[]} tiles
+   * @param {{shDegree: number, integers: boolean, extra: boolean}} wanted
+   * @param {Required<Limits>} limits
+   * @param {number} tableBytes of all codebooks
+   */
+  constructor(header, tiles, { shDegree, integers, extra }, limits, tableBytes) {
+    const count = tiles.reduce((sum, tile) => sum + tile.splatCount, 0);
+    const extras = extra ? header.extras : [];
+    checkBudget(count, arrayBytes(count, shDegree, extras, integers) + tableBytes, limits);
+    this.count = count;
+    this.shDegree = shDegree;
+    this.arrays = allocate(() =>
+      integers
+        ? new IntegerArrays(count, shDegree, tiles, spec.ATTRIBUTE_SH0 + shDegree)
+        : new FloatArrays(count, shDegree),
+    );
+    this.extras = allocate(() => new ExtraArrays(count, extras));
+  }
+
+  /**
+   * @param {Layer} layer
+   * @param {TileRecord} tile
+   * @param {number} first splat of the arrays that is the tile's first
+   */
+  put({ blocks, extras }, tile, first) {
+    for (const block of blocks) this.arrays.put(block, tile, first);
+    this.extras.put(extras, first);
+  }
+
+  fields() {
+    return { ...this.arrays.fields(), extra: this.extras.byName(), count: this.count, shDegree: this.shDegree };
+  }
+}
+
+/**
+ * LIM-1
+ *
+ * @param {number} count splats
+ * @param {number} bytes of arrays and tables
+ * @param {Required<Limits>} limits
+ */
+function checkBudget(count, bytes, limits) {
+  const at = spec.HEADER_SIZE; // splat_count
+  if (count > limits.splats)
+    throw fault(spec.ERROR_LIMIT, at, 'LIM-1', `${count} splats, the budget is ${limits.splats}`);
+  if (bytes > limits.bytes) {
+    throw fault(spec.ERROR_LIMIT, at, 'LIM-1', `arrays and tables of ${bytes} bytes, the budget is ${limits.bytes}`);
+  }
+}
+
+/** @param {Header['codebooks']} codebooks */
+export const codebooksById = (codebooks) => new Map(codebooks.map((codebook) => [codebook.id, codebook]));

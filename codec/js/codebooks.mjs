@@ -1,0 +1,328 @@
+// Codebooks: their chunks (spec 5.3) and the blocks that refer to them (6.4.5).
+
+import {
+  checkCoding,
+  checkIntegers,
+  columnCount,
+  readBlockHead,
+  readLatticeParams,
+  readOffsets,
+  readValues,
+} from './codings.mjs';
+import { fault } from './errors.mjs';
+import { putRows, rgbFromYcocg } from './lattice.mjs';
+import { Payload } from './payload.mjs';
+import * as spec from './spec.mjs';
+import { readStream } from './streams.mjs';
+import { signed } from './transforms.mjs';
+
+const { ERROR_CODEBOOK, ERROR_INDEX, ERROR_STREAM } = spec;
+const ENTRY_WIDTH_MAX = 4; // STR-2
+const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
+
+/**
+ * Entries of one chunk: per stage the columns one after the other, each `size` entries and a 0 (the place of the escape
+ * index in stage 0), and what none of them exceeds in magnitude.
+ *
+ * @typedef {{size: number, entries: Int32Array, bound: number}} Stage
+ * @typedef {{stages: Stage[], values?: Float32Array}} Table with the values of its entries once they are needed
+ *
+ * What a tile's blocks of one codebook have in common.
+ *
+ * @typedef {{indices: Uint32Array[], escapeCount: number, escaped: Uint32Array}} Indices
+ * @typedef {import('./codings.mjs').Block} Block
+ * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
+ * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
+ * @typedef {import('./tile.mjs').TileContext} TileContext
+ * @typedef {import('./inflate.mjs').Inflate} Inflate
+ */
+
+/** @param {string} name of an attribute */
+function columnsOf(name) {
+  const id = Object.entries(spec.ATTRIBUTE_NAMES).find((entry) => entry[1] === name)?.[0];
+  return spec.ATTRIBUTE_COLUMNS[/** @type {keyof typeof spec.ATTRIBUTE_COLUMNS} */ (Number(id))];
+}
+
+/**
+ * Columns of a codebook's chunk: those of the band, or of all attributes of the kind.
+ *
+ * @param {CodebookRecord} codebook
+ * @param {number} layer
+ */
+function tableColumns({ attributes, bandFirst }, layer) {
+  if (layer > 0) return columnsOf(attributes[layer - bandFirst]);
+  return attributes.reduce((sum, name) => sum + columnsOf(name), 0);
+}
+
+/**
+ * Bytes that the tables of some CODB chunks take, for the budget.
+ *
+ * @param {DirectoryRecord[]} directory
+ * @param {Map<number, CodebookRecord>} codebooks by id
+ */
+export function tableBytes(directory, codebooks) {
+  let bytes = 0;
+  for (const { type, id, layer } of directory) {
+    const codebook = type === spec.CHUNK_CODEBOOK ? codebooks.get(id) : undefined;
+    if (codebook) for (const size of codebook.sizes) bytes += 4 * (size + 1) * tableColumns(codebook, layer);
+  }
+  return bytes;
+}
+
+/**
+ * Read the payload of a CODB chunk.
+ *
+ * @param {Uint8Array<ArrayBuffer>} bytes
+ * @param {DirectoryRecord} record
+ * @param {CodebookRecord} codebook
+ * @param {Inflate} inflate
+ * @returns {Promise<Table>}
+ */
+export async function readTable(bytes, { id, layer, offset }, codebook, inflate) {
+  const payload = new Payload(bytes, offset + spec.CHUNK_HEADER_SIZE, 'CDB-2');
+  const { fields, offset: at } = payload.read(
+    spec.unpackCodebookHead,
+    spec.CODEBOOK_HEAD_SIZE,
+    {},
+    'the head of a codebook',
+  );
+  const { codebook_id, layer: itsLayer, stage_count } = fields;
+  const stageCount = codebook.sizes.length;
+  if (codebook_id !== id) throw fault(ERROR_INDEX, at, 'CDB-1', `codebook ${codebook_id} instead of ${id}`);
+  if (itsLayer !== layer) throw fault(ERROR_INDEX, at + 2, 'CDB-1', `layer ${itsLayer} instead of ${layer}`);
+  if (stage_count !== stageCount)
+    throw fault(ERROR_INDEX, at + 3, 'CDB-1', `${stage_count} stages instead of ${stageCount}`);
+  const count = tableColumns(codebook, layer);
+  /** @type {Stage[]} */
+  const stages = [];
+  for (const size of codebook.sizes) {
+    const integers = signed(await readStream(payload, size * count, ENTRY_WIDTH_MAX, inflate));
+    const entries = new Int32Array((size + 1) * count);
+    for (let c = 0; c < count; c++) entries.set(integers.subarray(c * size, (c + 1) * size), c * (size + 1));
+    let bound = 0;
+    for (let i = 0; i < integers.length; i++) bound = Math.max(bound, Math.abs(integers[i]));
+    stages.push({ size, entries, bound });
+  }
+  payload.finish();
+  return { stages };
+}
+
+/**
+ * Read a block coded CODEBOOK, behind its head.
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {boolean} integers whether all integers are wanted; if not, colours may stay in a table
+ * @returns {Promise<Block>}
+ */
+export async function readCodebookBlock(tile, payload, attribute, integers) {
+  const { fields, offset: at } = payload.read(
+    spec.unpackCodebookParams,
+    spec.CODEBOOK_PARAMS_SIZE,
+    { reserved_0: 2 },
+    'codebook parameters',
+  );
+  const { codebook_id: id, escape_count: escapeCount } = fields;
+  const codebook = tile.codebook(id);
+  if (codebook === undefined || !codebook.attributes.includes(attribute.name)) {
+    throw fault(
+      ERROR_CODEBOOK,
+      at,
+      'CBK-1',
+      `codebook ${id} for ${attribute.name}: not listed by the tile, or of another kind`,
+    );
+  }
+  const isFirst = codebook.attributes[0] === attribute.name;
+  const shared = isFirst
+    ? await readIndices(tile, payload, codebook, escapeCount, at)
+    : await knownIndices(tile, codebook, escapeCount, at);
+  const isSh = codebook.bandFirst > 0;
+  const table = await tile.table(id, isSh ? attribute.id - spec.ATTRIBUTE_SH0 : 0);
+  const values = integers ? null : tableValues(table, attribute);
+  const offset = at - spec.BLOCK_HEAD_SIZE;
+  if (values) {
+    const lookup = { values, index: shared.indices[0], escaped: shared.escaped };
+    if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
+    return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
+  }
+  // Columns of the codebook's attributes before this one; a band has a chunk of its own.
+  const before = isSh ? 0 : codebook.attributes.indexOf(attribute.name) * spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SCALES];
+  const block = sumEntries(tile.sums(attribute), table, before, shared.indices, attribute, offset);
+  if (codebook.kind === KIND_SHAPE && isFirst) await addSummand(tile, payload, block);
+  if (escapeCount) putEscapes(block, shared.escaped, await readEscapes(tile, payload, attribute, escapeCount));
+  checkIntegers(block, tile.splatCount);
+  return block;
+}
+
+/**
+ * The indices of a codebook's first block (CBK-2, CBK-3), remembered for its other blocks.
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {CodebookRecord} codebook
+ * @param {number} escapeCount
+ * @param {number} at of the parameters
+ * @returns {Promise<Indices>}
+ */
+async function readIndices(tile, payload, codebook, escapeCount, at) {
+  const n = tile.splatCount;
+  const indices = [];
+  for (const [stage, size] of codebook.sizes.entries()) {
+    const { low, offset } = await readStream(payload, n, spec.CODING_WIDTH_MAX[spec.CODING_CODEBOOK], tile.inflate);
+    const most = stage === 0 ? size : size - 1; // stage 0 has one more: the escape
+    for (let i = 0; i < n; i++) {
+      if (low[i] > most)
+        throw fault(ERROR_CODEBOOK, offset, 'CBK-2', `index ${low[i]} in stage ${stage} of ${size} entries`);
+    }
+    indices.push(low);
+  }
+  const found = [];
+  for (let i = 0; i < n; i++) if (indices[0][i] === codebook.sizes[0]) found.push(i);
+  if (found.length !== escapeCount) {
+    throw fault(ERROR_CODEBOOK, at + 4, 'CBK-3', `${found.length} splats are escaped, ${escapeCount} announced`);
+  }
+  const shared = { indices, escapeCount, escaped: Uint32Array.from(found) };
+  tile.indices.set(codebook.id, shared);
+  return shared;
+}
+
+/**
+ * The indices that the tile's first block of the codebook holds (CBK-4).
+ *
+ * @param {TileContext} tile
+ * @param {CodebookRecord} codebook
+ * @param {number} escapeCount
+ * @param {number} at of the parameters
+ */
+async function knownIndices(tile, codebook, escapeCount, at) {
+  if (codebook.bandFirst && !tile.indices.has(codebook.id)) await tile.needLayer(codebook.bandFirst);
+  const shared = tile.indices.get(codebook.id);
+  if (shared === undefined) {
+    throw fault(
+      ERROR_CODEBOOK,
+      at,
+      'CBK-4',
+      `${codebook.attributes[0]} of the tile are not coded with codebook ${codebook.id}`,
+    );
+  }
+  if (shared.escapeCount !== escapeCount) {
+    throw fault(
+      ERROR_CODEBOOK,
+      at,
+      'CBK-4',
+      `${escapeCount} escapes, the codebook's first block has ${shared.escapeCount}`,
+    );
+  }
+  return shared;
+}
+
+/**
+ * Values of a colour table's entries by rows, where no entry can break LAT-4 or LAT-5 and there is one stage.
+ *
+ * @param {Table} table
+ * @param {AttributeRecord} attribute
+ * @returns {Float32Array | null}
+ */
+function tableValues(table, attribute) {
+  const { id, mapping, chromaShift, step } = attribute;
+  const [{ size, entries, bound }] = table.stages;
+  const coarse = bound * 2 ** chromaShift;
+  if (id < spec.ATTRIBUTE_SH0 || table.stages.length > 1 || coarse > spec.COLUMN_MAX) return null;
+  if (!Number.isFinite(Math.fround(4 * coarse * step))) return null; // colour lifting at most triples
+  if (table.values === undefined) {
+    const columns = new Float64Array(entries);
+    if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) rgbFromYcocg(columns, columns.length / 3, chromaShift);
+    table.values = new Float32Array(columns.length);
+    const width = columnCount(attribute);
+    putRows(table.values, width, 0, 0, columns, width / 3, size + 1, step);
+  }
+  return table.values;
+}
+
+/**
+ * Sum of the entries that the indices name, over the stages. At most 4 × 2^31: exact.
+ *
+ * @param {Float64Array} columns to fill
+ * @param {Table} table
+ * @param {number} before columns of the table before the attribute's
+ * @param {Uint32Array[]} indices
+ * @param {AttributeRecord} attribute
+ * @param {number} offset of the block
+ * @returns {Block}
+ */
+function sumEntries(columns, table, before, indices, attribute, offset) {
+  const count = columnCount(attribute);
+  const n = indices[0].length;
+  let bound = 0;
+  for (const [stage, { size, entries, bound: most }] of table.stages.entries()) {
+    const index = indices[stage];
+    bound += most;
+    for (let c = 0; c < count; c++) {
+      const column = entries.subarray((before + c) * (size + 1), (before + c + 1) * (size + 1));
+      const at = c * n;
+      if (stage === 0) for (let i = 0; i < n; i++) columns[at + i] = column[index[i]];
+      else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];
+    }
+  }
+  return { attribute, columns, exponent: 0, bound, offset };
+}
+
+/**
+ * The common summand of the scales of the kind SHAPE.
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {Block} block changed: sums below 2^50 + 2^32 + 2^33
+ */
+async function addSummand(tile, payload, block) {
+  const { attribute, columns } = block;
+  const n = tile.splatCount;
+  readLatticeParams(payload, attribute, true);
+  const [first] = readOffsets(payload, 1);
+  const { low, width } = await readStream(payload, n, spec.CODING_WIDTH_MAX[spec.CODING_OFFSET], tile.inflate);
+  block.bound += Math.abs(first) + 2 ** (8 * width);
+  for (let c = 0, at = 0; c < columnCount(attribute); c++)
+    for (let i = 0; i < n; i++, at++) columns[at] += first + low[i];
+}
+
+/**
+ * Read the escape block (CBK-5).
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} count
+ */
+async function readEscapes(tile, payload, attribute, count) {
+  const head = readBlockHead(payload);
+  if (head.attribute !== attribute.id) {
+    throw fault(
+      ERROR_STREAM,
+      head.offset,
+      'CBK-5',
+      `escapes of attribute ${head.attribute} in a block of ${attribute.name}`,
+    );
+  }
+  if (head.coding === spec.CODING_CODEBOOK)
+    throw fault(ERROR_STREAM, head.offset + 1, 'CBK-5', 'escapes coded CODEBOOK');
+  checkCoding(head); // all other codings that it allows are those of CBK-5
+  return readValues(tile, payload, attribute, head.coding, count, true);
+}
+
+/**
+ * Put the escapes in the place of the escaped splats' sums.
+ *
+ * @param {Block} block changed
+ * @param {Uint32Array} escaped
+ * @param {Block} escapes
+ */
+function putEscapes(block, escaped, escapes) {
+  const n = escaped.length;
+  const stride = block.columns.length / columnCount(block.attribute);
+  for (let i = 0; i < escapes.columns.length; i++) {
+    block.columns[Math.floor(i / n) * stride + escaped[i % n]] = escapes.columns[i];
+  }
+  block.bound = Math.max(block.bound, escapes.bound);
+}

@@ -1,0 +1,316 @@
+// Attribute codings other than CODEBOOK: from streams to integers (spec section 6.4).
+
+import { fault } from './errors.mjs';
+import { ldexp } from './lattice.mjs';
+import { nameOf } from './registry.mjs';
+import * as spec from './spec.mjs';
+import { readIntegers, readStream } from './streams.mjs';
+
+const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+
+/**
+ * The integers of one block, column after column, each below 2^53 in magnitude and never −0.
+ *
+ * @typedef {object} Block
+ * @property {AttributeRecord} attribute
+ * @property {Float64Array} columns [C × n], or with `lookup` those of the escaped splats alone
+ * @property {{values: Float32Array, index: Uint32Array, escaped: Uint32Array}} [lookup] values of a codebook's entries
+ *   by rows, the entry of each splat, and the splats that have none
+ * @property {number} exponent of the tile's lattice of this attribute
+ * @property {number} bound what no integer exceeds in magnitude
+ * @property {number} offset in the file of the stream, or block, to blame for what the integers are
+ *
+ * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('./payload.mjs').Payload} Payload
+ * @typedef {import('./tile.mjs').TileContext} TileContext
+ */
+
+const RESERVED = { reserved_0: 2 };
+
+/**
+ * Columns of an attribute.
+ *
+ * @param {AttributeRecord} attribute
+ */
+export const columnCount = ({ id }) => spec.ATTRIBUTE_COLUMNS[/** @type {keyof typeof spec.ATTRIBUTE_COLUMNS} */ (id)];
+
+/**
+ * Read the head of a block; BLK-1 holds after it.
+ *
+ * @param {Payload} payload
+ */
+export function readBlockHead(payload) {
+  const { fields, offset } = payload.read(spec.unpackBlockHead, spec.BLOCK_HEAD_SIZE, RESERVED, 'a block head');
+  const { attribute, coding } = fields;
+  const name = nameOf(spec.CODING_NAMES, coding);
+  if (name === undefined) throw fault(ERROR_UNSUPPORTED, offset + 1, 'BLK-1', `coding ${coding}`);
+  return { attribute, coding, name, offset };
+}
+
+/**
+ * Refuse a coding that the registry does not list for the attribute.
+ *
+ * @param {ReturnType<typeof readBlockHead>} head
+ */
+export function checkCoding({ attribute, name, offset }) {
+  /** @type {readonly string[]} */
+  const listed = spec.ATTRIBUTE_CODINGS[/** @type {keyof typeof spec.ATTRIBUTE_CODINGS} */ (attribute)];
+  if (!listed.includes(name)) throw fault(ERROR_VALUE, offset + 1, 'BLK-1', `attribute ${attribute} coded ${name}`);
+}
+
+/**
+ * Read parameters and streams of a block in a coding other than CODEBOOK.
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload behind the block's head
+ * @param {AttributeRecord} attribute
+ * @param {number} coding one that the attribute may have
+ * @param {number} n splats
+ * @param {boolean} escaped whether this is an escape block
+ * @returns {Promise<Block>}
+ */
+export async function readValues(tile, payload, attribute, coding, n, escaped) {
+  if (coding === spec.CODING_LEVELS) return readLevels(tile, payload, attribute, n);
+  if (coding === spec.CODING_MORTON) return readMorton(tile, payload, attribute, n);
+  if (coding === spec.CODING_AXIS) return readAxis(tile, payload, attribute, n);
+  const exponent = readLatticeParams(payload, attribute, escaped);
+  return coding === spec.CODING_OFFSET
+    ? readOffset(tile, payload, attribute, n, exponent)
+    : readSigned(tile, payload, attribute, n, exponent);
+}
+
+/**
+ * Lattice parameters (spec 6.4.4).
+ *
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {boolean} mustBeZero
+ * @returns {number} the exponent
+ */
+export function readLatticeParams(payload, attribute, mustBeZero) {
+  const { fields, offset } = payload.read(
+    spec.unpackLatticeParams,
+    spec.LATTICE_PARAMS_SIZE,
+    RESERVED,
+    'lattice parameters',
+  );
+  const { exponent } = fields;
+  if (exponent !== 0 && (mustBeZero || attribute.id === spec.ATTRIBUTE_QUATS)) {
+    throw fault(ERROR_VALUE, offset, 'LAT-2', `exponent ${exponent}`);
+  }
+  if (attribute.step !== 0) {
+    const step = ldexp(attribute.step, exponent);
+    if (!(step > 0 && step < Infinity))
+      throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
+  }
+  return exponent;
+}
+
+/**
+ * Offsets i64[count] (LAT-3).
+ *
+ * @param {Payload} payload
+ * @param {number} count
+ * @returns {number[]} exact: at most 2^50 in magnitude
+ */
+export function readOffsets(payload, count) {
+  const offsets = [];
+  for (let i = 0; i < count; i++) {
+    const { offset } = payload;
+    const value = payload.view.getBigInt64(payload.claim(8, 'an offset'), true);
+    if (value > spec.COLUMN_MAX || value < -spec.COLUMN_MAX)
+      throw fault(ERROR_VALUE, offset, 'LAT-3', `an offset of ${value}`);
+    offsets.push(Number(value));
+  }
+  return offsets;
+}
+
+/**
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @returns {Promise<Block>}
+ */
+async function readLevels(tile, payload, attribute, n) {
+  const { columns, offset } = await readIntegers(
+    payload,
+    n,
+    spec.CODING_WIDTH_MAX[spec.CODING_LEVELS],
+    false,
+    tile.inflate,
+    tile.columns(attribute, n),
+  );
+  const block = { attribute, columns, exponent: 0, bound: attribute.levels, offset };
+  checkIntegers(block, n);
+  return block;
+}
+
+/**
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @returns {Promise<Block>}
+ */
+async function readMorton(tile, payload, attribute, n) {
+  const { fields, offset: at } = payload.read(
+    spec.unpackMortonParams,
+    spec.MORTON_PARAMS_SIZE,
+    { reserved_0: 1, reserved_1: 2 },
+    'Morton parameters',
+  );
+  const { bits } = fields;
+  if (bits < 1 || bits > spec.MORTON_BITS_MAX) throw fault(ERROR_VALUE, at, 'MOR-1', `${bits} bits per axis`);
+  const { low, high, offset } = await readStream(payload, n, spec.CODING_WIDTH_MAX[spec.CODING_MORTON], tile.inflate);
+  const end = 2 ** (3 * bits); // at most 2^51
+  const columns = tile.columns(attribute, n);
+  for (let i = 0; i < n; i++) {
+    const l = low[i],
+      h = high === null ? 0 : high[i];
+    if (h * 4294967296 + l >= end) throw fault(ERROR_RANGE, offset, 'MOR-2', `a code of more than ${3 * bits} bits`);
+    const a = l & 0x3fffffff; // the lower ten bits of each axis; the upper seven are 21 bits of the code
+    const b = (l >>> 30) | (h << 2);
+    columns[i] = thirdBits(a) | (thirdBits(b) << 10);
+    columns[n + i] = thirdBits(a >>> 1) | (thirdBits(b >>> 1) << 10);
+    columns[2 * n + i] = thirdBits(a >>> 2) | (thirdBits(b >>> 2) << 10);
+  }
+  return { attribute, columns, exponent: 0, bound: 2 ** bits, offset };
+}
+
+/**
+ * Bits 0, 3, 6, ... 27, close together.
+ *
+ * @param {number} x 30 bits
+ */
+function thirdBits(x) {
+  x &= 0x09249249;
+  x = (x | (x >>> 2)) & 0x030c30c3;
+  x = (x | (x >>> 4)) & 0x0300f00f;
+  x = (x | (x >>> 8)) & 0x030000ff;
+  return (x | (x >>> 16)) & 0x3ff;
+}
+
+/**
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @returns {Promise<Block>}
+ */
+async function readAxis(tile, payload, attribute, n) {
+  const { columns, offset } = await readIntegers(
+    payload,
+    3 * n,
+    spec.CODING_WIDTH_MAX[spec.CODING_AXIS],
+    false,
+    tile.inflate,
+    tile.columns(attribute, n),
+  );
+  return { attribute, columns, exponent: 0, bound: 2 ** spec.AXIS_BITS_MAX, offset };
+}
+
+/**
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @param {number} exponent
+ * @returns {Promise<Block>}
+ */
+async function readOffset(tile, payload, attribute, n, exponent) {
+  const count = columnCount(attribute);
+  const offsets = readOffsets(payload, count);
+  const widthMax = spec.CODING_WIDTH_MAX[spec.CODING_OFFSET];
+  const { columns, width, offset } = await readIntegers(
+    payload,
+    count * n,
+    widthMax,
+    false,
+    tile.inflate,
+    tile.columns(attribute, n),
+  );
+  let bound = 0;
+  for (let c = 0, i = 0; c < count; c++) {
+    const first = offsets[c];
+    for (const end = (c + 1) * n; i < end; i++) columns[i] += first;
+    bound = Math.max(bound, Math.abs(first) + 2 ** (8 * width));
+  }
+  const block = { attribute, columns, exponent, bound, offset };
+  checkIntegers(block, n);
+  return block;
+}
+
+/**
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @param {number} exponent
+ * @returns {Promise<Block>}
+ */
+async function readSigned(tile, payload, attribute, n, exponent) {
+  const widthMax = spec.CODING_WIDTH_MAX[spec.CODING_SIGNED];
+  const wanted = columnCount(attribute) * n;
+  const { columns, width, offset } = await readIntegers(
+    payload,
+    wanted,
+    widthMax,
+    true,
+    tile.inflate,
+    tile.columns(attribute, n),
+  );
+  const block = { attribute, columns, exponent, bound: 2 ** (8 * width - 1), offset };
+  checkIntegers(block, n);
+  return block;
+}
+
+/**
+ * LEV-1, QUA-1, QUA-2 or LAT-4, whichever the attribute is under.
+ *
+ * @param {Block} block
+ * @param {number} n splats
+ */
+export function checkIntegers({ attribute, columns, bound, offset }, n) {
+  const { id, levels } = attribute;
+  if (id === spec.ATTRIBUTE_OPACITIES) {
+    const bad = columns.findIndex((q) => q < 0 || q > levels);
+    if (bad >= 0) throw fault(ERROR_RANGE, offset, 'LEV-1', `a level of ${columns[bad]}, the file has ${levels}`);
+  } else if (id === spec.ATTRIBUTE_QUATS) {
+    const bad = columns.findIndex((q) => q < -levels || q > levels);
+    if (bad >= 0) throw fault(ERROR_RANGE, offset, 'QUA-1', `a component of ${columns[bad]}, M is ${levels}`);
+    for (let i = 0; i < n; i++) {
+      const r = radicand(columns[i], columns[n + i], columns[2 * n + i], levels);
+      if (r < 0) throw fault(ERROR_RANGE, offset, 'QUA-2', `R is ${r}`);
+    }
+  } else if (bound * 2 ** attribute.chromaShift > spec.COLUMN_MAX) {
+    checkColumns(attribute, columns, n, offset);
+  }
+}
+
+/**
+ * R of spec 7.5.
+ *
+ * @param {number} q1 at most `levels` in magnitude, like the others
+ * @param {number} q2
+ * @param {number} q3
+ * @param {number} levels at most 32,767
+ */
+export const radicand = (q1, q2, q3, levels) => 2 * levels * levels - q1 * q1 - q2 * q2 - q3 * q3;
+
+/**
+ * LAT-4: "Each integer, times 2^chroma_shift in the columns of Co and Cg, MUST be at most COLUMN_MAX in magnitude."
+ *
+ * @param {AttributeRecord} attribute
+ * @param {Float64Array} columns
+ * @param {number} n
+ * @param {number} offset
+ */
+function checkColumns(attribute, columns, n, offset) {
+  const firstChroma = (n * columnCount(attribute)) / 3; // Y, Co, Cg have a third of the columns each
+  for (let i = 0; i < columns.length; i++) {
+    const most = i < firstChroma ? spec.COLUMN_MAX : spec.COLUMN_MAX / 2 ** attribute.chromaShift;
+    if (Math.abs(columns[i]) > most)
+      throw fault(ERROR_RANGE, offset, 'LAT-4', `an integer of ${columns[i]} in column ${Math.floor(i / n)}`);
+  }
+}

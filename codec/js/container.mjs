@@ -1,0 +1,148 @@
+// The header of a file (spec 4.2) and the frame of a chunk (5.1).
+
+import { crc32, sha256 } from './checksums.mjs';
+import { allocate, fault } from './errors.mjs';
+import * as spec from './spec.mjs';
+
+/**
+ * @typedef {{profile: string, indexSize: number, fileSize: number, digest: Uint8Array, end: number}} FileHeader
+ * @typedef {import('./index.mjs').ChunkPlace} ChunkPlace
+ */
+
+/** Four letters as a string. @param {Uint8Array} bytes */
+export const typeName = (bytes) => String.fromCharCode(...bytes);
+
+/** @param {number} value */
+const hex = (value) => `0x${value.toString(16).padStart(8, '0')}`;
+
+/**
+ * Read and check the header alone. What follows it in `bytes` is not looked at.
+ *
+ * @param {Uint8Array<ArrayBuffer>} bytes
+ * @returns {FileHeader} `end` is the end of the index
+ */
+export function readFileHeader(bytes) {
+  const wrong = spec.MAGIC.findIndex((byte, i) => i < bytes.length && bytes[i] !== byte);
+  if (wrong >= 0) {
+    const clause = bytes.length < spec.HEADER_SIZE ? 'HDR-11' : 'HDR-1';
+    throw fault(
+      spec.ERROR_MAGIC,
+      0,
+      clause,
+      `not a csplat file: byte ${wrong} is ${bytes[wrong]}, not ${spec.MAGIC[wrong]}`,
+    );
+  }
+  if (bytes.length < spec.HEADER_SIZE) {
+    throw fault(spec.ERROR_TRUNCATED, bytes.length, 'HDR-11', `the header has ${spec.HEADER_SIZE} bytes`);
+  }
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const header = spec.unpackHeader(view, 0);
+  const { version_major: major, version_minor: minor, profile, index_size: indexSize } = header;
+  if (major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR) {
+    const ours = `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`;
+    throw fault(spec.ERROR_VERSION, 8, 'HDR-2', `the file has version ${major}.${minor}, this decoder reads ${ours}`);
+  }
+  const computed = crc32(bytes.subarray(0, 28));
+  if (header.header_crc !== computed) {
+    throw fault(spec.ERROR_CRC, 28, 'HDR-3', `found ${hex(header.header_crc)}, computed ${hex(computed)}`);
+  }
+  if (header.reserved_0) throw fault(spec.ERROR_RESERVED, 13, 'RES-1', `header: reserved_0 is ${header.reserved_0}`);
+  if (header.reserved_1) throw fault(spec.ERROR_RESERVED, 14, 'RES-1', `header: reserved_1 is ${header.reserved_1}`);
+  if (profile !== spec.PROFILE_BASE) {
+    /** @type {Record<number, string>} */
+    const names = spec.PROFILE_NAMES;
+    throw fault(
+      spec.ERROR_UNSUPPORTED,
+      12,
+      'HDR-4',
+      `profile ${names[profile] ?? profile}: this decoder reads the profile base`,
+    );
+  }
+  const fileSize = Number(header.file_size); // may round above 2^53; no data has that length
+  const end = spec.HEADER_SIZE + indexSize;
+  if (indexSize < spec.INDEX_HEAD_SIZE + 4 || end > fileSize) {
+    throw fault(spec.ERROR_VALUE, 16, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
+  }
+  return { profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, digest: header.digest.slice(), end };
+}
+
+/**
+ * @param {number} size of the data
+ * @param {FileHeader} header
+ */
+export function checkFileSize(size, { fileSize }) {
+  if (size < fileSize)
+    throw fault(spec.ERROR_TRUNCATED, size, 'HDR-5', `the file has ${fileSize} bytes, ${size} are here`);
+  if (size > fileSize) throw fault(spec.ERROR_TRAILING, fileSize, 'HDR-6', `${size - fileSize} bytes follow the end`);
+}
+
+/**
+ * HDR-8: the SHA-256 of everything but the digest.
+ *
+ * @param {Uint8Array<ArrayBuffer>} bytes the whole file
+ * @param {FileHeader} file
+ */
+export async function checkDigest(bytes, file) {
+  const field = 32; // offset and size of the digest
+  const covered = allocate(() => new Uint8Array(bytes.length - field));
+  covered.set(bytes.subarray(0, field));
+  covered.set(bytes.subarray(2 * field), field);
+  const computed = await sha256(covered);
+  if (computed.some((byte, i) => byte !== file.digest[i])) {
+    throw fault(spec.ERROR_DIGEST, field, 'HDR-8', 'the SHA-256 of the file is another');
+  }
+}
+
+/**
+ * Check the CRC at the end of an index.
+ *
+ * @param {Uint8Array<ArrayBuffer>} index
+ */
+export function checkIndexCrc(index) {
+  checkCrc(index, spec.HEADER_SIZE, 'IDX-1');
+}
+
+/**
+ * Check CRC and header of a chunk against the record that names it.
+ *
+ * @param {Uint8Array<ArrayBuffer>} chunk all its bytes, as many as the record says
+ * @param {ChunkPlace} place
+ * @returns {Uint8Array<ArrayBuffer>} the payload
+ */
+export function openChunk(chunk, place) {
+  const { offset } = place;
+  checkCrc(chunk, offset, 'CHK-1');
+  const header = spec.unpackChunkHeader(new DataView(chunk.buffer, chunk.byteOffset, chunk.byteLength), 0);
+  const type = typeName(header.type);
+  if (type !== place.type) {
+    throw fault(spec.ERROR_INDEX, offset, 'CHK-3', `a chunk ${JSON.stringify(type)} where the index has ${place.type}`);
+  }
+  if (header.flags !== place.flags) {
+    throw fault(spec.ERROR_INDEX, offset + 4, 'CHK-3', `flags ${header.flags}, the index says ${place.flags}`);
+  }
+  if (header.reserved_0)
+    throw fault(spec.ERROR_RESERVED, offset + 6, 'RES-1', `chunk header: reserved_0 is ${header.reserved_0}`);
+  const payload = chunk.subarray(spec.CHUNK_HEADER_SIZE, chunk.length - 4);
+  if (header.payload_size !== payload.length) {
+    throw fault(
+      spec.ERROR_INDEX,
+      offset + 8,
+      'CHK-3',
+      `a payload of ${header.payload_size} bytes, the index says ${payload.length}`,
+    );
+  }
+  return payload;
+}
+
+/**
+ * @param {Uint8Array<ArrayBuffer>} bytes with their CRC in the last four
+ * @param {number} base
+ * @param {string} clause
+ */
+function checkCrc(bytes, base, clause) {
+  const at = bytes.length - 4;
+  const found = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength).getUint32(at, true);
+  const computed = crc32(bytes.subarray(0, at));
+  if (found !== computed)
+    throw fault(spec.ERROR_CRC, base + at, clause, `found ${hex(found)}, computed ${hex(computed)}`);
+}

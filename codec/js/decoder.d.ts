@@ -1,0 +1,294 @@
+// Types of the csplat decoder. test/types.ts holds decoder.mjs against them.
+
+/** What a file may ask for. Defaults are those of the spec, section 8. */
+export interface Limits {
+  /** Splats of one decode, 2^25. */
+  splats?: number;
+  /** Bytes of decoded arrays and tables, 2 GiB; also of a file that a server sends without ranges. */
+  bytes?: number;
+  /** Bytes of one JSON chunk, 64 MiB. */
+  jsonBytes?: number;
+}
+
+/** Raw DEFLATE of exactly `size` bytes; refuses early ends, late ends and trailing bytes by throwing. */
+export type Inflate = (coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>;
+
+export type Form = 'floats' | 'integers';
+
+export interface DecodeOptions {
+  limits?: Limits;
+  /** SH bands above this degree are not decoded (their chunks are still checked). */
+  shDegree?: number;
+  /** Indices of the tiles to decode, in this order; all of them by default. */
+  tiles?: Iterable<number>;
+  /** `integers` for the arrays of the spec, section 9.2. */
+  form?: Form;
+  signal?: AbortSignal;
+  /** Splats so far, and all of them. */
+  onProgress?: (done: number, total: number) => void;
+  /** Takes the place of node:zlib or DecompressionStream. */
+  inflate?: Inflate;
+}
+
+export interface AttributeRecord {
+  id: number;
+  name: string;
+  mapping: string;
+  chromaShift: number;
+  levels: number;
+  step: number;
+}
+
+export interface CodebookRecord {
+  id: number;
+  kind: string;
+  attributes: string[];
+  bandFirst: number;
+  bandLast: number;
+  /** Entries of each stage. */
+  sizes: number[];
+}
+
+export interface ExtraRecord {
+  name: string;
+  dtype: 'u8' | 'i8' | 'u16' | 'i16' | 'u32' | 'i32' | 'f32' | 'f64';
+  /** Of one value. */
+  bytes: number;
+}
+
+/** Bytes of a file. */
+export interface ByteRange {
+  offset: number;
+  size: number;
+}
+
+/** A chunk as the index names it; the `Field`s are the places of offset and size in the index. */
+export interface ChunkPlace extends ByteRange {
+  type: string;
+  flags: number;
+  offsetField: number;
+  sizeField: number;
+}
+
+export interface DirectoryRecord extends ChunkPlace {
+  id: number;
+  layer: number;
+  recordOffset: number;
+}
+
+export interface LayerRecord extends ChunkPlace {
+  layer: number;
+}
+
+export interface TileRecord {
+  index: number;
+  /** Number of the tile's first splat in the whole scene. */
+  first: number;
+  splatCount: number;
+  /** Lattice of the means: exponent, step × 2^exponent, corner and extent in its integers. */
+  exponent: number;
+  step: number;
+  corner: number[];
+  extent: number[];
+  /** Box of the centres. */
+  min: number[];
+  max: number[];
+  /** Natural logarithm of the largest standard deviation. */
+  maxScale: number;
+  layers: LayerRecord[];
+  /** Ids of the codebooks. */
+  tables: number[];
+  recordOffset: number;
+  tablesOffset: number;
+}
+
+export interface Header {
+  version: string;
+  profile: string;
+  fileSize: number;
+  indexSize: number;
+  splatCount: number;
+  shDegree: number;
+  antialiased: boolean;
+  flat: boolean;
+  /** Letters of the directions of +x, +y, +z ("RDF"), or empty where they are not known. */
+  axes: string;
+  /** Metres per scene unit, 0 where unknown. */
+  unitMetres: number;
+  /** What the means are relative to. */
+  origin: number[];
+  attributes: AttributeRecord[];
+  codebooks: CodebookRecord[];
+  extras: ExtraRecord[];
+  directory: DirectoryRecord[];
+  tiles: TileRecord[];
+}
+
+export interface StatedErrors {
+  sourceCount: number;
+  prunedCount: number;
+  sourceShDegree: number;
+  refitted: boolean;
+  errors: Record<string, { max: number; rms: number }>;
+}
+
+/** Ancillary chunks; null for those that the file does not have. */
+export interface Description {
+  metadata: Record<string, unknown> | null;
+  cameras: Record<string, unknown>[] | null;
+  /** What the encoder was asked. */
+  options: Record<string, unknown> | null;
+  statedErrors: StatedErrors | null;
+}
+
+/** Which checks were made: CRCs of header, index and so many chunks, and the SHA-256 of the file. */
+export interface Checks {
+  header: boolean;
+  index: boolean;
+  chunks: number;
+  digest: boolean;
+}
+
+export type ExtraArray =
+  | Uint8Array
+  | Int8Array
+  | Uint16Array
+  | Int16Array
+  | Uint32Array
+  | Int32Array
+  | Float32Array
+  | Float64Array;
+
+/** The arrays of the spec, section 3, in C order. */
+export interface Splats {
+  count: number;
+  /** K = (shDegree + 1)² − 1 */
+  shDegree: number;
+  /** [count, 3], relative to the header's origin */
+  means: Float32Array;
+  /** [count, 4], w x y z */
+  quats: Float32Array;
+  /** [count, 3], natural logarithms */
+  scales: Float32Array;
+  /** [count], alpha */
+  opacities: Float32Array;
+  /** [count, 3] */
+  sh0: Float32Array;
+  /** [count, K, 3] */
+  shN: Float32Array;
+  /** Extra columns by name. */
+  extra: Record<string, ExtraArray>;
+}
+
+/** The integer arrays of the spec, section 9.2; A attributes of T tiles. */
+export interface IntegerSplats {
+  count: number;
+  shDegree: number;
+  opacities: Uint32Array;
+  scales: BigInt64Array;
+  quats: Int32Array;
+  means: BigInt64Array;
+  sh0: BigInt64Array;
+  sh1?: BigInt64Array;
+  sh2?: BigInt64Array;
+  sh3?: BigInt64Array;
+  tile_splats: Uint32Array;
+  exponents: Int32Array;
+  extra: Record<string, ExtraArray>;
+}
+
+export interface Whole extends Description {
+  header: Header;
+  checks: Checks;
+}
+export type Scene = Splats & Whole;
+export type IntegerScene = IntegerSplats & Whole;
+
+/** Decode a whole file, with all of its checksums. */
+export function decode(
+  data: ArrayBuffer | ArrayBufferView,
+  options: DecodeOptions & { form: 'integers' },
+): Promise<IntegerScene>;
+export function decode(
+  data: ArrayBuffer | ArrayBufferView,
+  options?: DecodeOptions & { form?: 'floats' },
+): Promise<Scene>;
+
+/** Read and check header and index; the data may end behind the index. */
+export function readHeader(data: ArrayBuffer | ArrayBufferView, options?: { limits?: Limits }): Header;
+
+/** Where a reader's bytes come from. `read` gives exactly `size` bytes or throws. */
+export interface ByteSource {
+  read(offset: number, size: number, signal?: AbortSignal): Promise<Uint8Array<ArrayBuffer>>;
+  prefetch?(ranges: ByteRange[], signal?: AbortSignal): void;
+  /** Of the file, where it is known. */
+  size?: number | null;
+}
+
+export interface ReaderOptions {
+  limits?: Limits;
+  /** Of the first request, 64 KiB: header and index, one hopes. */
+  firstBytes?: number;
+  /** Of `open`, and of the body of a server without ranges. */
+  signal?: AbortSignal;
+  /** Bytes received so far, and the size of the file (0 before the header is here). */
+  onProgress?: (received: number, fileSize: number) => void;
+  fetch?: typeof fetch;
+  /** Credentials, headers, mode of each request. */
+  request?: RequestInit;
+  inflate?: Inflate;
+}
+
+export interface ReadOptions {
+  form?: Form;
+  signal?: AbortSignal;
+}
+
+export interface LayerRequest {
+  tile: number;
+  layer: number;
+}
+
+/** Reads tiles and layers of a file in any order; checks the CRC of each part. */
+export class CsplatReader {
+  static open(from: string | URL | Blob | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
+  readonly header: Header;
+  readonly checks: Checks;
+  /** A tile with its SH bands up to a degree, and its extra columns if they are asked for. */
+  readTile(
+    index: number,
+    options: ReadOptions & { form: 'integers'; shDegree?: number; extra?: boolean },
+  ): Promise<IntegerSplats>;
+  readTile(
+    index: number,
+    options?: ReadOptions & { form?: 'floats'; shDegree?: number; extra?: boolean },
+  ): Promise<Splats>;
+  /** Layer 0: geometry and base colour. */
+  readLayer(index: number, layer: 0, options: ReadOptions & { form: 'integers' }): Promise<IntegerSplats>;
+  readLayer(index: number, layer: 0, options?: ReadOptions & { form?: 'floats' }): Promise<Splats>;
+  /** An SH band, [count, 2·layer + 1, 3]; null where the tile leaves it out and its coefficients are 0. */
+  readLayer(
+    index: number,
+    layer: number,
+    options: ReadOptions & { form: 'integers' },
+  ): Promise<{ sh: BigInt64Array; count: number } | null>;
+  readLayer(
+    index: number,
+    layer: number,
+    options?: ReadOptions & { form?: 'floats' },
+  ): Promise<{ sh: Float32Array; count: number } | null>;
+  describe(options?: { signal?: AbortSignal }): Promise<Description>;
+  /** Begin to fetch layers that will be read soon, neighbours with one request. */
+  prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
+}
+
+/** Base of all errors; `code` is one of the spec's, `clause` the broken requirement. */
+export class CsplatError extends Error {
+  readonly code: string;
+  readonly offset: number | null;
+  readonly clause: string | null;
+}
+export class FormatError extends CsplatError {}
+export class UnsupportedError extends CsplatError {}
+export class LimitError extends CsplatError {}
+export class InputError extends CsplatError {}

@@ -1,0 +1,318 @@
+// The index (spec 4.3): records of the whole file. `tiles.mjs` reads the rest of it, the tiles.
+
+import { fault } from './errors.mjs';
+import { checkIndexCrc, typeName } from './container.mjs';
+import { STEP_MIN } from './lattice.mjs';
+import { Payload } from './payload.mjs';
+import { nameOf, registeredFlags } from './registry.mjs';
+import * as spec from './spec.mjs';
+import { checkCoverage, checkTables, readTile } from './tiles.mjs';
+
+const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+
+/**
+ * @typedef {import('./decoder.d.ts').Header} Header
+ * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
+ * @typedef {import('./decoder.d.ts').ExtraRecord} ExtraRecord
+ * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
+ * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
+ * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./container.mjs').FileHeader} FileHeader
+ * @typedef {ReturnType<typeof spec.unpackIndexHead>} IndexHead
+ */
+
+const INDEX_GROWTH = 8; // the objects made of an index take about so many times its bytes
+
+/**
+ * Read and check the whole index.
+ *
+ * @param {Uint8Array<ArrayBuffer>} bytes of the index, its CRC included
+ * @param {FileHeader} file
+ * @param {Required<Limits>} limits
+ * @returns {Header}
+ */
+export function readIndex(bytes, file, limits) {
+  checkIndexCrc(bytes);
+  const index = new Payload(bytes.subarray(0, -4), spec.HEADER_SIZE, 'IDX-2', ERROR_INDEX);
+  const { fields: head } = index.read(spec.unpackIndexHead, spec.INDEX_HEAD_SIZE, {}, 'the head of the index');
+  const scene = readScene(head);
+  checkCounts(head, index, limits);
+
+  const attributes = [];
+  for (let i = 0; i < head.attribute_count; i++) attributes.push(readAttribute(index, i));
+  /** @type {CodebookRecord[]} */
+  const codebooks = [];
+  for (let i = 0; i < head.codebook_count; i++)
+    codebooks.push(readCodebook(index, codebooks.at(-1)?.id ?? -1, head.sh_degree));
+  /** @type {ExtraRecord[]} */
+  const extras = [];
+  const names = new Set();
+  for (let i = 0; i < head.extra_count; i++) extras.push(readExtra(index, names));
+  const directoryOffset = index.offset;
+  const directory = [];
+  for (let i = 0; i < head.directory_count; i++) directory.push(readDirectory(index));
+  checkDirectory(directory, codebooks, directoryOffset);
+
+  /** @type {Header} */
+  const header = { ...scene, ...omit(file), attributes, codebooks, extras, directory, tiles: [], splatCount: 0 };
+  const ids = new Set(codebooks.map(({ id }) => id));
+  for (let i = 0; i < head.tile_count; i++) {
+    const tile = readTile(index, header, i);
+    checkTables(tile, ids);
+    header.splatCount += tile.splatCount; // below 2^32 × 2^16
+    header.tiles.push(tile);
+  }
+  index.finish();
+  if (head.splat_count !== BigInt(header.splatCount)) {
+    throw fault(
+      ERROR_INDEX,
+      spec.HEADER_SIZE,
+      'IDX-7',
+      `N is ${head.splat_count}, the tiles hold ${header.splatCount}`,
+    );
+  }
+  checkCoverage(header, file.end);
+  return header;
+}
+
+/** @param {FileHeader} file */
+const omit = ({ profile, fileSize, indexSize }) => ({ profile, fileSize, indexSize });
+
+/** @param {IndexHead} head */
+function readScene(head) {
+  const at = spec.HEADER_SIZE;
+  if (head.sh_degree > spec.SH_DEGREE_MAX)
+    throw fault(ERROR_UNSUPPORTED, at + 19, 'IDX-3', `SH degree ${head.sh_degree}`);
+  const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT;
+  if (head.scene_flags & ~flags) throw fault(ERROR_RESERVED, at + 20, 'RES-1', `scene flags ${head.scene_flags}`);
+  const axes = [...head.axes];
+  const lines = new Set(axes.map((direction) => (direction + 1) >> 1)); // right–left 1, up–down 2, forward–back 3
+  const known = axes.every((direction) => direction >= 1 && direction <= 6) && lines.size === 3;
+  if (!known && axes.some((direction) => direction !== spec.DIRECTION_UNSPECIFIED)) {
+    throw fault(ERROR_VALUE, at + 21, 'IDX-4', `axes ${axes.join(', ')}`);
+  }
+  const unit = head.unit_metres;
+  if (!(unit >= 0 && Number.isFinite(unit))) throw fault(ERROR_VALUE, at + 24, 'IDX-5', `a unit of ${unit} metres`);
+  const bad = head.origin.findIndex((x) => !Number.isFinite(x));
+  if (bad >= 0) throw fault(ERROR_VALUE, at + 32 + 8 * bad, 'IDX-6', `an origin of ${head.origin[bad]}`);
+  /** @type {Record<number, string>} */
+  const letters = spec.DIRECTION_LETTER;
+  return {
+    version: `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`,
+    shDegree: head.sh_degree,
+    antialiased: (head.scene_flags & spec.SCENE_FLAG_ANTIALIASED) !== 0,
+    flat: (head.scene_flags & spec.SCENE_FLAG_FLAT) !== 0,
+    axes: axes.map((direction) => letters[direction]).join(''),
+    unitMetres: Math.abs(unit), // −0 is 0
+    origin: head.origin,
+  };
+}
+
+/**
+ * Compare what the head announces with the bytes of the index and with the budget, before anything is made of it.
+ *
+ * @param {IndexHead} head
+ * @param {Payload} index behind the head
+ * @param {Required<Limits>} limits
+ */
+function checkCounts(head, index, limits) {
+  const at = spec.HEADER_SIZE;
+  const wanted = 5 + head.sh_degree;
+  if (head.attribute_count !== wanted) {
+    throw fault(ERROR_INDEX, at + 18, 'ATT-1', `${head.attribute_count} attributes instead of ${wanted}`);
+  }
+  const least =
+    head.attribute_count * spec.ATTRIBUTE_RECORD_SIZE +
+    head.codebook_count * spec.CODEBOOK_RECORD_SIZE +
+    head.extra_count * spec.EXTRA_RECORD_SIZE +
+    head.directory_count * spec.DIRECTORY_RECORD_SIZE +
+    head.tile_count * spec.TILE_RECORD_SIZE;
+  if (least > index.left)
+    throw fault(ERROR_INDEX, at, 'IDX-2', `records of at least ${least} bytes, ${index.left} are there`);
+  if (index.bytes.length * INDEX_GROWTH > limits.bytes) {
+    throw fault(
+      ERROR_LIMIT,
+      16,
+      'LIM-1',
+      `an index of ${index.bytes.length} bytes, the budget is ${limits.bytes / INDEX_GROWTH}`,
+    );
+  }
+}
+
+/**
+ * @param {Payload} index
+ * @param {number} place
+ * @returns {AttributeRecord}
+ */
+function readAttribute(index, place) {
+  const { fields, offset } = index.read(
+    spec.unpackAttributeRecord,
+    spec.ATTRIBUTE_RECORD_SIZE,
+    { reserved_0: 3 },
+    'an attribute record',
+  );
+  const { attribute: id, levels, step, chroma_shift: chromaShift } = fields;
+  const wanted = spec.ATTRIBUTE_OPACITIES + place;
+  if (id !== wanted) throw fault(ERROR_INDEX, offset, 'ATT-1', `attribute ${id} instead of ${wanted}`);
+  const known = /** @type {keyof typeof spec.ATTRIBUTE_NAMES} */ (id);
+  const mapping = nameOf(spec.MAPPING_NAMES, fields.mapping) ?? '';
+  /** @type {readonly string[]} */
+  const mappings = spec.ATTRIBUTE_MAPPINGS[known];
+  if (!mappings.includes(mapping)) throw fault(ERROR_VALUE, offset + 1, 'ATT-2', `mapping ${fields.mapping}`);
+  if (spec.ATTRIBUTE_KIND[known] === 'lattice') {
+    if (levels !== 0) throw fault(ERROR_RESERVED, offset + 4, 'ATT-5', `levels ${levels}`);
+    if (!(step >= STEP_MIN && Number.isFinite(step)))
+      throw fault(ERROR_VALUE, offset + 8, 'ATT-6', `a step of ${step}`);
+  } else {
+    const isQuats = id === spec.ATTRIBUTE_QUATS;
+    const [low, high] = isQuats ? [spec.QUAT_LEVELS_MIN, spec.QUAT_LEVELS_MAX] : [1, spec.OPACITY_LEVELS_MAX];
+    if (levels < low || levels > high)
+      throw fault(ERROR_VALUE, offset + 4, isQuats ? 'ATT-4' : 'ATT-3', `levels ${levels}`);
+    if (!Object.is(step, 0)) throw fault(ERROR_RESERVED, offset + 8, 'ATT-7', `a step of ${step}`);
+  }
+  if (chromaShift > spec.CHROMA_SHIFT_MAX) throw fault(ERROR_VALUE, offset + 2, 'ATT-8', `chroma shift ${chromaShift}`);
+  if (chromaShift && fields.mapping !== spec.MAPPING_YCOCG) {
+    throw fault(ERROR_VALUE, offset + 2, 'ATT-9', `chroma shift ${chromaShift} of the mapping ${mapping}`);
+  }
+  return { id, name: spec.ATTRIBUTE_NAMES[known], mapping, chromaShift, levels, step };
+}
+
+/**
+ * @param {Payload} index
+ * @param {number} before id of the record before
+ * @param {number} shDegree
+ * @returns {CodebookRecord}
+ */
+function readCodebook(index, before, shDegree) {
+  const { fields, offset } = index.read(
+    spec.unpackCodebookRecord,
+    spec.CODEBOOK_RECORD_SIZE,
+    { reserved_0: 6 },
+    'a codebook record',
+  );
+  const { codebook_id: id, band_first: bandFirst, band_last: bandLast, stage_count: stages, sizes } = fields;
+  if (id <= before) throw fault(ERROR_INDEX, offset, 'CBR-1', `codebook ${id} after ${before}`);
+  const kind = nameOf(spec.CODEBOOK_KIND_NAMES, fields.kind);
+  if (kind === undefined) throw fault(ERROR_UNSUPPORTED, offset + 2, 'RES-2', `codebook kind ${fields.kind}`);
+  const isSh = fields.kind === spec.CODEBOOK_KIND_SH;
+  if (isSh ? !(bandFirst >= 1 && bandFirst <= bandLast && bandLast <= shDegree) : bandFirst || bandLast) {
+    throw fault(ERROR_VALUE, offset + 3, 'CBR-2', `bands ${bandFirst} to ${bandLast} of the kind ${kind}`);
+  }
+  if (stages < 1 || stages > spec.STAGES_MAX) throw fault(ERROR_VALUE, offset + 5, 'CBR-3', `${stages} stages`);
+  const bad = sizes.findIndex((size, i) => (i < stages ? size < 1 || size > spec.CODEBOOK_ENTRIES_MAX : size !== 0));
+  if (bad >= 0) throw fault(ERROR_VALUE, offset + 8 + 4 * bad, 'CBR-4', `a stage of ${sizes[bad]} entries`);
+  /** @type {readonly string[]} */
+  let attributes =
+    spec.CODEBOOK_KIND_ATTRIBUTES[/** @type {keyof typeof spec.CODEBOOK_KIND_ATTRIBUTES} */ (fields.kind)];
+  if (isSh) attributes = attributes.slice(bandFirst - 1, bandLast);
+  return { id, kind, attributes: [...attributes], bandFirst, bandLast, sizes: sizes.slice(0, stages) };
+}
+
+/**
+ * @param {Payload} index
+ * @param {Set<string>} names those of the columns before
+ * @returns {ExtraRecord}
+ */
+function readExtra(index, names) {
+  const { fields, offset } = index.read(spec.unpackExtraRecord, spec.EXTRA_RECORD_SIZE, {}, 'an extra column record');
+  const dtype = nameOf(spec.EXTRA_DTYPE_NAMES, fields.dtype);
+  if (dtype === undefined) throw fault(ERROR_UNSUPPORTED, offset, 'RES-2', `type ${fields.dtype} of an extra column`);
+  const size = fields.name_size;
+  if (size < 1 || size > spec.EXTRA_NAME_MAX) throw fault(ERROR_VALUE, offset + 1, 'EXR-1', `a name of ${size} bytes`);
+  const name = decodeUtf8(fields.name.slice(0, size));
+  if (name === null) {
+    let sound = size - 1; // bytes before the first that is not UTF-8
+    while (decodeUtf8(fields.name.slice(0, sound)) === null) sound--;
+    throw fault(ERROR_VALUE, offset + 2 + sound, 'EXR-2', 'a name that is not UTF-8');
+  }
+  if (/[\u0000-\u001f\u007f]/.test(name))
+    throw fault(ERROR_VALUE, offset + 2, 'EXR-2', 'a control character in a name');
+  if (names.has(name)) throw fault(ERROR_VALUE, offset + 2, 'EXR-2', `two columns ${JSON.stringify(name)}`);
+  names.add(name);
+  const rest = fields.name.subarray(size).find((byte) => byte !== 0);
+  if (rest !== undefined) throw fault(ERROR_RESERVED, offset + 2 + size, 'EXR-3', `a byte of ${rest} behind the name`);
+  const bytes = spec.EXTRA_DTYPE_BYTES[/** @type {keyof typeof spec.EXTRA_DTYPE_BYTES} */ (fields.dtype)];
+  return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes };
+}
+
+/**
+ * @param {Uint8Array} bytes
+ * @returns {string | null} null if they are not UTF-8
+ */
+function decodeUtf8(bytes) {
+  try {
+    return new TextDecoder('utf-8', { fatal: true, ignoreBOM: true }).decode(bytes);
+  } catch {
+    return null;
+  }
+}
+
+/**
+ * @param {Payload} index
+ * @returns {DirectoryRecord}
+ */
+function readDirectory(index) {
+  const { fields, offset: at } = index.read(
+    spec.unpackDirectoryRecord,
+    spec.DIRECTORY_RECORD_SIZE,
+    { reserved_0: 9, reserved_1: 10 },
+    'a directory record',
+  );
+  const { flags, id, layer, size, offset } = fields;
+  const type = typeName(fields.type);
+  if (type === spec.CHUNK_TILE || /[^\x20-\x7e]/.test(type)) {
+    throw fault(ERROR_VALUE, at, 'DIR-1', `the type ${JSON.stringify(type)} in the directory`);
+  }
+  if (flags & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
+    throw fault(ERROR_RESERVED, at + 4, 'RES-1', `chunk flags ${flags}`);
+  }
+  if (type === spec.CHUNK_PROBABILITIES || type === spec.CHUNK_TREE) {
+    throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `a chunk ${type}`);
+  }
+  if (Object.hasOwn(spec.CHUNK_NAMES, type)) {
+    const registered = registeredFlags(type);
+    if (flags !== registered) throw fault(ERROR_VALUE, at + 4, 'CHK-4', `flags ${flags} of ${type}, not ${registered}`);
+  } else if (flags & spec.CHUNK_FLAG_CRITICAL) {
+    throw fault(ERROR_UNSUPPORTED, at, 'DIR-2', `an unknown critical chunk ${JSON.stringify(type)}`);
+  }
+  return {
+    type,
+    flags,
+    id,
+    layer,
+    size,
+    offset: Number(offset),
+    recordOffset: at,
+    offsetField: at + 16,
+    sizeField: at + 12,
+  };
+}
+
+/**
+ * DIR-4 and DIR-5: what must occur once does, and nothing else.
+ *
+ * @param {DirectoryRecord[]} directory
+ * @param {CodebookRecord[]} codebooks
+ * @param {number} offset of the directory
+ */
+function checkDirectory(directory, codebooks, offset) {
+  const due = new Set(); // CODB chunks still to come, as id × 256 + layer
+  for (const { id, kind, bandFirst, bandLast } of codebooks) {
+    if (kind !== spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SH]) due.add(id * 256);
+    else for (let band = bandFirst; band <= bandLast; band++) due.add(id * 256 + band);
+  }
+  const seen = new Set();
+  for (const { type, id, layer, recordOffset } of directory) {
+    if (type === spec.CHUNK_CODEBOOK) {
+      const key = id * 256 + layer;
+      if (!due.delete(key))
+        throw fault(ERROR_INDEX, recordOffset, 'DIR-5', `a chunk of codebook ${id}, layer ${layer}`);
+    } else if (Object.hasOwn(spec.CHUNK_NAMES, type)) {
+      if (id || layer || seen.has(type))
+        throw fault(ERROR_INDEX, recordOffset, 'DIR-4', `${type} with id ${id} and layer ${layer}, or twice`);
+      seen.add(type);
+    }
+  }
+  if (due.size) throw fault(ERROR_INDEX, offset, 'DIR-5', `${due.size} chunks of codebooks are missing`);
+}

@@ -1,0 +1,137 @@
+// Lattices: exact steps, colour lifting, and the way from integers to the arrays (spec 7.1, 7.2).
+
+const ROWS_AT_ONCE = 1024; // of shN, so that the rows written column by column stay in the cache
+
+/** Smallest step × 2^exponent (ATT-6, TIL-9, LAT-1): no product with it is subnormal in binary64. */
+export const STEP_MIN = 2 ** -1022;
+
+/**
+ * x × 2^e without the power, which may lie outside binary64 (spec 7.2).
+ *
+ * @param {number} x at least 2^−1022 and finite
+ * @param {number} exponent an i16
+ * @returns {number} exact, or 0 or Infinity where the result is not within [2^−1022, 2^1024)
+ */
+export function ldexp(x, exponent) {
+  const view = new DataView(new ArrayBuffer(8));
+  view.setFloat64(0, x);
+  const high = view.getUint32(0);
+  const biased = ((high >>> 20) & 0x7ff) + exponent;
+  if (biased < 1) return 0;
+  if (biased > 2046) return Infinity;
+  view.setUint32(0, (high & 0x800fffff) | (biased << 20));
+  return view.getFloat64(0);
+}
+
+/**
+ * Spec 7.1 on whole columns, in place: Y, Co, Cg become R, G, B. All of it is exact below 2^53.
+ *
+ * @param {Float64Array} columns
+ * @param {number} third elements of Y, as many as of Co and Cg
+ * @param {number} k chroma shift
+ */
+export function rgbFromYcocg(columns, third, k) {
+  const unit = 2 ** k;
+  for (let i = 0; i < third; i++) {
+    const co = columns[third + i] * unit;
+    const cg = columns[2 * third + i] * unit;
+    const t = columns[i] - Math.floor(cg / 2);
+    const b = t - Math.floor(co / 2);
+    columns[i] = b + co;
+    columns[third + i] = cg + t;
+    columns[2 * third + i] = b;
+  }
+}
+
+/**
+ * Write columns [channel × rows + row] × s as `out`[splat, row, channel] (spec 7.2); the array rounds once.
+ *
+ * @param {Float32Array} out
+ * @param {number} stride values of a splat in `out`
+ * @param {number} start place of the first row among them
+ * @param {number} first splat
+ * @param {Float64Array} columns three per row
+ * @param {number} rows
+ * @param {number} n splats
+ * @param {number} s step
+ */
+export function putRows(out, stride, start, first, columns, rows, n, s) {
+  for (let from = 0; from < n; from += ROWS_AT_ONCE) {
+    const to = Math.min(n, from + ROWS_AT_ONCE);
+    for (let row = 0; row < rows; row++) {
+      const red = row * n,
+        green = (rows + row) * n,
+        blue = (2 * rows + row) * n;
+      let at = (first + from) * stride + start + 3 * row;
+      for (let i = from; i < to; i++, at += stride) {
+        out[at] = columns[red + i] * s;
+        out[at + 1] = columns[green + i] * s;
+        out[at + 2] = columns[blue + i] * s;
+      }
+    }
+  }
+}
+
+/**
+ * Copy rows of a table into `out`, for each splat the one that its index names.
+ *
+ * @param {Float32Array} out
+ * @param {number} stride values of a splat in `out`
+ * @param {number} start place of the first value among them
+ * @param {number} first splat
+ * @param {Float32Array} values rows of the table
+ * @param {number} width values of a row
+ * @param {Uint32Array} index
+ */
+export function copyRows(out, stride, start, first, values, width, index) {
+  let at = first * stride + start;
+  for (let i = 0; i < index.length; i++, at += stride) {
+    const from = index[i] * width;
+    for (let j = 0; j < width; j++) out[at + j] = values[from + j];
+  }
+}
+
+/**
+ * As putRows, for the splats of a list.
+ *
+ * @param {Float32Array} out
+ * @param {number} stride
+ * @param {number} start
+ * @param {number} first
+ * @param {Float64Array} columns as long as the list
+ * @param {number} rows
+ * @param {Uint32Array} splats counted from `first`
+ * @param {number} s step
+ */
+export function scatterRows(out, stride, start, first, columns, rows, splats, s) {
+  const n = splats.length;
+  for (let column = 0; column < 3 * rows; column++) {
+    const place = start + 3 * (column % rows) + Math.floor(column / rows);
+    for (let i = 0; i < n; i++) out[(first + splats[i]) * stride + place] = columns[column * n + i] * s;
+  }
+}
+
+/**
+ * Write columns [channel × rows + row] as `out`[splat, row, channel], a BigInt's halves by hand: a BigInt for each
+ * value would take ten times as long.
+ *
+ * @param {BigInt64Array} out
+ * @param {number} first splat
+ * @param {Float64Array} columns
+ * @param {number} rows
+ * @param {number} n
+ */
+export function putWide(out, first, columns, rows, n) {
+  const halves = new Int32Array(out.buffer); // low, high: this module runs on little-endian platforms alone
+  for (let channel = 0; channel < 3; channel++) {
+    for (let row = 0; row < rows; row++) {
+      const column = (channel * rows + row) * n;
+      for (let i = 0; i < n; i++) {
+        const value = columns[column + i]; // at most 2^53
+        const at = 2 * (((first + i) * rows + row) * 3 + channel);
+        halves[at] = value; // modulo 2^32
+        halves[at + 1] = Math.floor(value / 4294967296);
+      }
+    }
+  }
+}

@@ -1,0 +1,69 @@
+// Bytes of a file with their place in it: every length is checked here before it is used.
+
+import { fault } from './errors.mjs';
+import { ERROR_RESERVED, ERROR_STREAM } from './spec.mjs';
+
+/** The payload of a chunk (or the index), read from its beginning to its end. */
+export class Payload {
+  /**
+   * @param {Uint8Array<ArrayBuffer>} bytes
+   * @param {number} base offset of the first byte in the file
+   * @param {string} clause the one that demands that the payload ends with its last part
+   * @param {string} [code]
+   */
+  constructor(bytes, base, clause, code = ERROR_STREAM) {
+    this.bytes = bytes;
+    this.view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+    this.base = base;
+    this.clause = clause;
+    this.code = code;
+    this.at = 0;
+  }
+
+  /** Offset in the file of the next byte. */
+  get offset() {
+    return this.base + this.at;
+  }
+
+  get left() {
+    return this.bytes.length - this.at;
+  }
+
+  /**
+   * Step over the next `size` bytes.
+   *
+   * @param {number} size
+   * @param {string} what for the message
+   * @returns {number} where they begin, for `view`
+   */
+  claim(size, what) {
+    if (size > this.left)
+      throw fault(this.code, this.offset, this.clause, `${what} of ${size} bytes, ${this.left} left`);
+    this.at += size;
+    return this.at - size;
+  }
+
+  /**
+   * Read a structure with its generated reader and refuse reserved fields that are not 0.
+   *
+   * @template {Record<string, unknown>} T
+   * @param {(view: DataView, at: number) => T} unpack
+   * @param {number} size
+   * @param {Record<string, number>} reserved offsets of the reserved fields by name
+   * @param {string} what for the message
+   * @returns {{fields: T, offset: number}} `offset` in the file
+   */
+  read(unpack, size, reserved, what) {
+    const offset = this.offset;
+    const fields = unpack(this.view, this.claim(size, what));
+    for (const name in reserved) {
+      if (fields[name] !== 0)
+        throw fault(ERROR_RESERVED, offset + reserved[name], 'RES-1', `${what}: ${name} is ${fields[name]}`);
+    }
+    return { fields, offset };
+  }
+
+  finish() {
+    if (this.left) throw fault(this.code, this.offset, this.clause, `${this.left} bytes too many`);
+  }
+}

@@ -1,0 +1,27 @@
+// Lookups in the registry.
+
+import * as spec from './spec.mjs';
+
+/**
+ * A registry entry's name.
+ *
+ * @param {Record<number, string>} names
+ * @param {number} id
+ * @returns {string | undefined} undefined for reserved and unlisted ids
+ */
+export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : undefined);
+
+/**
+ * The flags that the registry gives a chunk type.
+ *
+ * @param {string} type a known one
+ */
+export function registeredFlags(type) {
+  /** @type {readonly string[]} */
+  const names = spec.CHUNK_FLAGS[/** @type {keyof typeof spec.CHUNK_FLAGS} */ (type)];
+  let flags = 0;
+  for (const bit of [spec.CHUNK_FLAG_CRITICAL, spec.CHUNK_FLAG_SAFE_TO_COPY]) {
+    if (names.includes(nameOf(spec.CHUNK_FLAG_NAMES, bit) ?? '')) flags |= bit;
+  }
+  return flags;
+}

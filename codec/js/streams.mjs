@@ -1,0 +1,173 @@
+// Streams: head and coder (spec sections 6.1 and 6.2).
+
+import { InputError, fault } from './errors.mjs';
+import { InflateError } from './inflate.mjs';
+import { parseJson } from './json.mjs';
+import * as spec from './spec.mjs';
+import { elements, putIntegers, undoDelta, undoRunLength, undoZigzag } from './transforms.mjs';
+
+const RESERVED = { reserved_0: 6 };
+const { TRANSFORM_DELTA, TRANSFORM_ZIGZAG, TRANSFORM_RUN_LENGTH } = spec;
+
+/**
+ * Elements of a stream as unsigned integers: `low` holds their lower 32 bits, `high` the others (null up to width 4).
+ *
+ * @typedef {{low: Uint32Array, high: Uint32Array | null, width: number, offset: number}} Elements
+ * @typedef {import('./payload.mjs').Payload} Payload
+ * @typedef {import('./inflate.mjs').Inflate} Inflate
+ * @typedef {ReturnType<typeof spec.unpackStreamHead>} StreamHead
+ */
+
+/**
+ * Read one stream.
+ *
+ * @param {Payload} payload at the stream's head
+ * @param {number} count elements that the place of the stream requires
+ * @param {number} widthMax bytes of an element at most
+ * @param {Inflate} inflate
+ * @returns {Promise<Elements>} `offset` is the head's
+ */
+export async function readStream(payload, count, widthMax, inflate) {
+  const { head, offset } = readHead(payload, widthMax, (found, at) => checkCount(found, count, at));
+  const bytes = await unpack(payload, head, offset, inflate);
+  return { ...elements(bytes, head), width: head.width, offset };
+}
+
+/**
+ * Read the stream of a JSON chunk (spec 5.4) to its value.
+ *
+ * @param {Payload} payload
+ * @param {number} limit bytes of the text at most
+ * @param {Inflate} inflate
+ * @returns {Promise<{value: unknown, offset: number}>} `offset` is the head's
+ */
+export async function readJson(payload, limit, inflate) {
+  const { head, offset } = readHead(payload, 1, (found, at) => {
+    if (found === 0) throw fault(spec.ERROR_STREAM, at, 'STR-1', 'no elements');
+    if (found > limit) throw fault(spec.ERROR_LIMIT, at, 'STR-8', `${found} bytes of JSON, the budget is ${limit}`);
+  });
+  const text = (await unpack(payload, head, offset, inflate)).slice();
+  const transforms = [...head.transforms];
+  if (transforms.includes(TRANSFORM_ZIGZAG)) undoZigzag(text, 1);
+  if (transforms.includes(TRANSFORM_DELTA)) undoDelta(text, 1);
+  payload.finish();
+  try {
+    return { value: parseJson(text), offset };
+  } catch (error) {
+    throw fault(spec.ERROR_JSON, offset, 'JSN-1', error instanceof Error ? error.message : String(error), error);
+  }
+}
+
+/**
+ * Read one stream to integers in binary64.
+ *
+ * @param {Payload} payload at the stream's head
+ * @param {number} count
+ * @param {number} widthMax at most 4
+ * @param {boolean} isSigned
+ * @param {Inflate} inflate
+ * @param {Float64Array} columns to fill
+ * @returns {Promise<{columns: Float64Array, width: number, offset: number}>}
+ */
+export async function readIntegers(payload, count, widthMax, isSigned, inflate, columns) {
+  const { head, offset } = readHead(payload, widthMax, (found, at) => checkCount(found, count, at));
+  const bytes = await unpack(payload, head, offset, inflate);
+  putIntegers(columns, bytes, head, isSigned);
+  return { columns, width: head.width, offset };
+}
+
+/**
+ * @param {Payload} payload
+ * @param {number} widthMax
+ * @param {(count: number, offset: number) => void} checkItsCount refuses a count that does not fit its place
+ */
+function readHead(payload, widthMax, checkItsCount) {
+  const { fields: head, offset } = payload.read(
+    spec.unpackStreamHead,
+    spec.STREAM_HEAD_SIZE,
+    RESERVED,
+    'a stream head',
+  );
+  const { width, coder, packed_size, coded_size } = head;
+  if (width < 1 || width > widthMax) {
+    throw fault(spec.ERROR_STREAM, offset, 'STR-2', `elements of ${width} bytes, 1 to ${widthMax} may be`);
+  }
+  if (!(coder in spec.CODER_NAMES)) throw fault(spec.ERROR_UNSUPPORTED, offset + 1, 'RES-2', `coder ${coder}`);
+  if (
+    spec.CODER_PROFILE[/** @type {keyof typeof spec.CODER_PROFILE} */ (coder)] !== spec.PROFILE_NAMES[spec.PROFILE_BASE]
+  ) {
+    throw fault(spec.ERROR_UNSUPPORTED, offset + 1, 'STR-7', `coder ${coder} in the profile base`);
+  }
+  checkTransforms(head.transforms, offset + 2);
+  checkItsCount(head.count, offset + 8);
+  const plain = head.count * width; // below 2^35
+  if (head.transforms.includes(TRANSFORM_RUN_LENGTH)) {
+    if (packed_size < 3 || packed_size % 3 || packed_size > 3 * plain) {
+      throw fault(spec.ERROR_STREAM, offset + 12, 'STR-5', `runs of ${packed_size} bytes for ${plain}`);
+    }
+  } else if (packed_size !== plain) {
+    throw fault(spec.ERROR_STREAM, offset + 12, 'STR-4', `${packed_size} bytes for ${plain}`);
+  }
+  if (coded_size > payload.left) {
+    throw fault(spec.ERROR_STREAM, offset + 16, 'STR-6', `${coded_size} coded bytes, ${payload.left} left`);
+  }
+  return { head, offset };
+}
+
+/**
+ * @param {number} found
+ * @param {number} count
+ * @param {number} offset
+ */
+function checkCount(found, count, offset) {
+  if (found !== count) throw fault(spec.ERROR_STREAM, offset, 'STR-1', `${found} elements instead of ${count}`);
+}
+
+/**
+ * @param {Uint8Array} transforms
+ * @param {number} offset
+ */
+function checkTransforms(transforms, offset) {
+  let last = 0;
+  for (let i = 0; i < transforms.length; i++) {
+    const transform = transforms[i];
+    if (!(transform in spec.TRANSFORM_NAMES))
+      throw fault(spec.ERROR_UNSUPPORTED, offset, 'RES-2', `transform ${transform}`);
+    const after = i > 0 && last === spec.TRANSFORM_NONE; // nothing but NONE may follow NONE
+    if (after ? transform !== spec.TRANSFORM_NONE : transform !== spec.TRANSFORM_NONE && transform <= last) {
+      throw fault(spec.ERROR_STREAM, offset, 'STR-3', `transforms ${[...transforms].join(', ')}`);
+    }
+    last = transform;
+  }
+}
+
+/**
+ * Undo the coder and RUN_LENGTH.
+ *
+ * @param {Payload} payload behind the stream's head; ends behind the coded bytes
+ * @param {StreamHead} head
+ * @param {number} offset
+ * @param {Inflate} inflate
+ * @returns {Promise<Uint8Array>} count × width bytes
+ */
+async function unpack(payload, head, offset, inflate) {
+  const { coder, packed_size: size, coded_size } = head;
+  const at = payload.claim(coded_size, 'coded bytes');
+  const coded = payload.bytes.subarray(at, at + coded_size);
+  const start = offset + spec.STREAM_HEAD_SIZE;
+  /** @type {Uint8Array} */
+  let packed = coded;
+  if (coder === spec.CODER_STORED) {
+    if (coded_size !== size) throw fault(spec.ERROR_CODER, start, 'COD-1', `${coded_size} stored bytes for ${size}`);
+  } else {
+    try {
+      packed = await inflate(coded, size);
+    } catch (error) {
+      if (!(error instanceof InflateError)) throw error;
+      throw fault(spec.ERROR_CODER, start + error.at, 'COD-2', error.message, error);
+    }
+  }
+  if (packed.length !== size) throw new InputError(`options.inflate gave ${packed.length} bytes instead of ${size}`);
+  if (!head.transforms.includes(TRANSFORM_RUN_LENGTH)) return packed;
+  return undoRunLength(packed, head.count * head.width, start);
+}

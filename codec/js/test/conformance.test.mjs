@@ -1,0 +1,115 @@
+// Every vector of the conformance suite, whole, as floats and as integers, and tile by tile.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatReader, decode, readHeader } from '../decoder.mjs';
+import { streamInflate } from '../inflate.mjs';
+import { hash, manifest, noStream, refusal, vector } from './helpers.mjs';
+
+const base = manifest.filter(({ profile }) => profile === 'base');
+const valid = base.filter(({ error }) => !error.code);
+const invalid = base.filter(({ error }) => error.code);
+
+const hashes = (scene, expected) =>
+  Object.fromEntries(Object.keys(expected).map((name) => [name, scene[name] && hash(scene[name])]));
+const wanted = (expected) => Object.fromEntries(Object.entries(expected).map(([name, [, , sha]]) => [name, sha]));
+const facts = (header) => ({
+  profile: header.profile,
+  splat_count: header.splatCount,
+  tile_count: header.tiles.length,
+  sh_degree: header.shDegree,
+  scene_flags: ['antialiased', 'flat'].filter((name) => header[name]),
+  axes: header.axes,
+  unit_metres: header.unitMetres,
+  origin: header.origin,
+});
+
+test('there are vectors of all kinds', () => {
+  assert.ok(valid.length > 100 && invalid.length > 200);
+});
+
+for (const { name, expect } of valid) {
+  test(`decodes ${name}`, async () => {
+    const file = vector(name);
+    const scene = await decode(file);
+    assert.deepEqual(facts(scene.header), expect.header);
+    assert.deepEqual(hashes(scene, expect.floats), wanted(expect.floats));
+    assert.deepEqual(hashes(scene.extra, expect.extra), wanted(expect.extra));
+    assert.deepEqual(Object.keys(scene.extra).sort(), Object.keys(expect.extra).sort());
+    const { header } = scene;
+    const chunks = header.directory.length + header.tiles.reduce((sum, tile) => sum + tile.layers.length, 0);
+    assert.deepEqual(scene.checks, { header: true, index: true, chunks, digest: true });
+    const integers = await decode(file, { form: 'integers' });
+    assert.deepEqual(hashes(integers, expect.integers), wanted(expect.integers));
+  });
+}
+
+test('decodes every valid vector with DecompressionStream', { skip: noStream }, async () => {
+  const inflate = await streamInflate();
+  for (const { name, expect } of valid) {
+    const scene = await decode(vector(name), { inflate });
+    assert.deepEqual(hashes(scene, expect.floats), wanted(expect.floats), name);
+  }
+});
+
+for (const { name, error } of invalid) {
+  test(`refuses ${name}`, async () => {
+    for (const form of ['floats', 'integers']) {
+      const { code, clause, offset } = await refusal(() => decode(vector(name), { form }));
+      assert.deepEqual({ code, clause, offset }, { code: error.code, clause: error.clause, offset: error.offset });
+    }
+  });
+}
+
+test(
+  'refuses every invalid vector with DecompressionStream, with the same code and clause',
+  { skip: noStream },
+  async () => {
+    const inflate = await streamInflate();
+    for (const { name, error } of invalid) {
+      const { code, clause } = await refusal(() => decode(vector(name), { inflate }));
+      assert.deepEqual({ code, clause }, { code: error.code, clause: error.clause }, name);
+    }
+  },
+);
+
+test('refuses the profile archive by its name', async () => {
+  const archive = manifest.filter(({ profile }) => profile === 'archive');
+  assert.ok(archive.length > 0);
+  for (const { name } of archive) {
+    const error = await refusal(() => decode(vector(name)));
+    assert.equal(error.name, 'UnsupportedError');
+    assert.equal(error.code, 'E_UNSUPPORTED');
+    assert.match(error.message, /archive/);
+  }
+});
+
+test('the header of every valid vector is read from the beginning of the file alone', () => {
+  for (const { name, expect } of valid) {
+    const file = vector(name);
+    const { indexSize } = readHeader(file);
+    assert.deepEqual(facts(readHeader(file.subarray(0, 64 + indexSize))), expect.header, name);
+  }
+});
+
+test('a reader gives for each tile what a whole decode gives', async () => {
+  for (const { name } of valid) {
+    const file = vector(name);
+    const whole = await decode(file);
+    const reader = await CsplatReader.open(new Blob([file]));
+    assert.deepEqual(reader.header, whole.header, name);
+    for (const { index, first, splatCount } of whole.header.tiles.slice(0, 20)) {
+      const tile = await reader.readTile(index, { extra: true });
+      for (const array of ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN']) {
+        const width = whole[array].length / whole.count;
+        const part = whole[array].slice(first * width, (first + splatCount) * width);
+        assert.equal(hash(tile[array]), hash(part), `${name} ${array}`);
+      }
+      for (const [column, values] of Object.entries(whole.extra)) {
+        assert.equal(hash(tile.extra[column]), hash(values.slice(first, first + splatCount)), `${name} ${column}`);
+      }
+    }
+    const { metadata, cameras, options, statedErrors } = whole;
+    assert.deepEqual(await reader.describe(), { metadata, cameras, options, statedErrors });
+  }
+});

@@ -1,0 +1,69 @@
+// Damaged files are refused with an error of ours, never decoded, never answered with another exception.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatError, decode, readHeader } from '../decoder.mjs';
+import { forged, refusal, vector } from './helpers.mjs';
+
+const example = vector('valid/worked_example');
+
+test('every prefix of the worked example is refused', async () => {
+  for (let size = 0; size < example.length; size++) {
+    const { code } = await refusal(() => decode(example.subarray(0, size)));
+    assert.equal(code, 'E_TRUNCATED', `${size} bytes`);
+  }
+});
+
+test('every flipped bit of the worked example is refused', async () => {
+  for (let bit = 0; bit < 8 * example.length; bit++) {
+    const damaged = example.slice();
+    damaged[bit >> 3] ^= 1 << (bit & 7);
+    const { code } = await refusal(() => decode(damaged));
+    const allowed = bit < 64 ? ['E_MAGIC'] : ['E_VERSION', 'E_CRC', 'E_DIGEST'];
+    assert.ok(allowed.includes(code), `bit ${bit}: ${code}`);
+  }
+});
+
+test('bytes behind the end are refused', async () => {
+  const longer = new Uint8Array(example.length + 1);
+  longer.set(example);
+  const { code, offset } = await refusal(() => decode(longer));
+  assert.deepEqual([code, offset], ['E_TRAILING', example.length]);
+});
+
+test('flipped bits under repaired checksums give a scene or an error of ours', async () => {
+  for (const name of ['valid/rich', 'extreme/seeded', 'valid/codebook_shape_escape']) {
+    const file = vector(name);
+    let random = 1;
+    let refused = 0;
+    for (let at = 0; at < file.length; at++) {
+      random = (Math.imul(random, 1103515245) + 12345) >>> 0;
+      const bytes = forged(file, (copy) => (copy[at] ^= 1 << (random >>> 29)));
+      await decode(bytes).catch((error) => {
+        if (!(error instanceof CsplatError)) throw new Error(`${name}, byte ${at}`, { cause: error });
+        refused++;
+      });
+    }
+    assert.ok(refused > file.length / 4, `${name}: ${refused} of ${file.length} refused`);
+  }
+});
+
+test('words of all ones and all zeros under repaired checksums do no worse', async () => {
+  const file = vector('valid/rich');
+  for (const value of [0xffffffff, 0, 0x7fffffff, 0x80000000]) {
+    for (let at = 8; at + 4 <= file.length; at += 1) {
+      const bytes = forged(file, (_, view) => view.setUint32(at, value, true));
+      await decode(bytes).catch((error) => {
+        if (!(error instanceof CsplatError)) throw new Error(`${value} at byte ${at}`, { cause: error });
+      });
+    }
+  }
+});
+
+test('readHeader refuses every prefix that lacks a part of the index', async () => {
+  const { indexSize } = readHeader(example);
+  for (let size = 0; size < 64 + indexSize; size++) {
+    const { code } = await refusal(() => readHeader(example.subarray(0, size)));
+    assert.equal(code, 'E_TRUNCATED');
+  }
+});

@@ -1,0 +1,91 @@
+// What the tests share: the conformance vectors, hashes, checksums made good again, a server.
+
+import { createHash } from 'node:crypto';
+import { readFileSync } from 'node:fs';
+import { createServer } from 'node:http';
+import { crc32 } from '../checksums.mjs';
+import { CsplatError, readHeader } from '../decoder.mjs';
+import { streamInflate } from '../inflate.mjs';
+
+const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
+
+export const manifest = JSON.parse(readFileSync(new URL('manifest.json', VECTORS), 'utf8')).vectors;
+
+/** @param {string} name as `valid/rich` */
+export const vector = (name) => new Uint8Array(readFileSync(new URL(`${name}.csplat`, VECTORS)));
+
+/** Why tests of DecompressionStream are skipped, or false where they are not. */
+export const noStream = await streamInflate().then(
+  () => false,
+  (error) => error.message,
+);
+
+/** SHA-256 of an array's bytes, in hexadecimal. @param {ArrayBufferView} array */
+export const hash = (array) =>
+  createHash('sha256')
+    .update(new Uint8Array(array.buffer, array.byteOffset, array.byteLength))
+    .digest('hex');
+
+/**
+ * What a decode is refused with.
+ *
+ * @param {() => unknown} run
+ * @returns {Promise<CsplatError>} anything else that is thrown fails the test
+ */
+export async function refusal(run) {
+  try {
+    await run();
+  } catch (error) {
+    if (error instanceof CsplatError) return error;
+    throw error;
+  }
+  throw new Error('not refused');
+}
+
+/**
+ * A copy of a file with some bytes changed and all checksums right again.
+ *
+ * @param {Uint8Array} file a valid one, whose chunks lie where its index says
+ * @param {(bytes: Uint8Array, view: DataView) => void} change
+ */
+export function forged(file, change) {
+  const { directory, tiles, indexSize } = readHeader(file);
+  const bytes = file.slice();
+  const view = new DataView(bytes.buffer);
+  change(bytes, view);
+  const seal = (start, end) => view.setUint32(end, crc32(bytes.subarray(start, end)), true);
+  seal(0, 28);
+  seal(64, 64 + indexSize - 4);
+  for (const { offset, size } of [...directory, ...tiles.flatMap((tile) => tile.layers)])
+    seal(offset, offset + size - 4);
+  bytes.set(createHash('sha256').update(bytes.subarray(0, 32)).update(bytes.subarray(64)).digest(), 32);
+  return bytes;
+}
+
+/**
+ * Serve a file until the test ends.
+ *
+ * @param {import('node:test').TestContext} test
+ * @param {Uint8Array} file
+ * @param {{ranges?: boolean, sent?: Uint8Array}} [options] `sent` is sent whole in place of the file
+ * @returns {Promise<{url: string, requests: string[]}>} `requests` collects the ranges that are asked for
+ */
+export async function serve(test, file, { ranges = true, sent = file } = {}) {
+  const requests = [];
+  const server = createServer((request, response) => {
+    const range = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '');
+    requests.push(request.headers.range ?? 'all');
+    if (request.url !== '/scene.csplat') return response.writeHead(404).end('no');
+    if (!ranges || !range) return response.writeHead(200).end(sent);
+    const [start, end] = [Number(range[1]), Math.min(Number(range[2]) + 1, file.length)];
+    if (start >= file.length) return response.writeHead(416).end();
+    response.writeHead(206, { 'Content-Range': `bytes ${start}-${end - 1}/${file.length}`, ETag: '"1"' });
+    return response.end(file.subarray(start, end));
+  });
+  await new Promise((resolve) => server.listen(0, '127.0.0.1', resolve));
+  test.after(() => {
+    server.closeAllConnections();
+    server.close();
+  });
+  return { url: `http://127.0.0.1:${server.address().port}/scene.csplat`, requests };
+}

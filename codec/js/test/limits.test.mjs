@@ -1,0 +1,106 @@
+// Budgets, options and the caller's mistakes.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatReader, LimitError, decode, readHeader } from '../decoder.mjs';
+import { hash, refusal, vector } from './helpers.mjs';
+
+const rich = vector('valid/rich');
+
+test('a budget of exactly the splats suffices, one fewer does not', async () => {
+  const { splatCount } = readHeader(rich);
+  await decode(rich, { limits: { splats: splatCount } });
+  const error = await refusal(() => decode(rich, { limits: { splats: splatCount - 1 } }));
+  assert.ok(error instanceof LimitError);
+  assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
+});
+
+test('a budget of bytes counts arrays and tables, before they are made', async () => {
+  const file = vector('extreme/tile_of_65536');
+  const { count, means, quats, scales, opacities, sh0, shN } = await decode(file);
+  const bytes = [means, quats, scales, opacities, sh0, shN].reduce((sum, array) => sum + array.byteLength, 0);
+  assert.equal(count, 65536);
+  await decode(file, { limits: { bytes } });
+  assert.equal((await refusal(() => decode(file, { limits: { bytes: bytes - 1 } }))).code, 'E_LIMIT');
+  assert.equal((await refusal(() => decode(file, { form: 'integers', limits: { bytes } }))).code, 'E_LIMIT');
+});
+
+test('a budget of JSON counts the text', async () => {
+  const file = vector('valid/worked_example'); // {"title":"two"}
+  assert.deepEqual((await decode(file, { limits: { jsonBytes: 15 } })).metadata, { title: 'two' });
+  assert.equal((await refusal(() => decode(file, { limits: { jsonBytes: 14 } }))).clause, 'STR-8');
+});
+
+test('an index beyond the budget is refused before its records are read', async () => {
+  const error = await refusal(() => readHeader(rich, { limits: { bytes: 1000 } }));
+  assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
+});
+
+test('a lower SH degree gives the rows of the lower bands', async () => {
+  const file = vector('extreme/seeded');
+  const whole = await decode(file);
+  for (const shDegree of [0, 1, 2, 3, 7]) {
+    const part = await decode(file, { shDegree });
+    const rows = (Math.min(shDegree, 3) + 1) ** 2 - 1;
+    assert.equal(part.shN.length, 3 * rows * part.count);
+    for (let i = 0; i < part.count; i++) {
+      assert.deepEqual(part.shN.slice(3 * rows * i, 3 * rows * (i + 1)), whole.shN.slice(45 * i, 45 * i + 3 * rows));
+    }
+    assert.equal(hash(part.sh0), hash(whole.sh0));
+  }
+});
+
+test('chosen tiles come in the order of the choice', async () => {
+  const whole = await decode(rich);
+  const [a, b] = whole.header.tiles;
+  const swapped = await decode(rich, { tiles: [1, 0] });
+  const second = whole.means.slice(3 * b.first);
+  assert.deepEqual([...swapped.means], [...second, ...whole.means.slice(0, 3 * a.splatCount)]);
+  const integers = await decode(rich, { tiles: [1], form: 'integers' });
+  assert.deepEqual([...integers.tile_splats], [b.splatCount]);
+  assert.equal((await decode(rich, { tiles: [] })).count, 0);
+});
+
+test('progress ends at all splats, and an abort is passed on', async () => {
+  const seen = [];
+  const { count } = await decode(rich, { onProgress: (done, total) => seen.push([done, total]) });
+  assert.deepEqual(seen.at(-1), [count, count]);
+  const reason = new Error('enough');
+  await assert.rejects(decode(rich, { signal: AbortSignal.abort(reason) }), reason);
+});
+
+test('data may be an ArrayBuffer, any view, or shared memory', async () => {
+  const shared = new Uint8Array(new SharedArrayBuffer(rich.length));
+  shared.set(rich);
+  const shifted = new Uint8Array(rich.length + 3);
+  shifted.set(rich, 3);
+  const whole = hash((await decode(rich)).means);
+  for (const data of [rich.slice().buffer, new DataView(rich.buffer), Buffer.from(rich), shared, shifted.subarray(3)]) {
+    assert.equal(hash((await decode(data)).means), whole);
+  }
+});
+
+test("the caller's mistakes are E_INPUT", async () => {
+  const reader = await CsplatReader.open(new Blob([rich]));
+  const mistakes = [
+    () => decode('a string'),
+    () => decode(null),
+    () => decode(rich, { form: 'doubles' }),
+    () => decode(rich, { shDegree: -1 }),
+    () => decode(rich, { shDegree: 1.5 }),
+    () => decode(rich, { tiles: [2] }),
+    () => decode(rich, { tiles: [-1] }),
+    () => decode(rich, { limits: { splats: -1 } }),
+    () => decode(rich, { limits: { splat: 1 } }),
+    () => decode(rich, { limits: { bytes: '1' } }),
+    () => decode(vector('valid/coder_deflate_fixed'), { inflate: () => new Uint8Array(1) }),
+    () => CsplatReader.open(42),
+    () => reader.readTile(2),
+    () => reader.readLayer(0, 4),
+    () => reader.readLayer(0, 8),
+  ];
+  for (const mistake of mistakes) {
+    const error = await refusal(mistake);
+    assert.deepEqual([error.name, error.code], ['InputError', 'E_INPUT'], String(mistake));
+  }
+});

@@ -1,0 +1,193 @@
+// CsplatReader over HTTP, with ranges and without, and what can go wrong on the way.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatReader, decode } from '../decoder.mjs';
+import { forged, hash, refusal, serve, vector } from './helpers.mjs';
+
+const rich = vector('valid/rich');
+const seeded = vector('extreme/seeded');
+
+test('one request for header and index of a small file, none for what came with it', async (t) => {
+  const { url, requests } = await serve(t, seeded);
+  const reader = await CsplatReader.open(url);
+  const tile = await reader.readTile(0);
+  assert.deepEqual(requests, ['bytes=0-65535']);
+  assert.equal(hash(tile.shN), hash((await decode(seeded)).shN));
+  assert.deepEqual(
+    { ...reader.checks, chunks: reader.checks.chunks > 0 },
+    { header: true, index: true, chunks: true, digest: false },
+  );
+});
+
+test('with small first requests each part is fetched by itself', async (t) => {
+  const { url, requests } = await serve(t, rich);
+  const whole = await decode(rich);
+  const reader = await CsplatReader.open(url, { firstBytes: 64 });
+  assert.equal(requests.length, 2);
+  const { count, sh0 } = await reader.readLayer(1, 0);
+  assert.equal(hash(sh0), hash(whole.sh0.slice(-3 * count)));
+  assert.deepEqual(await reader.describe(), {
+    metadata: whole.metadata,
+    cameras: whole.cameras,
+    options: whole.options,
+    statedErrors: whole.statedErrors,
+  });
+});
+
+test('layers in any order, those that need the indices of a lower band too', async (t) => {
+  const file = vector('valid/codebook_sh_1_3');
+  const { url } = await serve(t, file);
+  const whole = await decode(file);
+  const rows = whole.shN.length / 3 / whole.count;
+  for (const order of [
+    [3, 2, 1, 0],
+    [2, 3, 0, 1],
+    [1, 2, 3],
+    [3, 3, 1, 3],
+  ]) {
+    const reader = await CsplatReader.open(url, { firstBytes: 64 });
+    for (const layer of order) {
+      const part = await reader.readLayer(0, layer);
+      if (layer === 0) {
+        assert.equal(hash(part.means), hash(whole.means));
+        continue;
+      }
+      const wanted = [];
+      for (let i = 0; i < whole.count; i++) {
+        for (let row = layer * layer - 1; row < (layer + 1) ** 2 - 1; row++) {
+          wanted.push(...whole.shN.subarray(3 * (i * rows + row), 3 * (i * rows + row) + 3));
+        }
+      }
+      assert.deepEqual([...part.sh], wanted, `layer ${layer} of ${order}`);
+      const integers = await reader.readLayer(0, layer, { form: 'integers' });
+      assert.equal(integers.sh.length, wanted.length);
+    }
+  }
+});
+
+test('layers read at the same time', async () => {
+  const file = vector('valid/codebook_sh_1_3');
+  const reader = await CsplatReader.open(new Blob([file]));
+  const alone = await Promise.all(
+    [1, 2, 3].map((layer) => CsplatReader.open(new Blob([file])).then((one) => one.readLayer(0, layer))),
+  );
+  const together = await Promise.all([3, 1, 2].map((layer) => reader.readLayer(0, layer)));
+  assert.deepEqual(
+    together.map(({ sh }) => hash(sh)),
+    [alone[2], alone[0], alone[1]].map(({ sh }) => hash(sh)),
+  );
+});
+
+test('a band that the tile leaves out is null', async () => {
+  const reader = await CsplatReader.open(new Blob([vector('valid/absent_band')]));
+  assert.equal(await reader.readLayer(0, 1), null);
+  assert.ok((await reader.readLayer(0, 2)).sh.length > 0);
+});
+
+test('prefetch joins neighbours to one request and reads nothing twice', async (t) => {
+  const file = vector('extreme/tiles_of_one');
+  const { url, requests } = await serve(t, file);
+  const reader = await CsplatReader.open(url, { firstBytes: 64 });
+  const before = requests.length;
+  const indices = reader.header.tiles.map(({ index }) => index);
+  reader.prefetch(indices.map((tile) => ({ tile, layer: 0 })));
+  const tiles = await Promise.all(indices.map((index) => reader.readLayer(index, 0)));
+  assert.equal(requests.length - before, 1);
+  assert.deepEqual(
+    tiles.flatMap(({ means }) => [...means]),
+    [...(await decode(file)).means],
+  );
+  assert.equal(reader.source.fetched.length, 0);
+});
+
+test('a server without ranges sends the whole file, whose digest is then checked', async (t) => {
+  const { url, requests } = await serve(t, seeded, { ranges: false });
+  const received = [];
+  const reader = await CsplatReader.open(url, { onProgress: (...progress) => received.push(progress) });
+  assert.equal(hash((await reader.readTile(0)).shN), hash((await decode(seeded)).shN));
+  assert.equal(requests.length, 1);
+  await reader.source.complete;
+  while (!reader.checks.digest) await new Promise((resolve) => setTimeout(resolve, 1));
+  assert.equal(received.at(-1)[0], seeded.length);
+});
+
+test('a server without ranges and a wrong digest', async (t) => {
+  const { url } = await serve(t, vector('invalid/digest'), { ranges: false });
+  const reader = await CsplatReader.open(url);
+  await reader.source.complete;
+  await new Promise((resolve) => setTimeout(resolve, 50));
+  assert.equal((await refusal(() => reader.readTile(0))).code, 'E_DIGEST');
+  assert.equal(reader.checks.digest, false);
+});
+
+test('files cut short and files too long, with and without ranges', async (t) => {
+  const longer = new Uint8Array(rich.length + 5);
+  longer.set(rich);
+  for (const ranges of [true, false]) {
+    for (const size of [0, 10, 64, 300, rich.length - 1]) {
+      const { url } = await serve(t, rich.subarray(0, size), { ranges });
+      const error = await refusal(async () => {
+        const reader = await CsplatReader.open(url); // with ranges the server says how long the file is
+        await reader.source.complete; // without, the end of the body does
+      });
+      assert.equal(error.code, 'E_TRUNCATED', `${size} bytes, ranges ${ranges}`);
+    }
+    const { url } = await serve(t, longer, { ranges });
+    const error = await refusal(async () => {
+      const reader = await CsplatReader.open(url);
+      await reader.source.complete;
+    });
+    assert.equal(error.code, 'E_TRAILING');
+  }
+});
+
+test('a damaged part is refused, the others are not', async (t) => {
+  const { header } = await decode(rich);
+  const damaged = rich.slice();
+  damaged[header.tiles[0].layers[0].offset + 20] ^= 1;
+  const { url } = await serve(t, damaged);
+  const reader = await CsplatReader.open(url);
+  assert.equal((await refusal(() => reader.readTile(0))).clause, 'CHK-1');
+  assert.ok((await reader.readTile(1)).count > 0);
+});
+
+test('a codebook that is damaged is refused each time it is asked for', async () => {
+  const file = vector('valid/codebook_sh0');
+  const { header } = await decode(file);
+  const damaged = forged(file, (bytes) => (bytes[header.directory[0].offset + 12] ^= 1));
+  const reader = await CsplatReader.open(new Blob([damaged]));
+  for (let i = 0; i < 2; i++) assert.equal((await refusal(() => reader.readTile(0))).clause, 'CDB-1');
+});
+
+test('budgets hold for readers', async (t) => {
+  const { url } = await serve(t, rich, { ranges: false });
+  assert.equal((await refusal(() => CsplatReader.open(url, { limits: { bytes: rich.length - 1 } }))).code, 'E_LIMIT');
+  const reader = await CsplatReader.open(new Blob([rich]), { limits: { splats: 1 } });
+  assert.equal((await refusal(() => reader.readTile(0))).code, 'E_LIMIT');
+});
+
+test('a missing file and an unreachable server are E_INPUT', async (t) => {
+  const { url } = await serve(t, rich);
+  assert.equal((await refusal(() => CsplatReader.open(`${url}x`))).code, 'E_INPUT');
+  assert.equal((await refusal(() => CsplatReader.open('http://127.0.0.1:1/x'))).code, 'E_INPUT');
+});
+
+test('a file that changes behind the reader is noticed', async (t) => {
+  const { url } = await serve(t, rich);
+  let etag = 0;
+  const changing = async (...request) => {
+    const response = await fetch(...request);
+    return new Response(response.body, { status: response.status, headers: { ETag: `"${etag++}"` } });
+  };
+  const reader = await CsplatReader.open(url, { firstBytes: 64, fetch: changing }).catch((error) => error);
+  assert.equal(reader.code, 'E_INPUT');
+});
+
+test('an abort ends a read with its reason', async (t) => {
+  const { url } = await serve(t, rich);
+  const reader = await CsplatReader.open(url, { firstBytes: 64 });
+  const reason = new Error('enough');
+  await assert.rejects(reader.readTile(0, { signal: AbortSignal.abort(reason) }), reason);
+  assert.ok((await reader.readTile(0)).count > 0);
+});

@@ -1,0 +1,256 @@
+// One tile: the blocks of its layers, decoded to integers and checked (spec 5.2, 6.4, 7.1, 7.2, 7.4).
+
+import { readCodebookBlock } from './codebooks.mjs';
+import { checkCoding, columnCount, readBlockHead, readValues } from './codings.mjs';
+import { fault } from './errors.mjs';
+import { ldexp, rgbFromYcocg } from './lattice.mjs';
+import { Payload } from './payload.mjs';
+import * as spec from './spec.mjs';
+import { readStream } from './streams.mjs';
+
+const { ERROR_BOX, ERROR_INDEX, ERROR_RANGE, ERROR_STREAM } = spec;
+
+/**
+ * @typedef {import('./decoder.d.ts').Header} Header
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
+ * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
+ * @typedef {import('./codings.mjs').Block} Block
+ * @typedef {import('./codebooks.mjs').Indices} Indices
+ * @typedef {import('./codebooks.mjs').Table} Table
+ * @typedef {import('./inflate.mjs').Inflate} Inflate
+ * @typedef {import('./streams.mjs').Elements} Elements
+ *
+ * What a block's decoder may ask of its tile.
+ *
+ * @typedef {object} TileContext
+ * @property {number} splatCount
+ * @property {Inflate} inflate
+ * @property {Map<number, Indices>} indices of the codebooks that blocks of the tile use so far
+ * @property {(attribute: AttributeRecord, n: number) => Float64Array} columns an array for integers of n splats
+ * @property {(attribute: AttributeRecord) => Float64Array} sums another one, for sums of entries
+ * @property {(id: number) => CodebookRecord | undefined} codebook one that the tile lists
+ * @property {(id: number, layer: number) => Promise<Table>} table
+ * @property {(layer: number) => Promise<void>} needLayer sees to it that the layer, if the tile has it, is decoded
+ *
+ * What tiles share.
+ *
+ * @typedef {object} SceneContext
+ * @property {Header} header
+ * @property {Map<number, CodebookRecord>} codebooks by id
+ * @property {Inflate} inflate
+ * @property {TileContext['table']} table
+ * @property {(key: number, length: number) => Float64Array} scratch an array of any content, to be used until the
+ *   tile is done
+ *
+ * What a layer decodes to.
+ *
+ * @typedef {{blocks: Block[], extras: Elements[]}} Layer
+ */
+
+/** Decodes the layers of one tile and remembers what later layers need of earlier ones. */
+export class Tile {
+  /**
+   * @param {SceneContext} scene
+   * @param {TileRecord} record
+   * @param {TileContext['needLayer']} needLayer
+   */
+  constructor(scene, record, needLayer) {
+    this.scene = scene;
+    this.header = scene.header;
+    this.record = record;
+    this.splatCount = record.splatCount;
+    this.inflate = scene.inflate;
+    this.table = scene.table;
+    this.needLayer = needLayer;
+    /** @type {Map<number, Indices>} */
+    this.indices = new Map();
+  }
+
+  /**
+   * @param {AttributeRecord} attribute
+   * @param {number} n
+   */
+  columns(attribute, n) {
+    return this.scene.scratch(attribute.id, columnCount(attribute) * n);
+  }
+
+  /** @param {AttributeRecord} attribute */
+  sums(attribute) {
+    return this.scene.scratch(-attribute.id, columnCount(attribute) * this.splatCount);
+  }
+
+  /** @param {number} id */
+  codebook(id) {
+    return this.record.tables.includes(id) ? this.scene.codebooks.get(id) : undefined;
+  }
+
+  /**
+   * Decode one layer. Blocks come back with their final integers: R, G, B and the file's lattice.
+   *
+   * @param {Uint8Array<ArrayBuffer>} bytes payload of the TILE chunk
+   * @param {LayerRecord} place
+   * @param {boolean} integers whether all integers are wanted; if not, colours may stay in tables
+   * @returns {Promise<Layer>}
+   */
+  async readLayer(bytes, { layer, offset }, integers) {
+    const payload = new Payload(bytes, offset + spec.CHUNK_HEADER_SIZE, 'TLE-3');
+    const { fields, offset: at } = payload.read(
+      spec.unpackTileHead,
+      spec.TILE_HEAD_SIZE,
+      { reserved_0: 6 },
+      'the head of a tile',
+    );
+    const { index } = this.record;
+    if (fields.tile_index !== index)
+      throw fault(ERROR_INDEX, at, 'TLE-1', `tile ${fields.tile_index} instead of ${index}`);
+    if (fields.layer !== layer) throw fault(ERROR_INDEX, at + 4, 'TLE-1', `layer ${fields.layer} instead of ${layer}`);
+    const attributes = this.attributesOf(layer);
+    const wanted = layer === spec.LAYER_EXTRA ? this.header.extras.length : attributes.length;
+    if (fields.block_count !== wanted) {
+      throw fault(ERROR_STREAM, at + 5, 'TLE-2', `${fields.block_count} blocks instead of ${wanted}`);
+    }
+    const blocks = [];
+    for (const attribute of attributes) blocks.push(this.finish(await this.readBlock(payload, attribute, integers)));
+    const extras = [];
+    if (layer === spec.LAYER_EXTRA) {
+      for (const [column, extra] of this.header.extras.entries())
+        extras.push(await this.readRaw(payload, column, extra.bytes));
+    }
+    payload.finish();
+    return { blocks, extras };
+  }
+
+  /** @param {number} layer */
+  attributesOf(layer) {
+    const sh0 = spec.ATTRIBUTE_SH0;
+    if (layer === spec.LAYER_GEOMETRY) return this.header.attributes.slice(0, sh0);
+    return this.header.attributes.filter(({ id }) => id === sh0 + layer);
+  }
+
+  /**
+   * @param {Payload} payload at the block's head
+   * @param {AttributeRecord} attribute that the place of the block demands
+   * @param {boolean} integers
+   * @returns {Promise<Block>}
+   */
+  async readBlock(payload, attribute, integers) {
+    const head = readBlockHead(payload);
+    if (head.attribute !== attribute.id) {
+      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the place of ${attribute.name}`);
+    }
+    checkCoding(head);
+    if (head.coding === spec.CODING_CODEBOOK) return readCodebookBlock(this, payload, attribute, integers);
+    return readValues(this, payload, attribute, head.coding, this.splatCount, false);
+  }
+
+  /**
+   * @param {Payload} payload at the block's head
+   * @param {number} column
+   * @param {number} width
+   */
+  async readRaw(payload, column, width) {
+    const head = readBlockHead(payload);
+    if (head.attribute !== spec.ATTRIBUTE_EXTRA) {
+      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the extra layer`);
+    }
+    checkCoding(head);
+    const { fields, offset } = payload.read(
+      spec.unpackRawParams,
+      spec.RAW_PARAMS_SIZE,
+      { reserved_0: 2 },
+      'raw parameters',
+    );
+    if (fields.column !== column)
+      throw fault(ERROR_STREAM, offset, 'RAW-1', `column ${fields.column} instead of ${column}`);
+    const stream = await readStream(payload, this.splatCount, spec.CODING_WIDTH_MAX[spec.CODING_RAW], this.inflate);
+    if (stream.width !== width) {
+      throw fault(ERROR_STREAM, stream.offset, 'RAW-2', `elements of ${stream.width} bytes, the type has ${width}`);
+    }
+    return stream;
+  }
+
+  /**
+   * Take a block's integers to those of the file's lattice, in place, and check what only they show.
+   *
+   * @param {Block} block
+   * @returns {Block}
+   */
+  finish(block) {
+    const { id, mapping, chromaShift, step } = block.attribute;
+    if (id === spec.ATTRIBUTE_MEANS) {
+      this.placeMeans(block);
+      checkFinite(block, this.record.step, 'MEA-1');
+    } else if (step !== 0) {
+      if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) {
+        rgbFromYcocg(block.columns, block.columns.length / 3, chromaShift);
+        block.bound *= 4 * 2 ** chromaShift; // |R| <= |Y| + |Cg| / 2 + 3 |Co| / 2 and 1 for each rounding
+      }
+      const s = ldexp(step, block.exponent);
+      checkFinite(block, s, 'LAT-5');
+      if (id === spec.ATTRIBUTE_SCALES) this.checkMaxScale(block.columns, s);
+    }
+    return block;
+  }
+
+  /**
+   * TIL-10, then n = corner + q (spec 7.4).
+   *
+   * @param {Block} block
+   */
+  placeMeans(block) {
+    const { corner, extent, exponent, recordOffset } = this.record;
+    const n = this.splatCount;
+    for (let axis = 0; axis < 3; axis++) {
+      const column = block.columns.subarray(axis * n, (axis + 1) * n);
+      let least = Infinity;
+      let most = -Infinity;
+      for (let i = 0; i < n; i++) {
+        least = Math.min(least, column[i]);
+        most = Math.max(most, column[i]);
+      }
+      // "The means' integers q MUST have on each axis the minimum 0 and the maximum extent."
+      if (least !== 0 || most !== extent[axis]) {
+        const what = `axis ${axis}: integers from ${least} to ${most}, the record says 0 to ${extent[axis]}`;
+        throw fault(ERROR_BOX, recordOffset + 12, 'TIL-10', what);
+      }
+      const first = corner[axis];
+      for (let i = 0; i < n; i++) column[i] += first; // at most 2^53 by TIL-7
+    }
+    block.exponent = exponent;
+    block.bound = spec.INTEGER_MAX;
+  }
+
+  /**
+   * TIL-11
+   *
+   * @param {Float64Array} integers of the scales
+   * @param {number} step
+   */
+  checkMaxScale(integers, step) {
+    let largest = -Infinity;
+    for (let i = 0; i < integers.length; i++) largest = Math.max(largest, integers[i]);
+    const value = Math.fround(largest * step);
+    const { maxScale, recordOffset } = this.record;
+    if (!Object.is(value, maxScale)) {
+      throw fault(ERROR_BOX, recordOffset + 48, 'TIL-11', `the largest scale is ${value}, the record says ${maxScale}`);
+    }
+  }
+}
+
+/**
+ * Refuse integers whose value leaves binary32.
+ *
+ * @param {Block} block
+ * @param {number} step
+ * @param {string} clause
+ */
+function checkFinite({ attribute, columns, bound, offset }, step, clause) {
+  if (Number.isFinite(Math.fround(bound * step))) return;
+  for (const n of columns) {
+    if (!Number.isFinite(Math.fround(n * step))) {
+      throw fault(ERROR_RANGE, offset, clause, `${attribute.name}: ${n} × ${step} is beyond binary32`);
+    }
+  }
+}

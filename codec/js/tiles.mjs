@@ -1,0 +1,170 @@
+// Tile and layer records (spec 4.3.5) and the coverage of the file by chunks (4.3.6).
+
+import { fault } from './errors.mjs';
+import { ldexp } from './lattice.mjs';
+import { nameOf, registeredFlags } from './registry.mjs';
+import * as spec from './spec.mjs';
+
+const { ERROR_INDEX, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+const AXES = [0, 1, 2];
+
+/**
+ * @typedef {import('./decoder.d.ts').Header} Header
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
+ * @typedef {import('./payload.mjs').Payload} Payload
+ */
+
+/**
+ * Read the record of one tile, with its layers and table ids.
+ *
+ * @param {Payload} index at the record
+ * @param {Header} header with attributes and extras; the tiles before stand in `tiles`
+ * @param {number} place number of the tile
+ * @returns {TileRecord}
+ */
+export function readTile(index, header, place) {
+  const { fields, offset } = index.read(
+    spec.unpackTileRecord,
+    spec.TILE_RECORD_SIZE,
+    { level: 4, reserved_0: 10 },
+    'a tile record',
+  );
+  const { splat_count: splatCount, exponent, extent, layer_count, table_count } = fields;
+  if (splatCount < 1 || splatCount > spec.TILE_SPLATS_MAX) {
+    throw fault(ERROR_VALUE, offset, 'TIL-1', `a tile of ${splatCount} splats`);
+  }
+  const lists = layer_count * spec.LAYER_RECORD_SIZE + 2 * table_count;
+  if (lists > index.left) throw fault(ERROR_INDEX, offset, 'IDX-2', `lists of ${lists} bytes, ${index.left} are left`);
+  const corner = readCorner(fields.corner, extent, offset);
+  const step = ldexp(header.attributes[spec.ATTRIBUTE_MEANS - 1].step, exponent);
+  if (!(step > 0 && step < Infinity))
+    throw fault(ERROR_VALUE, offset + 8, 'TIL-9', `a lattice with the exponent ${exponent}`);
+  const layers = readLayers(index, layer_count, header);
+  const tablesOffset = index.offset;
+  const tables = [];
+  for (let i = 0; i < table_count; i++) tables.push(index.view.getUint16(index.claim(2, 'a table id'), true));
+  return {
+    index: place,
+    first: header.splatCount, // N so far
+    splatCount,
+    exponent,
+    corner,
+    extent,
+    step,
+    min: AXES.map((axis) => Math.fround(corner[axis] * step)),
+    max: AXES.map((axis) => Math.fround((corner[axis] + extent[axis]) * step)),
+    maxScale: fields.max_scale,
+    layers,
+    tables,
+    recordOffset: offset,
+    tablesOffset,
+  };
+}
+
+/**
+ * @param {bigint[]} corner
+ * @param {number[]} extent
+ * @param {number} offset of the tile record
+ */
+function readCorner(corner, extent, offset) {
+  const most = BigInt(spec.INTEGER_MAX);
+  for (const axis of AXES) {
+    const end = corner[axis] + BigInt(extent[axis]);
+    if (corner[axis] < -most || corner[axis] > most || end > most) {
+      throw fault(ERROR_VALUE, offset + 12 + 8 * axis, 'TIL-7', `a box from ${corner[axis]} to ${end}`);
+    }
+    if (extent[axis] >= 2 ** spec.AXIS_BITS_MAX) {
+      throw fault(ERROR_VALUE, offset + 36 + 4 * axis, 'TIL-8', `an extent of ${extent[axis]}`);
+    }
+  }
+  return corner.map(Number); // exact: at most 2^53
+}
+
+/**
+ * @param {Payload} index
+ * @param {number} count
+ * @param {Header} header
+ * @returns {LayerRecord[]}
+ */
+function readLayers(index, count, header) {
+  const start = index.offset;
+  /** @type {LayerRecord[]} */
+  const layers = [];
+  const flags = registeredFlags(spec.CHUNK_TILE);
+  for (let i = 0; i < count; i++) {
+    const { fields, offset: at } = index.read(
+      spec.unpackLayerRecord,
+      spec.LAYER_RECORD_SIZE,
+      { reserved_0: 1, reserved_1: 2 },
+      'a layer record',
+    );
+    const { layer, size, offset } = fields;
+    if (nameOf(spec.LAYER_NAMES, layer) === undefined) throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `layer ${layer}`);
+    const before = layers.at(-1)?.layer;
+    if (before === undefined ? layer !== spec.LAYER_GEOMETRY : layer <= before) {
+      throw fault(ERROR_INDEX, at, 'TIL-2', `layer ${layer} after ${before ?? 'none'}`);
+    }
+    if (layer !== spec.LAYER_EXTRA && layer > header.shDegree) {
+      throw fault(ERROR_INDEX, at, 'TIL-3', `layer ${layer} in a scene of SH degree ${header.shDegree}`);
+    }
+    layers.push({
+      layer,
+      type: spec.CHUNK_TILE,
+      flags,
+      size,
+      offset: Number(offset),
+      offsetField: at + 8,
+      sizeField: at + 4,
+    });
+  }
+  if (count === 0) throw fault(ERROR_INDEX, start, 'TIL-2', 'no layers');
+  const hasExtra = layers[count - 1].layer === spec.LAYER_EXTRA;
+  if (hasExtra !== header.extras.length > 0) {
+    throw fault(
+      ERROR_INDEX,
+      start,
+      'TIL-5',
+      `${header.extras.length} extra columns, ${hasExtra ? 'a' : 'no'} layer of them`,
+    );
+  }
+  return layers;
+}
+
+/**
+ * TIL-6: "The table ids MUST ascend strictly, and each MUST be the id of a codebook record."
+ *
+ * @param {TileRecord} tile
+ * @param {Set<number>} codebooks their ids
+ */
+export function checkTables({ tables, tablesOffset }, codebooks) {
+  tables.forEach((id, i) => {
+    if ((i > 0 && id <= tables[i - 1]) || !codebooks.has(id)) {
+      throw fault(ERROR_INDEX, tablesOffset + 2 * i, 'TIL-6', `table id ${id}`);
+    }
+  });
+}
+
+/**
+ * COV-1: the chunks begin behind the index, follow each other without gap or overlap, and end with the file.
+ *
+ * @param {Header} header
+ * @param {number} start end of the index
+ */
+export function checkCoverage(header, start) {
+  const places = [...header.directory, ...header.tiles.flatMap((tile) => tile.layers)];
+  for (const { size, sizeField } of places) {
+    const least = spec.CHUNK_HEADER_SIZE + 4;
+    if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its frame has ${least}`);
+  }
+  // Offsets of 2^53 and more are rounded. They lie behind the end of the file, or `end` misses it: either is refused.
+  places.sort((a, b) => a.offset - b.offset);
+  let end = start;
+  for (const { offset, offsetField, size } of places) {
+    if (offset !== end)
+      throw fault(ERROR_INDEX, offsetField, 'COV-1', `a chunk at ${offset}, the one before ends at ${end}`);
+    end += size;
+  }
+  if (end !== header.fileSize)
+    throw fault(ERROR_INDEX, 20, 'COV-1', `the chunks end at ${end}, the file at ${header.fileSize}`);
+}
