@@ -383,6 +383,42 @@ def test_progress_names_its_stages_and_ends_at_one(make_model):
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 
 
+def test_huge_values_that_coarsen_their_tile_are_named(make_model):
+    model = make_model(300, 1)
+    assert () == encode_with_report(model).report.notes
+    rest = model.shN.copy()
+    rest[5] = 1e9
+    (note,) = encode_with_report(replace(model, shN=rest)).report.notes
+    assert note.startswith("shN: huge values coarsen 1 of 1 tiles")
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+@pytest.mark.parametrize("seed", range(4))
+def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
+    """Enough splats for cut tiles and codebooks, with importances from nothing to huge."""
+    rng = np.random.default_rng(seed)
+    model = make_model(700, 2, seed)
+
+    def spread(values: np.ndarray, decades: float) -> np.ndarray:
+        factors = 10.0 ** rng.uniform(-decades, decades, (len(values),) + (1,) * (values.ndim - 1))
+        return (values * factors).astype(np.float32)
+
+    wild = replace(
+        model,
+        means=spread(model.means, 20),
+        sh0=spread(model.sh0, 3),
+        shN=spread(model.shN, 3),
+        scales=np.clip(spread(model.scales, 1), -60, 60),
+    )
+    importance = np.where(rng.random(700) < 0.5, 0.0, 10.0 ** rng.uniform(-12, 12, 700))
+    for weights in (None, importance):
+        result = encode_with_report(wild, EncodeOptions(preset=preset), importance=weights)
+        measured = measure_errors(wild, csplat.decode(result.data), result.source_index)
+        for name, (largest, rms) in measured.items():
+            assert largest <= result.report.errors[name][0], name
+            assert rms <= result.report.errors[name][1], name
+
+
 def test_zlib_serves_where_libdeflate_is_absent(make_model, monkeypatch):
     monkeypatch.setitem(sys.modules, "deflate", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -65,10 +65,11 @@ class ShTables:
 
 @dataclass(frozen=True)
 class CodedSh:
-    """Blocks by layer (a band that is zero throughout has none), and errors by measure."""
+    """Blocks by layer (a band that is zero throughout has none), errors by measure, and the tile's exponent."""
 
-    blocks: Mapping[int, bytes] = field(default_factory=dict)
-    errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    blocks: Mapping[int, bytes]
+    errors: Mapping[str, tuple[float, float]]
+    exponent: int
 
 
 def quantise_colour(rgb: F32, step: float, shift: int) -> Colour:
@@ -95,6 +96,7 @@ def code_sh(shN: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, coar
     sums = _BandSums(source.shape[1])
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
+    exponent = 0
     if tables.entries:
         layers = _code_by_codebook(source[:, :kept], rows, plan, tables, sums)
     elif kept:
@@ -105,7 +107,7 @@ def code_sh(shN: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, coar
             if part.any():
                 flat = part.reshape(-1, len(rows))
                 layers[band] = blocks.signed_block(_spec.ATTRIBUTE_SH0 + band, flat, exponent, plan.coding)
-    return CodedSh(layers, sums.by_band())
+    return CodedSh(layers, sums.by_band(), exponent)
 
 
 def quantise_rows(source: F32, plan: Plan, coarse: I32 | None) -> tuple[Integers, int, F32]:

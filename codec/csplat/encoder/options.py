@@ -34,7 +34,7 @@ class EncodeOptions:
         sh_coding: "auto", "codebook", "scalar" or "none".
         codebook_size: entries of the SH codebook's first stage.
         codebook_stages: residual stages, 1 to 4.
-        escape_fraction: share of the splats, the most important ones, whose SH is coded directly, 0 to 1.
+        escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). By default only where an importance is given.
         tile_splats: splats per tile at most, 1 to 65536.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ class EncodeReport:
         options: what the caller asked for, and the steps and codings that followed; it stands in the file too.
         errors: (max, rms) by measure, as the file states them (spec 5.5).
         splat_count: splats of the file. tile_count: its tiles. size_bytes: its size.
+        notes: what a user should know beside the errors, a sentence each.
     """
 
     options: dict[str, Any]
@@ -41,6 +43,7 @@ class EncodeReport:
     splat_count: int
     tile_count: int
     size_bytes: int
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def encode_with_report(
     scene = file_scene(model, plan, books, extras, file_chunks(model, errors, settings, plan))
     data = write(scene, [part.tile for part in encoded])
     rows = np.concatenate([part.rows for part in encoded]) if encoded else np.zeros(0, np.int64)
-    summary = EncodeReport(settings, errors.stated(), len(model), len(tiles), len(data))
+    summary = EncodeReport(settings, errors.stated(), len(model), len(tiles), len(data), _notes(encoded))
     return EncodeResult(data, rows.astype(np.int64, copy=False), summary)
 
 
@@ -130,6 +133,15 @@ def _encode_tiles(
         return [one(tile) for tile in tiles]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, tiles))
+
+
+def _notes(encoded: Sequence[EncodedTile]) -> tuple[str, ...]:
+    """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours."""
+    counts = Counter(name for part in encoded for name in part.coarsened)
+    return tuple(
+        f"{name}: huge values coarsen {count} of {len(encoded)} tiles; remove them, or see the stated errors"
+        for name, count in sorted(counts.items())
+    )
 
 
 def _silent(stage: str, done: float) -> None:

@@ -36,7 +36,7 @@ def chosen_settings(plan: Plan, tables: ShTables, options: EncodeOptions) -> dic
         "sh_degree": plan.sh_degree,
         "sh_coding": plan.sh_coding,
         "chroma_shift": plan.chroma_shift,
-        "adaptive": plan.adaptive,
+        "adaptive": plan.adaptive if plan.sh_coding == "scalar" else 0.0,
         "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
         "effort": plan.coding.effort,
         "deflate": plan.coding.library,

@@ -40,11 +40,12 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class EncodedTile:
-    """A tile's bytes, the source rows in decoded order, and its errors."""
+    """A tile's bytes, the source rows in decoded order, its errors, and which attributes a huge value coarsened."""
 
     tile: FileTile
     rows: NDArray[np.intp]
     errors: ErrorSums
+    coarsened: frozenset[str]
 
 
 @dataclass
@@ -55,6 +56,7 @@ class _Work:
     blocks: list[bytes]
     largest: dict[str, float]
     squares: dict[str, float]
+    coarsened: set[str]
 
     def note(self, measure: str, errors: tuple[float, float]) -> None:
         self.largest[measure], self.squares[measure] = errors
@@ -72,7 +74,7 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
     Returns:
         The tile; its rows are the model's, in the order in which a decoder returns them.
     """
-    work = _Work(plan, [], {}, {})
+    work = _Work(plan, [], {}, {}, set())
     rows, q, corner, codes = _order(model, tile, plan)
     _opacities(work, _take(model.opacities, rows))
     max_scale = _shape(work, _take(model.quats, rows), _take(model.scales, rows))
@@ -82,6 +84,8 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
     if model.sh_degree:
         coded = code_sh(model.shN, rows, plan, tables, _coarse(rows, plan, tables))
         layers |= {layer: [block] for layer, block in coded.blocks.items()}
+        if coded.exponent:
+            work.coarsened.add("shN")
         for measure, errors in coded.errors.items():
             work.note(measure, errors)
     if tables.extras:
@@ -99,7 +103,7 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
         layers=layers,
         tables=tuple(sorted(tables.ids)) if any(layer in layers for layer in tables.layers) else (),
     )
-    return EncodedTile(file_tile, rows, ErrorSums(len(rows), work.largest, work.squares))
+    return EncodedTile(file_tile, rows, ErrorSums(len(rows), work.largest, work.squares), frozenset(work.coarsened))
 
 
 def _order(model: SplatModel, tile: Tile, plan: Plan) -> tuple[NDArray[np.intp], Integers, Integers, Integers | None]:
@@ -144,6 +148,8 @@ def _shape(work: _Work, quats: F32, scales: F32) -> float:
     plan = work.plan
     rotation, sorted_scales = fix_gauge(quats, scales)
     exponent = lattice_exponent(float(np.abs(sorted_scales).max()), plan.scale_step)
+    if exponent:
+        work.coarsened.add("scales")
     step = lattice_step(plan.scale_step, exponent)
     n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
     decoded_scales = lattice_values(n, step)
@@ -180,6 +186,8 @@ def _sh0(work: _Work, sh0: F32) -> None:
     plan = work.plan
     source = np.ascontiguousarray(sh0.T)
     colour = quantise_colour(source, plan.sh0_step, plan.chroma_shift)
+    if colour.exponent:
+        work.coarsened.add("sh0")
     work.blocks.append(blocks.offset_block(_spec.ATTRIBUTE_SH0, colour.columns, colour.exponent, plan.coding))
     check_finite("sh0", colour.decoded)
     work.note("sh0", value_errors(source, colour.decoded))
