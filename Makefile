@@ -43,6 +43,7 @@ sample: $(VENV)/.core ## make the sample scene again
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/codec.py
+	$(BIN)/python tools/benchmarks/render.py
 
 fuzz: $(VENV)/.dev ## ten minutes of malformed files
 	$(BIN)/python tests/fuzz.py --seconds 600

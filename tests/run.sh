@@ -85,7 +85,7 @@ build_and_install_wheel() {
     local pip=("$WHEEL/python" -m pip install --quiet --disable-pip-version-check)
     local wheel
     wheel=$(echo out/dist/csplat-*.whl)
-    "${pip[@]}" "${wheel}[render]" pytest hypothesis
+    "${pip[@]}" "${wheel}[render,torch-tests]" pytest hypothesis
     "${pip[@]}" --force-reinstall --no-deps "$wheel"
     "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
 }

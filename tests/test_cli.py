@@ -150,6 +150,9 @@ def test_repairs_are_reported_and_strict_refuses_them(tmp_path, make_model):
     write_ply(tmp_path / "extra.ply", model)
     result = invoke("encode", tmp_path / "extra.ply", tmp_path / "a.csplat")
     assert "extra-columns" in result.stderr
+    quiet = invoke("encode", tmp_path / "extra.ply", tmp_path / "q.csplat", "--quiet")
+    assert "extra-columns" in quiet.stderr
+    assert 1 == len(quiet.stderr.splitlines())
     assert "extra-columns" in refused("encode", tmp_path / "extra.ply", tmp_path / "b.csplat", "--strict", "--quiet")
     assert not (tmp_path / "b.csplat").exists()
     call("encode", tmp_path / "extra.ply", tmp_path / "c.csplat", "--strict", "--keep-extra")
@@ -469,11 +472,12 @@ def test_a_filter_that_finds_nothing_fails():
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
 
 
-@pytest.mark.parametrize("command", ["encode", "decode", "info", "verify", "lint", "conformance"])
+@pytest.mark.parametrize("command", ["encode", "decode", "info", "verify", "lint", "compare", "render", "conformance"])
 def test_help_gives_an_example(command):
     text = call(command, "--help")
     assert "Examples:" in text
     assert f"csplat {command} " in text
+    assert "\\b" not in text  # click's mark for "do not wrap", which typer's rich mode prints as it stands
 
 
 def test_version_names_program_and_format():

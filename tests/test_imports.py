@@ -48,3 +48,10 @@ def test_dir_lists_the_public_names():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         csplat.nonsense  # noqa: B018 -- the access is the test
+
+
+def test_cameras_need_no_numba_and_the_renderer_no_torch():
+    pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+    assert not modules_after("from csplat_render import Camera, render") & {"numba", "scipy", "torch"}
+    loaded = {name.split(".")[0] for name in modules_after("import csplat_render.rasterise, csplat_render.twin")}
+    assert not loaded & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy

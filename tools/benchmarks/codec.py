@@ -13,14 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from machine import describe_machine
 from peers import CAP_SECONDS, compress_general, find_splat_transform, run_timed, transform
 from scenes import ROOT, Scene, find_scenes
 
@@ -46,7 +44,7 @@ def main() -> None:
     if missing:
         sys.exit(f"error: no scene {', '.join(sorted(missing))}")
     args.cache.mkdir(parents=True, exist_ok=True)
-    machine = _machine()
+    machine = describe_machine()
     print("\n".join(f"{key}: {value}" for key, value in machine.items()))
     command, remark = (None, "left out") if args.no_peers else find_splat_transform(args.peers)
     print(f"SPZ and SOG: {remark}" + ("" if command else "  <-- NOT MEASURED"))
@@ -183,40 +181,6 @@ def _size_table(result: dict[str, Any], count: int, ply: int) -> str:
         times = ["-" if seconds is None else f"{seconds:.2f}" for seconds in (wall, cpu)]
         rows.append([name, *sizes, *times, remark])
     return format_table(header, rows)
-
-
-def _machine() -> dict[str, str]:
-    """What the numbers were taken on."""
-    names = ("numpy", "zstandard", "deflate", "plyfile")
-    return {
-        "machine": f"{_processor()}, {os.cpu_count()} cores, {_memory()}",
-        "system": f"{platform.system()} {platform.release()}, Python {platform.python_version()}",
-        "packages": ", ".join(f"{name} {_version(name)}" for name in ("csplat", *names)),
-    }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _memory() -> str:
-    try:
-        pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return "memory unknown"
-    return f"{pages * page_bytes / 2**30:.0f} GiB"
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "absent"
 
 
 if __name__ == "__main__":

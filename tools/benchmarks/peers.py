@@ -17,7 +17,16 @@ from pathlib import Path
 import zstandard
 from scenes import Scene
 
-__all__ = ["CAP_SECONDS", "Peer", "Timing", "compress_general", "find_splat_transform", "run_timed", "transform"]
+__all__ = [
+    "CAP_SECONDS",
+    "Peer",
+    "Timing",
+    "compress_general",
+    "find_splat_transform",
+    "run_timed",
+    "spz_and_back",
+    "transform",
+]
 
 #: Longest run of another program.
 CAP_SECONDS = 600
@@ -97,6 +106,23 @@ def transform(command: list[str], scene: Scene, folder: Path, runs: int) -> list
     return peers
 
 
+def spz_and_back(command: list[str], scene: Scene, folder: Path) -> tuple[Peer, Path]:
+    """Let splat-transform write SPZ, and a PLY of what it reads from that.
+
+    Returns:
+        What became of the scene, and the PLY; it is there where the size is.
+    """
+    spz, back = folder / f"{scene.name}.spz", folder / f"{scene.name}.spz.ply"
+    peer = _transform(command, scene, spz, [], 1, "SPZ")
+    if peer.size_bytes is None:
+        return peer, back
+    try:
+        timing = run_timed([*command, "-q", "-w", str(spz), str(back)], 1)
+    except subprocess.CalledProcessError as error:
+        return Peer(peer.name, None, None, f"reading it failed: {_last_line(error)}"), back
+    return (peer if timing else Peer(peer.name, None, None, "reading it took too long")), back
+
+
 def run_timed(command: list[str], runs: int) -> Timing | None:
     """Run a program and take medians; `None` if a run reached the cap.
 
@@ -121,11 +147,15 @@ def _transform(command: list[str], scene: Scene, output: Path, options: list[str
     try:
         timing = run_timed(full, runs)
     except subprocess.CalledProcessError as error:
-        last = (error.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
-        return Peer(name, None, None, f"failed: {last}")
+        return Peer(name, None, None, f"failed: {_last_line(error)}")
     if timing is None:
         return Peer(name, None, None, f"stopped at the cap of {CAP_SECONDS} s")
     return Peer(name, output.stat().st_size, timing)
+
+
+def _last_line(error: subprocess.CalledProcessError) -> str:
+    lines: list[str] = error.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+    return lines[-1]
 
 
 def _stream(name: str, path: Path, compressor: object) -> Peer:

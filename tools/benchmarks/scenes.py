@@ -12,7 +12,7 @@ import numpy as np
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 
-__all__ = ["BLOWN_UP", "Scene", "blow_up", "find_scenes"]
+__all__ = ["BLOWN_UP", "DATA", "ROOT", "Scene", "blow_up", "describe_ply", "find_scenes"]
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
@@ -55,14 +55,14 @@ def find_scenes(names: list[str], cache: Path) -> list[Scene]:
     chosen = []
     for name, path in paths.items():
         if path.exists() and (not names or name in names):
-            chosen.append(_scene(name, path))
+            chosen.append(describe_ply(name, path))
     for name, source, count in BLOWN_UP:
         if paths[source].exists() and (not names or name in names):
             path = cache / f"{name}.ply"
             if not path.exists():
                 cache.mkdir(parents=True, exist_ok=True)
                 write_ply(path, blow_up(read_ply(paths[source]), count))
-            chosen.append(_scene(name, path))
+            chosen.append(describe_ply(name, path))
     return chosen
 
 
@@ -110,7 +110,8 @@ def _vary(model: SplatModel, rng: np.random.Generator, shift: np.ndarray) -> Spl
     )
 
 
-def _scene(name: str, path: Path) -> Scene:
+def describe_ply(name: str, path: Path) -> Scene:
+    """Read the header of a PLY."""
     count = rest = 0
     with path.open("rb") as stream:
         for line in stream:

@@ -8,11 +8,14 @@ import typer
 
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat_tools.commands.compare import compare
 from csplat_tools.commands.conformance import conformance
 from csplat_tools.commands.decode import decode
 from csplat_tools.commands.encode import encode
 from csplat_tools.commands.info import info
 from csplat_tools.commands.lint import lint
+from csplat_tools.commands.render import render
+from csplat_tools.commands.train import train
 from csplat_tools.commands.verify import verify
 from csplat_tools.console import say
 
@@ -40,12 +43,11 @@ def root(
         typer.Option("--version", callback=_version, is_eager=True, help="Print the versions of program and format."),
     ] = False,
 ) -> None:
-    r"""csplat: 3D Gaussian splats, compressed.
+    """csplat: 3D Gaussian splats, compressed.
 
     Status 0: done. 1: refused or failed, with one line on standard error.
     2: the command line is wrong.
 
-    \b
     Examples:
       csplat encode scene.ply scene.csplat
       csplat info scene.csplat
@@ -58,4 +60,7 @@ app.command()(decode)
 app.command()(info)
 app.command()(verify)
 app.command()(lint)
+app.command()(compare)
+app.command()(render)
+app.command()(train)
 app.add_typer(conformance, name="conformance")

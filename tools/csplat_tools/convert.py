@@ -7,14 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from csplat.decoder import Limits, decode, decode_scene
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.inout import mapped_csplat, ply_path, read_array, write_array, write_bytes, write_model
+from csplat_tools.models import without_bands
 from csplat_tools.proof import Proof, prove
 
 __all__ = [
@@ -103,6 +102,7 @@ class Encoded:
             "tiles": report.tile_count,
             "seconds": round(self.seconds, 3),
             "defects": findings_as_json(self.findings),
+            "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
         }
@@ -128,7 +128,7 @@ def encode_file(
         facts: what the PLY does not say.
         strict: refuse what would be repaired.
         importance: a .npy file with one weight per splat of the PLY as read.
-        source_index: a .npy file to write: which splat of the PLY each splat of the file is.
+        source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
         progress: is told the stages.
 
     Raises:
@@ -154,7 +154,13 @@ def encode_file(
 
 
 def decode_file(
-    source: str, target: str, *, sh_degree: int | None = None, absolute: bool = False, max_splats: int | None = None
+    source: str,
+    target: str,
+    *,
+    sh_degree: int | None = None,
+    absolute: bool = False,
+    max_splats: int | None = None,
+    progress: Report | None = None,
 ) -> None:
     """Read a .csplat file, write a PLY.
 
@@ -164,17 +170,23 @@ def decode_file(
         sh_degree: leave out the bands above.
         absolute: add the origin and write doubles.
         max_splats: budget; the default is the decoder's.
+        progress: called with the stage's name and the share done.
 
     Raises:
         CsplatError: the file is not valid, or too large.
         OSError: a file cannot be read or written.
     """
+    report = progress or (lambda _stage, _done: None)
+    report("decoding", 0.0)
     with mapped_csplat(source) as data:
         # All bands, even if not all are wanted: the digest is that of the whole file.
         model = decode(data, limits=_limits(max_splats))
-    if sh_degree is not None and sh_degree < model.sh_degree:
-        model = replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
+    if sh_degree is not None:
+        model = without_bands(model, sh_degree)
+    report("decoding", 1.0)
+    report("writing", 0.0)
     write_model(target, model, absolute=absolute)
+    report("writing", 1.0)
 
 
 def verify_file(

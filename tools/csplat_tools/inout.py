@@ -28,6 +28,8 @@ from csplat.ply import write_ply
 __all__ = [
     "STANDARD_STREAM",
     "check_output",
+    "is_csplat",
+    "local_path",
     "mapped_csplat",
     "ply_path",
     "read_array",
@@ -71,15 +73,13 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
 
 
 @contextmanager
-def ply_path(path: str) -> Iterator[Path]:
-    """Give the path of a PLY; standard input and named pipes go into a temporary file first.
+def local_path(path: str) -> Iterator[Path]:
+    """Give the path of a file that can be read twice; standard input and named pipes are copied first.
 
     Raises:
-        InputError: it is a .csplat file.
         OSError: it cannot be read.
     """
     if path != STANDARD_STREAM and not Path(path).is_fifo():
-        _refuse_csplat(Path(path))
         yield Path(path)
         return
     with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
@@ -90,8 +90,36 @@ def ply_path(path: str) -> Iterator[Path]:
             else:
                 with Path(path).open("rb") as pipe:
                     shutil.copyfileobj(pipe, stream, 1 << 20)
-        _refuse_csplat(spool)
         yield spool
+
+
+@contextmanager
+def ply_path(path: str) -> Iterator[Path]:
+    """Give the path of a PLY; standard input and named pipes go into a temporary file first.
+
+    Raises:
+        InputError: it is a .csplat file.
+        OSError: it cannot be read.
+    """
+    with local_path(path) as local:
+        if is_csplat(local):
+            raise InputError(
+                f"{local.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
+                " `csplat info` describes it"
+            )
+        yield local
+
+
+def is_csplat(path: Path) -> bool:
+    """Whether a file begins as .csplat files do; a folder (an unbundled SOG) does not.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if path.is_dir():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(MAGIC)) == MAGIC
 
 
 @contextmanager
@@ -170,17 +198,6 @@ def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:
         with spool.open("rb") as stream:
             shutil.copyfileobj(stream, sys.stdout.buffer, 1 << 20)
             sys.stdout.buffer.flush()
-
-
-def _refuse_csplat(path: Path) -> None:
-    if path.is_dir():
-        return  # may be an unbundled SOG: the PLY reader says so
-    with path.open("rb") as stream:
-        if stream.read(len(MAGIC)) == MAGIC:
-            raise InputError(
-                f"{path.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
-                " `csplat info` describes it"
-            )
 
 
 def _refuse_ply(name: str, data: bytes) -> None:

@@ -16,9 +16,8 @@ conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
 @conformance.callback()
 def root() -> None:
-    r"""Run the conformance suite: files, and what a decoder must make of them.
+    """Run the conformance suite: files, and what a decoder must make of them.
 
-    \b
     Examples:
       csplat conformance decoder
       csplat conformance decoder --cmd 'my-decoder {input} {outdir}'
@@ -36,13 +35,12 @@ def decoder(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Each vector's result, for programs.")] = False,
 ) -> None:
-    r"""Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
+    """Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
 
     Another decoder writes what it decodes into {outdir}, or exits with
     status 1 and the error code in a line of JSON; conformance/README.md says
     how.
 
-    \b
     Examples:
       csplat conformance decoder --filter 'invalid/*'
       csplat conformance decoder --cmd 'node decode.mjs {input} {outdir}' --json

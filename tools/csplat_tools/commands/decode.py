@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.console import guarded
+from csplat_tools.console import guarded, progress_bar
 from csplat_tools.convert import decode_file
 from csplat_tools.inout import check_output
 
@@ -28,15 +28,15 @@ def decode(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    r"""Turn a .csplat file into a PLY that every 3DGS viewer opens.
+    """Turn a .csplat file into a PLY that every 3DGS viewer opens.
 
     All checks of the format are made first: a damaged file gives no PLY.
 
-    \b
     Examples:
       csplat decode scene.csplat scene.ply
       csplat decode scene.csplat small.ply --sh-degree 0
       csplat decode scene.csplat - | gzip > scene.ply.gz
     """
     check_output(target, force=force, inputs=(source,))
-    decode_file(source, target, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats)
+    with progress_bar() as progress:
+        decode_file(source, target, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, progress=progress)

@@ -33,10 +33,16 @@ def encode(
         bool, typer.Option("--keep-extra", help="Carry columns that splats do not have, bit for bit.")
     ] = False,
     source_index: Annotated[
-        str | None, typer.Option(metavar="FILE.npy", help="Write which splat of the PLY each splat of the file is.")
+        str | None,
+        typer.Option(
+            metavar="FILE.npy", help="Write which splat each one of the file was; rows that were dropped do not count."
+        ),
     ] = None,
     importance: Annotated[
-        str | None, typer.Option(metavar="FILE.npy", help="Weights of the splats, instead of opacity x size.")
+        str | None,
+        typer.Option(
+            metavar="FILE.npy", help="Weights of the splats, without dropped rows, instead of opacity x size."
+        ),
     ] = None,
     axes: Annotated[
         str | None,
@@ -127,7 +133,6 @@ def encode(
     Reads the PLY of any 3DGS trainer, repairs what is safe to repair (and
     says so), and states in the file how far its splats lie from the source.
 
-    \b
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
@@ -184,14 +189,18 @@ def encode(
         )
     if as_json:
         say_json(encoded.as_json())
-    elif not quiet:
-        _report(encoded)
+    else:
+        for finding in encoded.findings:
+            if not quiet or finding.kind == "repair":
+                note(str(finding))
+        for line in encoded.result.report.notes:
+            note(line)
+        if not quiet:
+            _report(encoded)
 
 
 def _report(encoded: Encoded) -> None:
     report = encoded.result.report
-    for finding in encoded.findings:
-        note(str(finding))
     per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
     note(

@@ -19,13 +19,12 @@ def info(
     source: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
     as_json: Annotated[bool, typer.Option("--json", help="Everything, for programs.")] = False,
 ) -> None:
-    r"""Say what is in a file: scene, sizes, options, stated errors.
+    """Say what is in a file: scene, sizes, options, stated errors.
 
     Reads the header, the index and the heads of the blocks: a large file
     takes hardly longer than a small one. Nothing is decoded: whether the
     file is intact is what `csplat verify` tells.
 
-    \b
     Examples:
       csplat info scene.csplat
       csplat info scene.csplat --json | jq .attributes.means.bits_per_splat

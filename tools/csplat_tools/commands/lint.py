@@ -27,14 +27,13 @@ def lint(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing OUT.ply.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    r"""Say what is wrong with a PLY: each defect with its count.
+    """Say what is wrong with a PLY: each defect with its count.
 
     Notes are ordinary variation. Repairs are what encoding repairs by
     itself and `encode --strict` refuses; errors cannot be repaired without
     guessing. The status is 1 where there are repairs or errors; with --fix,
     where there are errors.
 
-    \b
     Examples:
       csplat lint scene.ply
       csplat lint scene.ply --fix clean.ply

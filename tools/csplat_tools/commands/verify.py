@@ -30,13 +30,12 @@ def verify(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Let the status speak.")] = False,
 ) -> None:
-    r"""Check a file: every checksum, the digest, every value; and its stated errors.
+    """Check a file: every checksum, the digest, every value; and its stated errors.
 
     With --source, each splat of the file must have a splat of the PLY within
     the stated maxima. With --source-index it is known which one, and rms and
     counts are proved as well.
 
-    \b
     Examples:
       csplat verify scene.csplat
       csplat verify scene.csplat --source scene.ply

@@ -1,0 +1,248 @@
+"""`csplat compare` and what it stands on: pairs of splats, and the one meaning of `psnr`."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import EncodeOptions, decode, encode, write_ply
+from csplat.encoder import encode_with_report
+from csplat.errors import InputError
+from csplat_tools.app import app
+from csplat_tools.attributes import attribute_errors
+from csplat_tools.compare import compare_models, comparison_cameras, render_source
+from csplat_tools.models import LoadedModel, load_model
+
+
+@pytest.fixture
+def renderer():
+    for package in ("numba", "PIL"):
+        pytest.importorskip(package, reason=f"rendering needs {package}: pip install 'csplat[render]'")
+
+
+@pytest.fixture
+def scene(make_model):
+    """A cloud of splats of some size."""
+    model = make_model(400, 1)
+    return replace(model, scales=model.scales * np.float32(0.3) - np.float32(1.5))
+
+
+@pytest.fixture
+def cameras(renderer):  # noqa: ARG001 -- a fixture cannot ask for another one by a mark
+    """Two small views of the cloud, and one of the empty space behind it."""
+    from csplat_render.cameras import intrinsics, look_at
+
+    K = intrinsics(64, 48, 60.0)
+    up = (0.0, -1.0, 0.0)
+    return [
+        look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), up, K, 64, 48),
+        look_at((4.0, 1.0, 0.0), (0.0, 0.0, 0.0), up, K, 64, 48, image="side.png"),
+        look_at((0.0, 0.0, 50.0), (0.0, 0.0, 90.0), up, K, 64, 48),
+    ]
+
+
+@pytest.fixture
+def camera_file(cameras, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([camera.to_json() for camera in cameras]))
+    return path
+
+
+def loaded(model):
+    return LoadedModel(model, 1000)
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def call(*words):
+    result = invoke(*words)
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result.stdout
+
+
+# pairs
+
+
+def test_a_source_index_pairs_shuffled_splats(scene):
+    order = np.random.default_rng(1).permutation(len(scene))
+    errors = attribute_errors(loaded(scene), loaded(scene.select(order)), order)
+    assert ("index", len(scene), 0) == (errors.pairing, errors.matched, errors.unmatched)
+    assert {(0.0, 0.0)} == set(errors.errors.values())
+
+
+def test_a_wrong_source_index_is_refused(scene):
+    with pytest.raises(InputError, match="source index"):
+        attribute_errors(loaded(scene), loaded(scene), np.arange(3))
+
+
+def test_scenes_of_one_order_are_paired_by_it(scene):
+    moved = replace(scene, means=scene.means + np.float32(0.001))
+    errors = attribute_errors(loaded(scene), loaded(moved))
+    assert "order" == errors.pairing
+    assert errors.errors["means"][1] == pytest.approx(0.001 * 3**0.5, rel=1e-3)
+
+
+def test_shuffled_splats_of_a_ply_are_not_paired(scene):
+    order = np.random.default_rng(1).permutation(len(scene))
+    assert attribute_errors(loaded(scene), loaded(scene.select(order))) is None
+    assert attribute_errors(loaded(scene), loaded(scene.select(slice(0, 300)))) is None
+
+
+def test_splats_of_a_file_are_found_within_its_stated_errors(scene, tmp_path):
+    result = encode_with_report(scene, EncodeOptions(preset="balanced"))
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(result.data)
+    found = attribute_errors(loaded(scene), load_model(str(path)))
+    assert ("search", len(scene), 0) == (found.pairing, found.matched, found.unmatched)
+    known = attribute_errors(loaded(scene), load_model(str(path)), result.source_index)
+    assert known.errors["means"] == pytest.approx(found.errors["means"])
+
+
+def test_both_kinds_of_file_are_read(scene, tmp_path):
+    write_ply(tmp_path / "scene", scene)
+    (tmp_path / "other").write_bytes(encode(scene))
+    a, b = load_model(str(tmp_path / "scene")), load_model(str(tmp_path / "other"))
+    assert len(a.model) == len(b.model) == len(scene)
+    assert a.header is None
+    assert b.stated_errors is not None
+    assert a.size_bytes == (tmp_path / "scene").stat().st_size
+
+
+# pictures
+
+
+def test_a_scene_compared_with_itself_scores_99(scene, cameras):
+    compared = compare_models(scene, scene, cameras)
+    assert (99.0, 99.0, 99.0) == (compared.psnr, compared.psnr_mean, compared.psnr_worst)
+    assert compared.ssim == pytest.approx(1.0)
+    assert compared.lpips is None
+    assert 0.1 < compared.cover < 1.0
+
+
+def test_psnr_is_that_of_the_clipped_error_pooled_over_everything(scene, cameras):
+    from csplat_render import render
+
+    other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
+    compared = compare_models(scene, other, cameras)
+    squares = []
+    for camera in cameras:
+        a, b = (np.clip(render(model, camera).rgb.astype(np.float64), 0.0, 1.0) for model in (scene, other))
+        squares.append(np.square(a - b))
+    assert compared.psnr == pytest.approx(-10.0 * np.log10(np.mean(squares)), abs=1e-6)
+    own = [99.0 if not one.any() else -10.0 * np.log10(one.mean()) for one in squares]
+    assert compared.psnr_mean == pytest.approx(np.mean(own), abs=1e-6)
+    assert compared.psnr_worst == pytest.approx(min(own), abs=1e-6)
+    assert compared.worst_view == int(np.argmin(own))
+    assert 99.0 == compared.views[2].psnr
+    assert 0.0 == compared.views[2].cover
+
+
+def test_an_error_scores_lower_on_the_covered_pixels(scene, cameras):
+    compared = compare_models(scene, replace(scene, sh0=scene.sh0 + np.float32(0.3)), cameras)
+    assert compared.psnr_covered < compared.psnr
+
+
+def test_pictures_of_the_source_serve_for_many_comparisons(scene, cameras):
+    views = list(render_source(scene, cameras))
+    other = decode(encode(scene, EncodeOptions(preset="small")))
+    again, first = (compare_models(scene, other, **words) for words in ({"source_views": views}, {"cameras": cameras}))
+    assert first.psnr == again.psnr
+    assert first.views == again.views
+
+
+def test_another_origin_changes_nothing(scene, cameras):
+    shift = (10.0, -20.0, 5.0)
+    moved = replace(scene, means=scene.means - np.float32(shift), origin=shift)
+    assert compare_models(scene, moved, cameras).psnr > 90.0
+
+
+def test_views_are_shown_and_progress_is_told(scene, cameras):
+    shown, told = [], []
+    compare_models(
+        scene,
+        scene,
+        cameras,
+        lpips=lambda a, b: float(np.abs(a - b).max()),
+        on_view=lambda number, a, b: shown.append((number, a.shape, b.shape)),
+        progress=lambda stage, done: told.append((stage, done)),
+    )
+    assert [(n, (48, 64, 3), (48, 64, 3)) for n in range(3)] == shown
+    assert ("comparing", 1.0) == told[-1]
+
+
+@pytest.mark.usefixtures("renderer")
+def test_no_camera_is_refused(scene):
+    with pytest.raises(InputError, match="no camera"):
+        compare_models(scene, scene, [])
+
+
+@pytest.mark.usefixtures("renderer")
+def test_the_cameras_of_psnr_come_from_the_source_alone(scene):
+    cameras = comparison_cameras(scene)
+    assert 8 == len(cameras)
+    assert {(640, 480)} == {(camera.W, camera.H) for camera in cameras}
+    again = comparison_cameras(replace(scene, cameras=[camera.to_json() for camera in cameras[:1]]))
+    assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
+
+
+# the command
+
+
+@pytest.fixture
+def files(scene, tmp_path):
+    write_ply(tmp_path / "a.ply", scene)
+    (tmp_path / "b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
+    return tmp_path / "a.ply", tmp_path / "b.csplat"
+
+
+def test_the_table_names_sizes_errors_and_quality(files, camera_file):
+    text = call("compare", *files, "--cameras", camera_file)
+    for word in ("a.ply", "times smaller", "covariance", "pairs found", "psnr_worst", "ssim", "cover", " dB", " s\n"):
+        assert word in text
+
+
+def test_json_has_psnr_at_the_top(files, camera_file):
+    result = json.loads(call("compare", *files, "--cameras", camera_file, "--json"))
+    assert 20.0 < result["psnr"] < 99.0
+    assert 3 == len(result["views"])
+    assert ["cameras.json", "standard", [0.0, 0.0, 0.0]] == [result[key] for key in ("cameras", "mode", "background")]
+    assert result["ratio"] == pytest.approx(result["a"]["size_bytes"] / result["b"]["size_bytes"])
+    assert result["attributes"]["errors"]["means"]["rms"] > 0.0
+    assert result["seconds"] > 0.0
+
+
+@pytest.mark.usefixtures("renderer")
+def test_the_virtual_cameras_are_the_default(files):
+    result = json.loads(call("compare", *files, "--json"))
+    assert "virtual" == result["cameras"]
+    assert 8 == len(result["views"])
+
+
+def test_pictures_are_written_side_by_side(files, camera_file, tmp_path):
+    from PIL import Image
+
+    call("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out")
+    assert ["0000.png", "0002.png", "side.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
+    with Image.open(tmp_path / "out" / "side.png") as picture:
+        assert (3 * 64, 48) == picture.size
+    again = invoke("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out")
+    assert 1 == again.exit_code
+    assert "--force replaces it" in again.stderr
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_file_that_is_absent_is_one_line(files, tmp_path):
+    result = invoke("compare", files[0], tmp_path / "nothing.csplat")
+    assert 1 == result.exit_code
+    assert "nothing.csplat" in result.stderr
+    assert 1 == result.stderr.count("\n")
+
+
+def test_lpips_reads_its_weights(files, camera_file, data_dir):
+    weights = data_dir / "lpips" / "lpips_alex.npz"
+    result = json.loads(call("compare", *files, "--cameras", camera_file, "--lpips", weights, "--json"))
+    assert 0.0 < result["lpips"] < 1.0

@@ -1,0 +1,454 @@
+"""Readers of data sets, on tiny ones made here and on the shared ones."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+
+pytest.importorskip("numba", reason="the trainer needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="undistortion needs scipy: pip install 'csplat[render]'")
+Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from csplat_render.cameras import intrinsics, look_at  # noqa: E402
+from csplat_trainer.data import load  # noqa: E402
+from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
+from csplat_trainer.data.dataset import Lens  # noqa: E402
+from csplat_trainer.data.pixels import _distort, undistorted_lens  # noqa: E402
+
+W, H = 48, 32
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+POINTS = np.array([[0.05, 0.03, -0.04], [0.4, 0.1, 0.2], [-0.3, 0.2, -0.1]])
+COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]])
+
+
+def cameras(count, width=W, height=H):
+    """Around the origin, z up."""
+    K = intrinsics(width, height, 50.0)
+    angles = np.linspace(0.3, 5.0, count)
+    return [look_at([3 * np.cos(a), 3 * np.sin(a), 1.0], [0, 0, 0], [0, 0, 1], K, width, height) for a in angles]
+
+
+def write_picture(path, camera, mode="RGB", scale=1):
+    """Black, with a dot where each point falls."""
+    width, height = camera.W // scale, camera.H // scale
+    pixels = np.zeros((height, width, len(mode)), np.uint8)
+    for point, colour in zip(POINTS, COLOURS, strict=True):
+        c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+        u, v = (camera.K @ (c / c[2]))[:2] / scale
+        pixels[int(v), int(u), :3] = colour
+        if mode == "RGBA":
+            pixels[int(v), int(u), 3] = 255
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels, mode).save(path)
+
+
+def assert_dots_are_where_points_fall(pictures):
+    for picture in pictures:
+        camera = picture.camera
+        for point, colour in zip(POINTS, COLOURS, strict=True):
+            c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+            u, v = (camera.K @ (c / c[2]))[:2]
+            assert (picture.pixels[int(v), int(u), :3] == colour).all()
+
+
+def to_opengl(camera):
+    return (np.linalg.inv(camera.viewmat) @ FLIP).tolist()
+
+
+@pytest.fixture
+def blender(tmp_path):
+    for part, count in (("train", 5), ("test", 3)):
+        frames = []
+        for i, camera in enumerate(cameras(count)):
+            write_picture(tmp_path / part / f"r_{i}.png", camera, "RGBA")
+            frames.append({"file_path": f"./{part}/r_{i}", "transform_matrix": to_opengl(camera)})
+        document = {"camera_angle_x": float(np.radians(50.0)), "frames": frames}
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+@pytest.fixture
+def ngp(tmp_path):
+    frames = []
+    for i, camera in enumerate(cameras(10)):
+        if i != 4:
+            write_picture(tmp_path / "images" / f"{i:04}.png", camera)
+        frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": to_opengl(camera)})
+    K = intrinsics(W, H, 50.0)
+    intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
+    document = {**intrinsic, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+def quaternion(rotation):
+    """w x y z (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    lower = [
+        [xx + yy + zz, 0, 0, 0],
+        [zy - yz, xx - yy - zz, 0, 0],
+        [xz - zx, yx + xy, yy - xx - zz, 0],
+        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
+    ]
+    return np.linalg.eigh(np.array(lower))[1][:, -1]
+
+
+MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+
+def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H):
+    """A sparse model of cameras and the three points."""
+    folder.mkdir(parents=True, exist_ok=True)
+    K = shots[0].K
+    parameters = parameters or [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    poses = [(*quaternion(c.viewmat[:3, :3]), *c.viewmat[:3, 3]) for c in shots]
+    names = [f"im {i:03}.png" for i in range(len(shots))]
+    if text:
+        words = " ".join(str(float(p)) for p in parameters)
+        (folder / "cameras.txt").write_text(f"# comment\n7 {model} {width} {height} {words}\n")
+        lines = [
+            f"{i + 1} {' '.join(str(float(v)) for v in pose)} 7 {name}\n{'1.5 2.5 -1' if i % 2 else ''}\n"
+            for i, (pose, name) in enumerate(zip(poses, names, strict=True))
+        ]
+        (folder / "images.txt").write_text("# comment\n# another\n" + "".join(lines))
+        rows = [
+            f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 0 2 0\n"
+            for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+        ]
+        (folder / "points3D.txt").write_text("# comment\n" + "".join(rows))
+        return
+    data = struct.pack("<QiiQQ", 1, 7, MODELS[model], width, height) + struct.pack(f"<{len(parameters)}d", *parameters)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(shots))
+    for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
+        data += struct.pack("<i7di", i + 1, *pose, 7) + name.encode() + b"\0"
+        data += struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(POINTS))
+    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
+        data += struct.pack("<Q3d3BdQ", i, *point, *map(int, colour), 0.5, i) + struct.pack("<ii", 1, 2) * i
+    (folder / "points3D.bin").write_bytes(data)
+
+
+@pytest.fixture(params=["binary", "text"])
+def colmap(tmp_path, request):
+    shots = cameras(9)
+    for i, camera in enumerate(shots):
+        write_picture(tmp_path / "images" / f"im {i:03}.png", camera)
+    write_colmap(tmp_path / "sparse" / "0", shots, text=request.param == "text")
+    return tmp_path
+
+
+def test_blender_sets_keep_their_split_and_their_transparency(blender):
+    data = load(blender)
+    assert (5, 3) == (len(data.train), len(data.test))
+    assert data.name.startswith("Blender set")
+    assert [f"test/r_{i}.png" for i in range(3)] == [picture.camera.image for picture in data.test]
+    assert all(picture.has_alpha for picture in data.train)
+    assert data.points is None
+    for picture, camera in zip(data.train, cameras(5), strict=True):
+        assert np.allclose(camera.viewmat, picture.camera.viewmat)
+        assert np.allclose(camera.K, picture.camera.K)
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+
+
+def test_transforms_json_reports_missing_pictures_and_splits_every_eighth(ngp):
+    data = load(ngp)
+    assert (7, 2) == (len(data.train), len(data.test))
+    assert ["images/0000.png", "images/0009.png"] == [picture.camera.image for picture in data.test]
+    assert any("1 of 10 pictures are missing" in line and "images/0004.png" in line for line in data.report)
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+    assert len(load(ngp / "transforms.json", test_every=0).train) == 9
+
+
+def test_transforms_json_may_name_its_test_pictures(ngp):
+    document = json.loads((ngp / "transforms.json").read_text())
+    document["test_filenames"] = ["./images/0003.png", "images/0004.png"]
+    (ngp / "transforms.json").write_text(json.dumps(document))
+    data = load(ngp)
+    assert ["images/0003.png"] == [picture.camera.image for picture in data.test]
+
+
+def test_frames_may_have_intrinsics_of_their_own_and_a_world_scale(ngp):
+    document = json.loads((ngp / "transforms.json").read_text())
+    frame = document["frames"][1]
+    frame["fl_x"] = frame["fl_y"] = 77.0
+    frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
+    (ngp / "transforms.json").write_text(json.dumps(document))
+    picture = next(p for p in load(ngp).train if p.camera.image == "images/0001.png")
+    assert 77.0 == picture.camera.K[0, 0]
+    assert np.allclose(cameras(10)[1].viewmat, picture.camera.viewmat)
+
+
+def test_colmap_sets_bring_points_and_colours(colmap):
+    data = load(colmap)
+    assert (7, 2) == (len(data.train), len(data.test))
+    assert ["im 000.png", "im 008.png"] == [picture.camera.image for picture in data.test]
+    assert data.name.startswith("COLMAP set")
+    assert np.allclose(POINTS, data.points)
+    assert (COLOURS / 255.0 == data.points_rgb).all()
+    assert np.float32 == data.points.dtype == data.points_rgb.dtype
+    for picture, camera in zip(data.train, cameras(9)[1:8], strict=True):
+        assert np.allclose(camera.viewmat, picture.camera.viewmat)
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+
+
+def test_test_txt_names_the_test_pictures(colmap):
+    (colmap / "sparse" / "0" / "test.txt").write_text("im 002.png\nim 005.png\n")
+    assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in load(colmap).test]
+
+
+def test_the_smallest_sufficient_folder_of_pictures_is_read(tmp_path):
+    shots = cameras(9, 96, 64)
+    for scale, folder in ((1, "images"), (2, "images_2"), (4, "images_4")):
+        for i, camera in enumerate(shots):
+            write_picture(tmp_path / folder / f"im {i:03}.png", camera, scale=scale)
+    write_colmap(tmp_path / "sparse" / "0", shots, width=96, height=64)
+    for size, folder, wanted in (
+        (None, "images", (96, 64)),
+        ((48, 32), "images_2", (48, 32)),
+        ((40, 30), "images_2", (40, 30)),
+        ((96, 64), "images", (96, 64)),
+        ((12, 8), "images_4", (12, 8)),
+    ):
+        data = load(tmp_path, size)
+        assert f"pictures from {folder}" in data.report
+        camera = data.train[0].camera
+        assert wanted == (camera.W, camera.H)
+        assert np.allclose(np.diag([wanted[0] / 96, wanted[1] / 64, 1]) @ shots[0].K, camera.K)
+    assert_dots_are_where_points_fall(load(tmp_path, (48, 32)).train)
+    named = load(tmp_path, images="images_4")
+    assert (24, 16) == (named.train[0].camera.W, named.train[0].camera.H)
+    assert_dots_are_where_points_fall(named.train)
+    with pytest.raises(InputError, match="images_8"):
+        load(tmp_path, images="images_8")
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_PINHOLE", [50.0, 24.0, 16.0]),
+        ("PINHOLE", [50.0, 51.0, 24.0, 16.0]),
+        ("SIMPLE_RADIAL", [50.0, 24.0, 16.0, 0.05]),
+        ("OPENCV", [50.0, 51.0, 23.0, 17.0, 0.05, -0.02, 0.001, -0.002]),
+    ],
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_lenses_of_colmap(tmp_path, model, parameters, text):
+    shots = cameras(3)
+    for i, camera in enumerate(shots):
+        write_picture(tmp_path / "images" / f"im {i:03}.png", camera)
+    write_colmap(tmp_path / "sparse", shots, model, parameters, text)
+    data = load(tmp_path)
+    K = data.train[0].camera.K
+    distorted = model in ("SIMPLE_RADIAL", "OPENCV")
+    assert any("distortion" in line for line in data.report) == distorted
+    assert (50.0 <= K[0, 0] < 52.0) if distorted else K[0, 0] == 50.0
+    assert parameters[2 if len(parameters) in (4, 8) and model != "SIMPLE_RADIAL" else 1] == K[0, 2]
+
+
+def test_refuses_a_lens_it_cannot_undo(tmp_path):
+    shots = cameras(3)
+    write_picture(tmp_path / "images" / "im 000.png", shots[0])
+    write_colmap(tmp_path / "sparse" / "0", shots, "OPENCV_FISHEYE", [50.0, 50.0, 24.0, 16.0, 0.1, 0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match="OPENCV_FISHEYE"):
+        load(tmp_path)
+
+
+def test_distortion_moves_pixels_as_opencv_says():
+    """One point worked out by hand: x = 0.5, y = -0.25, r² = 0.3125."""
+    lens = Lens(100, 80, 100.0, 90.0, 50.0, 40.0, (0.1, -0.02, 0.01, -0.03))
+    straight = Lens(100, 80, 100.0, 90.0, 50.0, 40.0)
+    radial = 1 + 0.1 * 0.3125 - 0.02 * 0.3125**2
+    xd = 0.5 * radial + 2 * 0.01 * 0.5 * -0.25 + -0.03 * (0.3125 + 2 * 0.25)
+    yd = -0.25 * radial + 0.01 * (0.3125 + 2 * 0.0625) + 2 * -0.03 * 0.5 * -0.25
+    x, y = _distort(np.array([100.0]), np.array([40.0 - 0.25 * 90.0]), lens, straight)
+    assert np.isclose(50.0 + 100.0 * xd, x[0])
+    assert np.isclose(40.0 + 90.0 * yd, y[0])
+
+
+def test_a_straight_line_is_straight_after_undistortion(tmp_path):
+    """A white line at x = 0.3 in the world of a lens with strong distortion, painted where the lens puts it."""
+    lens = Lens(160, 120, 120.0, 120.0, 80.0, 60.0, (-0.2, 0.03, 0.002, -0.001))
+    straight = undistorted_lens(lens)
+    y = np.linspace(-0.6, 0.6, 4000)
+    u, v = _distort(
+        120.0 * np.full_like(y, 0.3) + 80.0, 120.0 * y + 60.0, lens, Lens(160, 120, 120.0, 120.0, 80.0, 60.0)
+    )
+    rows, columns = np.mgrid[0:120, 0:160] + 0.5
+    nearest = np.interp(rows[:, 0], v, u)
+    pixels = np.clip(255.0 * np.exp(-((columns - nearest[:, None]) ** 2) / 2.0), 0, 255).astype(np.uint8)
+    (tmp_path / "images").mkdir()
+    Image.fromarray(np.repeat(pixels[..., None], 3, axis=2)).save(tmp_path / "images" / "a.png")
+    k1, k2, p1, p2 = lens.distortion
+    document = {"fl_x": 120.0, "fl_y": 120.0, "cx": 80.0, "cy": 60.0, "w": 160, "h": 120}
+    document |= {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+    document["frames"] = [{"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    (picture,) = load(tmp_path).train
+    assert np.isclose(straight.fx, picture.camera.K[0, 0])
+    values = picture.pixels[..., 0].astype(float)
+    found = (values * columns).sum(axis=1) / values.sum(axis=1)
+    assert np.abs(found - (straight.fx * 0.3 + 80.0)).max() < 0.1
+    bent = (pixels * columns).sum(axis=1) / pixels.sum(axis=1)
+    assert np.ptp(bent) > 1.5  # it was bent before
+
+
+@pytest.mark.parametrize("distortion", [(0.06, -0.08, -0.001, 0.0002), (-0.3, 0.1, 0.0, 0.0), (0.2, 0.0, 0.01, 0.01)])
+def test_undistortion_never_looks_beyond_the_picture(distortion):
+    lens = Lens(540, 960, 688.0, 687.0, 277.0, 482.0, distortion)
+    v, u = np.mgrid[0:960, 0:540] + 0.5
+    x, y = _distort(u, v, lens, undistorted_lens(lens))
+    assert x.min() >= 0.0
+    assert x.max() <= 540.0
+    assert y.min() >= 0.0
+    assert y.max() <= 960.0
+
+
+def test_a_smaller_size_scales_each_axis_by_itself(blender):
+    data = load(blender, (24, 8))
+    picture = data.train[0]
+    assert (8, 24, 4) == picture.pixels.shape
+    assert np.allclose(np.diag([0.5, 0.25, 1.0]) @ cameras(5)[0].K, picture.camera.K)
+
+
+def test_colours_do_not_bleed_from_where_nothing_is(tmp_path):
+    pixels = np.zeros((H, W, 4), np.uint8)
+    pixels[:, : W // 2] = (200, 100, 50, 255)
+    pixels[:, W // 2 :] = (0, 255, 0, 0)
+    (tmp_path / "train").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "train" / "r_0.png")
+    frame = {"file_path": "./train/r_0", "transform_matrix": to_opengl(cameras(1)[0])}
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": [frame]}))
+    data = load(tmp_path, (17, 11))
+    small = data.train[0].pixels
+    assert np.abs(small[small[..., 3] > 60][:, :3].astype(int) - (200, 100, 50)).max() <= 8
+    assert any("no transforms_test.json" in line for line in data.report)
+
+
+def test_the_near_plane_follows_the_distance_of_the_cameras(blender):
+    assert np.isclose(0.03 * np.sqrt(10.0), load(blender).train[0].camera.near)
+    assert 0.011 == load(blender, near=0.011).train[0].camera.near
+
+
+def test_refuses_what_is_no_data_set(tmp_path):
+    with pytest.raises(InputError, match="is no data set"):
+        load(tmp_path)
+    with pytest.raises(InputError, match="neither a folder"):
+        load(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"frames": []}, "lists no frames"),
+        ({"frames": [{"transform_matrix": []}]}, "frame 0 has no file_path"),
+        ({"fl_x": -5}, "focal length"),
+        ({"fl_x": "wide"}, "fl_x is 'wide'"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"k3": 0.1}, "k3"),
+        ({"w": 0}, "pixels"),
+        ({"k1": -30.0}, "cannot be undone"),
+    ],
+)
+def test_refuses_broken_transforms(ngp, change, says):
+    document = json.loads((ngp / "transforms.json").read_text())
+    (ngp / "transforms.json").write_text(json.dumps({**document, **change}))
+    with pytest.raises(InputError, match=says):
+        load(ngp)
+
+
+@pytest.mark.parametrize(
+    "matrix", [None, [[1]], np.zeros((4, 4)).tolist(), np.diag([1.0, 1, -1, 1]).tolist(), [["x"] * 4] * 4]
+)
+def test_refuses_poses_that_are_none(ngp, matrix):
+    document = json.loads((ngp / "transforms.json").read_text())
+    document["frames"][2]["transform_matrix"] = matrix
+    (ngp / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="frame 2"):
+        load(ngp)
+
+
+def test_refuses_a_set_without_pictures(ngp):
+    for path in (ngp / "images").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="none of its 10 pictures"):
+        load(ngp)
+
+
+def test_refuses_a_file_that_is_no_picture(ngp):
+    (ngp / "images" / "0001.png").write_text("not a picture")
+    with pytest.raises(InputError, match=r"0001\.png"):
+        load(ngp)
+
+
+def test_refuses_text_that_is_no_json(tmp_path):
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(InputError, match="not a JSON file"):
+        load(tmp_path)
+
+
+def test_every_prefix_of_colmap_files_is_refused(tmp_path):
+    write_colmap(tmp_path, cameras(2))
+    for name, read in (("images.bin", read_images), ("points3D.bin", read_points)):
+        data = (tmp_path / name).read_bytes()
+        for end in range(len(data)):
+            (tmp_path / name).write_bytes(data[:end])
+            with pytest.raises(InputError):
+                read(tmp_path / name)
+        (tmp_path / name).write_bytes(data + b"\0")
+        with pytest.raises(InputError, match="follow"):
+            read(tmp_path / name)
+        (tmp_path / name).write_bytes(b"\xff" * 8 + data[8:])
+        with pytest.raises(InputError, match="ends at byte"):
+            read(tmp_path / name)
+
+
+def test_refuses_text_lines_that_are_none(tmp_path):
+    for text in ("1 2 3\n", "1 a b c d e f g 7 name\n", "1 0 0 0 0 0 0 0 7 name\n", "1 1 0 0 0 0 0 0 x name\n"):
+        (tmp_path / "images.txt").write_text(text)
+        with pytest.raises(InputError, match="line 1"):
+            read_images(tmp_path / "images.txt")
+
+
+def test_shared_lego(data_dir):
+    data = load(data_dir / "images" / "lego200")
+    assert (100, 200) == (len(data.train), len(data.test))
+    assert (200, 200, 4) == data.train[0].pixels.shape
+    wanted = json.loads((data_dir / "ply" / "lego60k.cameras.json").read_text())
+    for picture, camera in zip(data.test, wanted, strict=True):
+        assert np.allclose(camera["viewmat"], picture.camera.viewmat, atol=1e-5)
+        assert np.isclose(camera["K"][0][0] / camera["W"], picture.camera.K[0, 0] / 200)
+
+
+def test_shared_fox(data_dir):
+    data = load(data_dir / "images" / "fox", (270, 480))
+    assert (43, 7) == (len(data.train), len(data.test))
+    assert any("17 of 67 pictures are missing" in line for line in data.report)
+    wanted = json.loads((data_dir / "ply" / "fox120k.cameras.json").read_text())
+    for picture, camera in zip(data.test, wanted, strict=True):
+        assert camera["image"].endswith(picture.camera.image)
+        assert np.allclose(camera["viewmat"], picture.camera.viewmat, atol=1e-5)
+        assert np.allclose(camera["K"], picture.camera.K, atol=2.0)
+
+
+def test_shared_desk_points_fall_where_their_colour_is(data_dir):
+    data = load(data_dir / "images" / "desk29")
+    assert (25, 4) == (len(data.train), len(data.test))
+    assert (7562, 3) == data.points.shape
+    right, mirrored = [], []
+    for picture in data.test:
+        camera = picture.camera
+        c = data.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        p = c @ camera.K.T
+        u, v = (p[:, :2] / p[:, 2:]).T
+        inside = (c[:, 2] > 0) & (u >= 0) & (u < camera.W) & (v >= 0) & (v < camera.H)
+        assert inside.mean() > 0.9
+        u, v = u[inside].astype(int), v[inside].astype(int)
+        for errors, row in ((right, v), (mirrored, camera.H - 1 - v)):
+            errors.append(np.abs(picture.pixels[row, u] / 255.0 - data.points_rgb[inside]).mean())
+    assert np.mean(right) < 0.6 * np.mean(mirrored)

@@ -1,0 +1,106 @@
+"""PSNR and SSIM: their conventions, against formulas written out another way."""
+
+import math
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat_render.metrics import PSNR_CAP, Scorer, psnr, ssim
+
+
+def pictures(seed=0, height=30, width=41, noise=0.1):
+    rng = np.random.default_rng(seed)
+    a = rng.random((height, width, 3), np.float32)
+    return a, np.clip(a + noise * rng.standard_normal(a.shape), 0.0, 1.0).astype(np.float32)
+
+
+def slow_ssim(a, b):
+    """Pixel by pixel: the full 11×11 window, zeros beyond the border."""
+    g = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
+    window = np.outer(g, g) / np.outer(g, g).sum()
+    values = []
+    for c in range(3):
+        x, y = (np.pad(p[..., c].astype(np.float64), 5) for p in (a, b))
+        for i in range(a.shape[0]):
+            for j in range(a.shape[1]):
+                p, q = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
+                mp, mq = (window * p).sum(), (window * q).sum()
+                pp, qq, pq = ((window * s).sum() for s in (p * p, q * q, p * q))
+                up = (2 * mp * mq + 0.01**2) * (2 * (pq - mp * mq) + 0.03**2)
+                values.append(up / ((mp**2 + mq**2 + 0.01**2) * (pp - mp**2 + qq - mq**2 + 0.03**2)))
+    return np.mean(values)
+
+
+def test_psnr_of_a_known_error():
+    a = np.full((4, 5, 3), 0.5, np.float64)
+    assert math.isclose(20.0, psnr(a, a + 0.1))
+
+
+def test_equal_pictures_score_the_cap():
+    a, _ = pictures()
+    assert PSNR_CAP == psnr(a, a)
+    assert PSNR_CAP == psnr(a, a + np.float32(1e-9))
+    assert math.isclose(1.0, ssim(a, a))
+
+
+def test_pictures_are_clipped_first():
+    a, b = pictures()
+    over = np.where(b == 1.0, 7.0, b)
+    assert psnr(a, b) == psnr(a, over)
+
+
+def test_ssim_is_the_sum_over_the_window_written_out():
+    a, b = pictures(height=14, width=17)
+    assert math.isclose(slow_ssim(a, b), ssim(a, b), rel_tol=1e-12)
+
+
+def test_ssim_of_a_picture_smaller_than_the_window():
+    a, b = pictures(height=3, width=2)
+    assert math.isclose(slow_ssim(a, b), ssim(a, b), rel_tol=1e-12)
+
+
+def test_the_error_is_pooled_and_the_mean_stands_beside_it():
+    scorer = Scorer()
+    zero = np.zeros((4, 4, 3))
+    each = [scorer.add(zero, zero + 0.1), scorer.add(zero, zero + 0.01)]
+    scores = scorer.scores()
+    assert np.allclose([20.0, 40.0], each)
+    assert math.isclose(30.0, scores.psnr_mean)
+    assert math.isclose(-10.0 * math.log10((0.01 + 0.0001) / 2.0), scores.psnr)
+    assert (0, 2) == (scores.worst_view, scores.views)
+    assert math.isclose(20.0, scores.psnr_worst)
+    assert scores.cover is None
+    assert scores.psnr_covered is None
+
+
+def test_views_of_different_sizes_weigh_by_their_pixels():
+    scorer = Scorer()
+    scorer.add(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))
+    scorer.add(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
+    assert math.isclose(-10.0 * math.log10(0.01 * 3 / 4), scorer.scores().psnr)
+
+
+def test_an_empty_background_inflates_psnr_by_what_covered_pixels_tell():
+    reference, image = np.ones((10, 10, 3)), np.ones((10, 10, 3))
+    reference[:5], image[:5] = 0.5, 0.6
+    alpha = np.zeros((10, 10))
+    alpha[:5] = 1.0
+    scorer = Scorer()
+    scorer.add(reference, image, alpha)
+    scores = scorer.scores()
+    assert math.isclose(0.5, scores.cover)
+    assert math.isclose(20.0, scores.psnr_covered)
+    assert math.isclose(20.0 + 10.0 * math.log10(2.0), scores.psnr)
+    assert {"psnr", "psnr_mean", "psnr_worst", "ssim", "cover"} <= scores.to_json().keys()
+
+
+def test_refuses_what_cannot_be_compared():
+    a, b = pictures()
+    for reference, image in ((a, b[1:]), (a[..., 0], b[..., 0]), ((a * 255).astype(np.uint8), b), (a * np.nan, b)):
+        with pytest.raises(InputError):
+            psnr(reference, image)
+    with pytest.raises(InputError, match="no pictures"):
+        Scorer().scores()
+    with pytest.raises(InputError, match="alpha"):
+        Scorer().add(a, b, np.zeros((2, 2)))

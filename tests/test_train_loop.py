@@ -1,0 +1,169 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from csplat import read_ply, write_ply
+from csplat.errors import InputError
+from csplat_render.cameras import intrinsics, orbit
+from csplat_render.rasterise import Rasteriser
+from csplat_trainer.data import DataSet
+from csplat_trainer.loop import train
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.outputs import Outputs
+from csplat_trainer.pictures import Picture
+from csplat_trainer.starting import scene_of, starting_splats
+
+SIZE = 48
+QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
+
+
+def photographs(make_model, *, alpha: bool = True) -> DataSet:
+    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
+    rasteriser = Rasteriser(gradients=False)
+    shots = []
+    for elevation in (10.0, 45.0):
+        cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(SIZE, SIZE, 50.0), SIZE, SIZE, elevation=elevation)
+        for camera in cameras:
+            seen = rasteriser.forward(scene, camera)
+            cover = np.maximum(seen.alpha, 1e-6)[..., None]
+            colour = np.clip(seen.rgb / cover, 0, 1)
+            pixels = np.concatenate([colour, seen.alpha[..., None]], axis=2) if alpha else np.clip(seen.rgb, 0, 1)
+            shots.append(Picture(camera, np.rint(pixels * 255).astype(np.uint8)))
+    return DataSet("made", shots[:9], shots[9:])
+
+
+@pytest.fixture(scope="module")
+def make_data():
+    cache: dict[bool, DataSet] = {}
+
+    def make(make_model, *, alpha: bool = True) -> DataSet:
+        if alpha not in cache:
+            cache[alpha] = photographs(make_model, alpha=alpha)
+        return cache[alpha]
+
+    return make
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
+def test_training_brings_the_loss_down(make_data, make_model, strategy):
+    data = make_data(make_model)
+    options = TrainOptions(**{**QUICK, "iterations": 300, "refine_every": 50}, strategy=strategy, lr_means=2e-3)
+    result = train(data, options)
+    losses = result.log["losses"]
+    assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:20])
+    assert result.metrics["psnr_mean"] > 15
+    assert len(result.model) <= 80
+
+
+def test_the_same_seed_makes_the_same_file(make_data, make_model, tmp_path):
+    data = make_data(make_model)
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        write_ply(tmp_path / name, train(data, TrainOptions(**QUICK, seed=seed, background="random")).model)
+    first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
+    assert first == second
+    assert first != other
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
+def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, tmp_path, strategy):
+    data, options = make_data(make_model), TrainOptions(**QUICK, strategy=strategy)
+    whole = train(data, options, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    stopped = tmp_path / "stopped.npz"
+
+    def stop(now):
+        if now.iteration == 40:
+            stopped.write_bytes((tmp_path / "c.npz").read_bytes())  # the one of step 25
+
+    train(data, options, stop, Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    again = train(data, options, outputs=Outputs(resume=stopped))
+    assert np.array_equal(whole.model.means, again.model.means)
+    assert np.array_equal(whole.model.shN, again.model.shN)
+    assert whole.log["losses"] == again.log["losses"]
+
+
+def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_path):
+    data = make_data(make_model)
+    train(data, TrainOptions(**QUICK, strategy="fixed"), outputs=Outputs(checkpoint=tmp_path / "c.npz"))
+    for count in (50, 120):
+        options = TrainOptions(**{**QUICK, "max_splats": count, "iterations": 70, "sh_degree": 2}, strategy="fixed")
+        result = train(data, options, outputs=Outputs(resume=tmp_path / "c.npz"))
+        assert (count, 2) == (len(result.model), result.model.sh_degree)
+
+
+def test_progress_log_and_previews_tell_where_it_stands(make_data, make_model, tmp_path):
+    seen = []
+    result = train(
+        make_data(make_model), TrainOptions(**QUICK), seen.append, Outputs(previews=tmp_path / "p", preview_every=30)
+    )
+    assert [20, 40, 60] == [now.iteration for now in seen]
+    assert seen[-1].seconds_left == 0
+    assert ["000030.png", "000060.png"] == sorted(path.name for path in (tmp_path / "p").iterdir())
+    log = json.loads(json.dumps(result.log, allow_nan=False))
+    assert 60 == len(log["losses"])
+    assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
+
+
+def test_the_hull_holds_what_all_masks_show(make_data, make_model):
+    data = make_data(make_model)
+    scene = scene_of(data.train)
+    assert np.linalg.norm(scene.focus) < 0.1
+    found = starting_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="hull")
+    boxed = starting_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="box")
+    assert np.linalg.norm(found["means"], axis=1).mean() < np.linalg.norm(boxed["means"], axis=1).mean()
+
+
+def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
+    data = make_data(make_model, alpha=False)
+    result = train(data, TrainOptions(**QUICK, background="black"))
+    assert np.isfinite(result.model.means).all()
+    with pytest.raises(InputError, match="no alpha channel"):
+        train(data, TrainOptions(**QUICK, init="hull"))
+    with pytest.raises(InputError, match="no points"):
+        train(data, TrainOptions(**QUICK, init="points"))
+
+
+def test_points_are_where_splats_start(make_data, make_model):
+    data = make_data(make_model)
+    points = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
+    given = DataSet("made", data.train, [], points, np.full((20, 3), 0.25, np.float32))
+    result = train(given, TrainOptions(**{**QUICK, "iterations": 1}, lr_means=0.0, lr_means_final=0.0, noise=0.0))
+    assert {tuple(row) for row in points.tolist()} == {tuple(row) for row in result.model.means.tolist()}
+    assert result.metrics is None
+
+
+def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
+    from PIL import Image
+
+    (tmp_path / "train").mkdir()
+    frames = []
+    data = make_data(make_model)
+    for number, picture in enumerate(data.train):
+        Image.fromarray(picture.pixels).save(tmp_path / "train" / f"{number}.png")
+        pose = np.linalg.inv(picture.camera.viewmat) @ np.diag([1, -1, -1, 1])
+        frames.append({"file_path": f"./train/{number}", "transform_matrix": pose.tolist()})
+    angle = 2 * np.arctan(0.5 * SIZE / data.train[0].camera.K[0, 0])
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    run = [sys.executable, "-m", "csplat_tools", "train", str(tmp_path), "-o", str(tmp_path / "o.ply")]
+    options = ["--max-splats", "50", "--sh-degree", "1", "--iterations", "30", "--size", "40x40", "--seed", "3"]
+    files = ["--json", str(tmp_path / "log.json"), "--plot", str(tmp_path / "loss.png")]
+    done = subprocess.run([*run, *options, *files], capture_output=True, text=True, check=False)
+    assert (0, "") == (done.returncode, done.stdout), done.stderr
+    assert read_ply(tmp_path / "o.ply").sh_degree == 1
+    assert 30 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
+    assert (tmp_path / "loss.png").read_bytes().startswith(b"\x89PNG")
+    again = subprocess.run([*run, "--device", "mps"], capture_output=True, text=True, check=False)
+    assert 2 == again.returncode
+    assert "mps is not supported" in " ".join(again.stderr.split())
+
+
+def test_the_command_says_which_extra_is_missing(tmp_path):
+    code = "import sys; sys.modules['numba'] = None; sys.argv = ['csplat', 'train', '.', '-o', sys.argv[1]]"
+    code += "; from csplat_tools.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "o.ply")], capture_output=True, text=True, check=False
+    )
+    assert 1 == done.returncode
+    assert "error: this needs numba: pip install 'csplat[train]'" == done.stderr.strip()

@@ -1,0 +1,199 @@
+import json
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
+from csplat_trainer.mcmc import add_noise, grow, relocate, share
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
+from csplat_trainer.report import moving_average
+from csplat_trainer.resume import adapt
+
+
+@pytest.fixture
+def parameters(make_model):
+    return Parameters.starting_at(from_model(make_model(40, 2), 2))
+
+
+def test_adam_is_the_textbook_s(parameters):
+    rng = np.random.default_rng(0)
+    gradients = [
+        {name: rng.standard_normal(parameters.values[name].shape).astype(np.float32) for name in GROUPS}
+        for _ in range(3)
+    ]
+    x = parameters.values["means"].astype(np.float64)
+    m, v = np.zeros_like(x), np.zeros_like(x)
+    for step, gradient in enumerate(gradients, 1):
+        g = gradient["means"].astype(np.float64)
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+        x -= 0.01 * (m / (1 - 0.9**step)) / (np.sqrt(v / (1 - 0.999**step)) + 1e-15)
+        adam_step(parameters, gradient, dict.fromkeys(GROUPS, 0.01))
+    assert np.abs(parameters.values["means"] - x).max() <= 1e-6
+    assert np.abs(np.linalg.norm(parameters.values["quats"], axis=1) - 1).max() <= 1e-6
+
+
+def test_a_splat_without_gradient_does_not_move(parameters):
+    before = {name: parameters.values[name].copy() for name in GROUPS}
+    for _ in range(3):
+        adam_step(parameters, {name: np.zeros_like(before[name]) for name in GROUPS}, dict.fromkeys(GROUPS, 0.1))
+    for name in GROUPS:
+        assert np.allclose(before[name], parameters.values[name], atol=1e-6)
+
+
+def test_a_model_survives_the_way_through_parameters(make_model):
+    model = make_model(20, 1)
+    again = to_model(from_model(model, 3))
+    assert again.sh_degree == 3
+    assert np.array_equal(model.means, again.means)
+    assert np.allclose(model.opacities, again.opacities, atol=1e-6)
+    assert np.array_equal(model.shN, again.shN[:, :3])
+
+
+@pytest.mark.parametrize("count", [2, 3, 10, 51])
+@pytest.mark.parametrize("alpha", [0.05, 0.5, 0.9])
+def test_shared_splats_cover_like_one(alpha, count):
+    # The integral of what n equal splats cover along a line through their centre is that of the one.
+    shared, factor = share(np.array([alpha]), np.array([count]))
+    x = np.linspace(-12, 12, 20_001)
+    one = alpha * np.exp(-(x**2) / 2)
+    many = 1 - (1 - shared * np.exp(-(x**2) / (2 * factor**2))) ** count
+    assert many.sum() == pytest.approx(one.sum(), rel=1e-6)
+    assert many.max() == pytest.approx(alpha, rel=1e-9)
+
+
+def test_dead_splats_move_onto_live_ones(parameters):
+    parameters.values["logits"][:] = 2.0
+    parameters.values["logits"][:10] = -9.0
+    adam_step(parameters, {name: np.ones_like(parameters.values[name]) for name in GROUPS}, dict.fromkeys(GROUPS, 0.0))
+    assert 10 == relocate(parameters, 0.005, np.random.default_rng(0))
+    alive = {tuple(row) for row in parameters.values["means"][10:].tolist()}
+    assert all(tuple(row) in alive for row in parameters.values["means"][:10].tolist())
+    assert (parameters.first["means"][:10] == 0).all()
+    assert parameters.alphas.min() > 0.005
+
+
+def test_nothing_is_moved_where_all_are_dead(parameters):
+    parameters.values["logits"][:] = -9.0
+    assert 0 == relocate(parameters, 0.005, np.random.default_rng(0))
+
+
+def test_growth_stops_at_the_cap(parameters):
+    rng = np.random.default_rng(0)
+    assert 2 == grow(parameters, 1.05, 1000, 0.005, rng)
+    assert 3 == grow(parameters, 2.0, 45, 0.005, rng)
+    assert 0 == grow(parameters, 2.0, 45, 0.005, rng)
+    assert {45} == {len(part[name]) for part in (parameters.values, parameters.first) for name in GROUPS}
+
+
+def test_noise_moves_transparent_splats_alone(parameters):
+    parameters.values["logits"][:20] = 3.0
+    parameters.values["logits"][20:] = -8.0
+    before = parameters.values["means"].copy()
+    add_noise(parameters, 1.0, np.random.default_rng(0).standard_normal(before.shape).astype(np.float32))
+    moved = (before != parameters.values["means"]).any(axis=1)
+    assert not moved[:20].any()
+    assert moved[20:].all()
+
+
+def test_densification_clones_small_splits_large_and_prunes(parameters):
+    parameters.values["logits"][:] = 1.0
+    parameters.values["logits"][5] = -9.0
+    parameters.values["scales"][:] = np.log(1e-3)
+    parameters.values["scales"][1] = np.log(0.5)
+    screen = ScreenGradients.none(40)
+    screen.add(np.where(np.arange(40) < 2, 1.0, 0.0).astype(np.float32), np.ones(40, bool))
+    first, second = parameters.values["means"][:2].copy()
+    assert 1 == densify(parameters, screen, 1.0, 1e-3, 100, 0.005, np.random.default_rng(0))
+    means, scales = parameters.values["means"], parameters.values["scales"]
+    assert np.array_equal(first, means[0])
+    assert np.array_equal(first, means[-2])
+    assert not np.array_equal(second, means[1])
+    assert np.allclose(scales[[1, -1]], np.log(0.5 / 1.6))
+
+
+def test_densification_keeps_to_the_cap(parameters):
+    parameters.values["logits"][:] = 1.0
+    screen = ScreenGradients.none(40)
+    screen.add(np.ones(40, np.float32), np.ones(40, bool))
+    densify(parameters, screen, 1.0, 1e-3, 50, 0.005, np.random.default_rng(0))
+    assert 50 == len(parameters)
+    reset_opacities(parameters)
+    assert parameters.alphas.max() <= 0.0101
+
+
+def checkpoint_of(parameters: Parameters) -> Checkpoint:
+    return Checkpoint(7, parameters, np.random.default_rng(0).bit_generator.state, [3, 1], {"seed": 0}, {"losses": []})
+
+
+def test_a_checkpoint_comes_back_whole(parameters, tmp_path):
+    save_checkpoint(tmp_path / "run.npz", checkpoint_of(parameters))
+    again = load_checkpoint(tmp_path / "run.npz")
+    assert (7, [3, 1]) == (again.iteration, again.queue)
+    for name in GROUPS:
+        assert np.array_equal(parameters.values[name], again.parameters.values[name])
+        assert np.array_equal(parameters.second[name], again.parameters.second[name])
+
+
+@pytest.mark.parametrize("damage", ["text", "empty", "cut", "other"])
+def test_a_damaged_checkpoint_is_refused(parameters, tmp_path, damage):
+    path = tmp_path / "run.npz"
+    save_checkpoint(path, checkpoint_of(parameters))
+    whole = path.read_bytes()
+    path.write_bytes({"text": b"hello", "empty": b"", "cut": whole[: len(whole) // 2], "other": whole}[damage])
+    if damage == "other":
+        np.savez(path, facts=np.frombuffer(json.dumps({"version": 99}).encode(), np.uint8))
+    with pytest.raises(InputError, match=r"checkpoint"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("cap", "degree", "strategy", "count"), [(25, 1, "mcmc", 25), (60, 3, "fixed", 60), (60, 0, "mcmc", 40)]
+)
+def test_a_checkpoint_adapts_to_other_options(parameters, cap, degree, strategy, count):
+    options = TrainOptions(max_splats=cap, sh_degree=degree, strategy=strategy)
+    adapted = adapt(parameters, options, np.random.default_rng(0))
+    assert count == len(adapted)
+    assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
+
+
+def test_the_moving_average_is_of_the_last_values():
+    assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"max_splats": 0}, {"sh_degree": 4}, {"loss": "l2"}, {"lr_means": float("nan")}, {"lr_means_final": 1.0}],
+)
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(InputError, match="wanted"):
+        TrainOptions(**wrong)
+
+
+def test_mps_is_refused_in_one_line():
+    with pytest.raises(InputError, match="mps is not supported"):
+        TrainOptions(device="mps")
+
+
+def test_the_learning_rate_of_the_means_falls_to_its_end():
+    options = TrainOptions(iterations=100)
+    assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
+    assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
+
+
+def test_growth_reaches_the_cap_halfway():
+    options = TrainOptions(max_splats=1000, iterations=2000, refine_start=100)
+    count = 10.0
+    for step in range(1, options.refine_end // 2 + 1):
+        if options.refines_after(step):
+            count *= options.growth_from(10)
+    assert 1000 == pytest.approx(count)
+    assert 1.05 == options.growth_from(1000)
+    assert 1.5 == TrainOptions(growth=1.5).growth_from(10)
+
+
+def test_sh_degrees_come_one_after_the_other():
+    options = TrainOptions(iterations=1500, sh_degree=2)
+    assert [0, 1, 2, 2] == [options.active_degree(step) for step in (0, 100, 200, 1400)]

@@ -1,0 +1,129 @@
+# ruff: noqa: E402 -- torch may be absent, which has to be known before the trainer is imported
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="the torch wrapper wants torch (the train extra)")
+
+from csplat.errors import InputError
+from csplat_render.camera import Camera
+from csplat_trainer import autograd, cuda
+from csplat_trainer.engine import CpuEngine
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.parameters import GROUPS, Parameters, from_model
+from csplat_trainer.perceptual import PerceptualLoss
+from csplat_trainer.pictures import Picture
+
+
+@pytest.fixture
+def camera() -> Camera:
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 6.0
+    return Camera(np.array([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), viewmat, 24, 20)
+
+
+def tensors_of(model, dtype):
+    arrays = (model.means, model.quats, model.scales, model.opacities, model.sh0, model.shN)
+    return [torch.tensor(array, dtype=dtype, requires_grad=True) for array in arrays]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gradients_are_those_of_finite_differences(make_model, camera, degree, antialiased):
+    model = make_model(
+        6, degree, seed=5, scales=np.full((6, 3), -1.0, np.float32) + 0.3 * np.eye(6, 3, dtype=np.float32)
+    )
+    inputs = tensors_of(model, torch.float64)
+    weight = torch.tensor(np.random.default_rng(0).standard_normal((20, 24, 3)))
+
+    def loss(*tensors):
+        return (autograd.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased) * weight).sum()
+
+    # Alpha jumps at 1/255, where the picture has no derivative: a step of 1e-7 meets few such pixels.
+    loss(*inputs).backward()
+    rng = np.random.default_rng(1)
+    for tensor in inputs:
+        if tensor.numel() == 0:
+            continue
+        direction = torch.tensor(rng.standard_normal(tensor.shape))
+        step = 1e-7
+        with torch.no_grad():
+            up, down = (
+                loss(*(one + sign * step * direction if one is tensor else one for one in inputs)) for sign in (1, -1)
+            )
+        expected = float((up - down) / (2 * step))
+        assert float((tensor.grad * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+def test_two_pictures_can_wait_for_their_gradients(make_model, camera):
+    inputs = tensors_of(make_model(6, 1), torch.float32)
+    first, second = (autograd.render(*inputs, camera, background=(value,) * 3) for value in (0.0, 1.0))
+    together = torch.autograd.grad((first + second).sum(), inputs)
+    alone = [
+        torch.autograd.grad(autograd.render(*inputs, camera, background=(v,) * 3).sum(), inputs) for v in (0.0, 1.0)
+    ]
+    for got, *wanted in zip(together, *alone, strict=True):
+        assert torch.allclose(got, sum(wanted), rtol=1e-5, atol=1e-5)
+
+
+def test_mixed_types_are_refused(make_model, camera):
+    inputs = tensors_of(make_model(2, 0), torch.float32)
+    inputs[1] = inputs[1].double()
+    with pytest.raises(InputError, match="all float32 or all float64"):
+        autograd.render(*inputs, camera)
+
+
+def rasterization(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, sh_degree, backgrounds, **rest
+):
+    """What stands in for gsplat: the rasteriser of the CPU, with gsplat's arguments."""
+    camera = Camera(Ks[0].double().numpy(), viewmats[0].double().numpy(), width, height, near_plane)
+    picture = autograd.render(
+        means, quats, scales.log(), opacities, colors[:, 0], colors[:, 1:], camera,
+        background=tuple(backgrounds[0].tolist()), antialiased=rest["rasterize_mode"] == "antialiased",
+        sh_degree=sh_degree,
+    )  # fmt: skip
+    return picture[None], None, {}
+
+
+@pytest.mark.parametrize("loss", ["inria", "study"])
+def test_the_engine_of_the_gpu_takes_the_same_steps(make_model, camera, loss):
+    options = TrainOptions(strategy="fixed", loss=loss, noise=0.0, max_splats=12)
+    pixels = np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8)
+    engines = [
+        CpuEngine(Parameters.starting_at(from_model(make_model(12, 1), 1)), options),
+        cuda.CudaEngine(Parameters.starting_at(from_model(make_model(12, 1), 1)), options, rasterization, "cpu"),
+    ]
+    figures = []
+    for engine in engines:
+        rng = np.random.default_rng(0)
+        for step in range(1, 6):
+            value = engine.step(
+                Picture(camera, pixels), np.ones(3, np.float32), 1, options.learning_rates(step, 1.0), rng
+            )
+        figures.append(value)
+    assert figures[0].loss == pytest.approx(figures[1].loss, rel=1e-4)
+    for name in GROUPS:
+        assert np.allclose(engines[0].parameters.values[name], engines[1].parameters.values[name], atol=2e-3)
+    pictures = [engine.render(camera, np.zeros(3, np.float32), 1) for engine in engines]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1e-3
+
+
+def test_a_missing_gpu_is_refused_in_one_line():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(InputError, match="finds no GPU"):
+        cuda.gsplat_rasterization()
+
+
+def test_the_perceptual_loss_is_lpips_with_its_gradient(data_dir):
+    from csplat_render.lpips import load_lpips
+
+    weights = load_lpips(data_dir / "lpips" / "lpips_alex.npz")
+    rng = np.random.default_rng(0)
+    x, y = (rng.random((64, 64, 3), dtype=np.float32) for _ in range(2))
+    perceptual = PerceptualLoss(weights)
+    assert weights(y, x) == pytest.approx(perceptual.distance(x, y), abs=1e-5)
+    slope = perceptual.gradient(x, y, 2.0)
+    length = np.linalg.norm(slope)
+    up, down = (2 * perceptual.distance(x + sign * 1e-3 * slope / length, y) for sign in (1, -1))
+    assert (up - down) / 2e-3 == pytest.approx(length, rel=0.02)

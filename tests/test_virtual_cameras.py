@@ -1,0 +1,207 @@
+"""Virtual cameras: kinds of scenes, cover, determinism, agreement with the cameras of the shared scenes."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from csplat import read_ply
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.cameras import load_cameras
+from csplat_render.cloud import cover, sample_cloud, weighted_quantiles
+from csplat_render.virtual import OBJECT_DISTANCES, SURROUNDING_DISTANCES, orbit_cameras, scene_frame, virtual_cameras
+
+
+def model_of(means, size=0.03, **fields):
+    n = len(means)
+    arrays = {
+        "means": np.asarray(means, np.float32),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        "scales": np.broadcast_to(np.log(np.asarray(size, np.float32)).reshape(-1, 1), (n, 3)).astype(np.float32),
+        "opacities": np.full(n, 0.9, np.float32),
+        "sh0": np.zeros((n, 3), np.float32),
+    }
+    return SplatModel(**{**arrays, **fields})
+
+
+def ball(count=3000, radius=1.0, seed=0, **fields):
+    p = np.random.default_rng(seed).standard_normal((count, 3))
+    return model_of(radius * p / np.linalg.norm(p, axis=1, keepdims=True), **fields)
+
+
+def capture(seed=0):
+    """A small subject, fine splats; far walls, coarse ones, all around it."""
+    rng = np.random.default_rng(seed)
+    subject, walls = rng.standard_normal((4000, 3)) * 0.3, rng.standard_normal((1500, 3))
+    walls *= 6.0 / np.linalg.norm(walls, axis=1, keepdims=True)
+    return model_of(np.concatenate([subject, walls]), np.repeat([0.02, 0.4], [4000, 1500]))
+
+
+def same(a, b):
+    return all(
+        (x.viewmat == y.viewmat).all() and (x.K == y.K).all() and x.near == y.near for x, y in zip(a, b, strict=True)
+    )
+
+
+def test_an_object_and_surroundings_are_told_apart():
+    assert "object" == scene_frame(ball()).kind
+    assert "surrounding" == scene_frame(capture()).kind
+
+
+def test_one_far_floater_makes_no_surroundings():
+    means = np.concatenate([ball().means, [[300.0, 0.0, 0.0]]])
+    frame = scene_frame(model_of(means))
+    assert "object" == frame.kind
+    assert np.allclose(frame.centre, 0.0, atol=0.05)
+
+
+def test_invisible_splats_do_not_count():
+    clean = ball()
+    means = np.concatenate([clean.means, 50.0 * np.random.default_rng(1).standard_normal((3000, 3))])
+    dirty = scene_frame(model_of(means, opacities=np.repeat(np.array([0.9, 0.001], np.float32), 3000)))
+    assert "object" == dirty.kind
+    assert np.allclose(scene_frame(clean).centre, dirty.centre)
+    assert np.isclose(scene_frame(clean).extent, dirty.extent)
+
+
+@pytest.mark.parametrize(("count", "seed"), [(8, 0), (8, 3), (1, 0), (5, 1)])
+def test_an_object_covers_half_of_each_picture(count, seed):
+    model = ball()
+    cloud = sample_cloud(model, 50_000, np.random.default_rng(9))
+    cameras = virtual_cameras(model, count, seed=seed)
+    assert count == len(cameras)
+    frame = scene_frame(model)
+    for camera in cameras:
+        assert (640, 480) == (camera.W, camera.H)
+        assert cover(cloud, camera) >= 0.5
+        distance = np.linalg.norm(camera.position - frame.centre) / frame.extent
+        assert np.isclose(distance, OBJECT_DISTANCES).any()
+        assert camera.near == min(0.2, 0.05 * frame.extent)
+
+
+def test_a_tower_is_covered_too():
+    rng = np.random.default_rng(0)
+    model = model_of(rng.random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
+    cloud = sample_cloud(model, 50_000, rng)
+    assert all(cover(cloud, camera) >= 0.5 for camera in virtual_cameras(model))
+
+
+def test_cameras_stand_all_around_an_object():
+    frame = scene_frame(ball())
+    offsets = np.array([camera.position - frame.centre for camera in virtual_cameras(ball())])
+    angles = np.sort(np.degrees(np.arctan2(offsets[:, 2], offsets[:, 0])))
+    assert np.diff(np.append(angles, angles[0] + 360.0)).max() < 100.0
+    assert (offsets[:, 1] < 0.0).all()  # above: y points down where nothing else is said
+
+
+def test_cameras_in_surroundings_see_the_subject():
+    model = capture()
+    frame = scene_frame(model)
+    for camera in virtual_cameras(model):
+        towards = frame.centre - camera.position
+        distance = np.linalg.norm(towards) / frame.extent
+        assert np.isclose(distance, SURROUNDING_DISTANCES).any()
+        assert np.allclose(camera.viewmat[2, :3], towards / np.linalg.norm(towards))
+
+
+@pytest.mark.parametrize(("letters", "up"), [("RUB", [0, 1, 0]), ("RDF", [0, -1, 0]), ("RFU", [0, 0, 1])])
+def test_a_coordinate_system_says_which_way_is_up(letters, up):
+    assert (scene_frame(ball(coordinate_system=letters)).up == up).all()
+
+
+def test_a_flat_scene_is_seen_from_above_its_plane():
+    means = np.random.default_rng(0).standard_normal((2000, 3)) * [1.0, 1.0, 0.1]
+    assert (scene_frame(model_of(means)).up == [0, 0, 1]).all()
+
+
+def test_the_same_arguments_give_the_same_cameras_and_a_seed_gives_others():
+    model = ball()
+    assert same(virtual_cameras(model), virtual_cameras(model))
+    assert not same(virtual_cameras(model, seed=0), virtual_cameras(model, seed=1))
+
+
+def test_training_cameras_are_not_looked_at():
+    other = ball(cameras=[{"K": np.eye(3).tolist()}])
+    assert same(virtual_cameras(ball()), virtual_cameras(other))
+
+
+def test_a_larger_scene_is_seen_from_farther_away():
+    small, large = ball(), ball(radius=128.0, size=0.03 * 128.0)
+    for a, b in zip(virtual_cameras(small), virtual_cameras(large), strict=True):
+        assert np.allclose(a.viewmat[:3, :3], b.viewmat[:3, :3], atol=1e-5)
+        assert np.allclose(128.0 * a.viewmat[:3, 3], b.viewmat[:3, 3], rtol=1e-4, atol=1e-2)
+
+
+THREADS = """
+import json
+import numpy as np
+from csplat.model import SplatModel, normalise_quats
+from csplat_render.virtual import virtual_cameras
+
+rng = np.random.default_rng(0)
+f = lambda *shape: rng.standard_normal((20000, *shape)).astype(np.float32)
+alpha = np.abs(np.tanh(f()))
+model = SplatModel(means=f(3), quats=normalise_quats(f(4)), scales=f(3) - 4, opacities=alpha, sh0=f(3))
+print(json.dumps([camera.to_json() for camera in virtual_cameras(model)]))
+"""
+
+
+def test_threads_change_nothing():
+    out = []
+    for threads in ("1", "2"):
+        environment = dict(os.environ)
+        environment.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), threads))
+        run = subprocess.run([sys.executable, "-c", THREADS], env=environment, capture_output=True, check=True)
+        out.append(run.stdout)
+    assert out[0] == out[1]
+    assert 8 == out[0].count(b"viewmat")
+
+
+def test_degenerate_scenes_have_cameras():
+    nothing = model_of(np.zeros((0, 3)), np.zeros(0))
+    point = model_of(np.zeros((1, 3)))
+    clear = ball(opacities=np.zeros(3000, np.float32))
+    huge = ball(scales=np.full((3000, 3), 60.0, np.float32))
+    tiny = ball(scales=np.full((3000, 3), -60.0, np.float32))
+    far = ball(radius=1e15)
+    for model in (nothing, point, clear, huge, tiny, far):
+        cameras = virtual_cameras(model)
+        assert 8 == len(cameras)
+        assert all(np.isfinite(camera.viewmat).all() for camera in cameras)
+        assert 3 == len(orbit_cameras(model, 3))
+
+
+def test_refuses_no_cameras():
+    with pytest.raises(InputError, match="at least 1"):
+        virtual_cameras(ball(), 0)
+
+
+def test_an_orbit_shows_a_whole_object():
+    model = ball()
+    for camera in orbit_cameras(model, 6, 320, 240):
+        p = model.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        u = camera.K[0, 0] * p[:, 0] / p[:, 2] + camera.K[0, 2]
+        v = camera.K[1, 1] * p[:, 1] / p[:, 2] + camera.K[1, 2]
+        assert ((u > 0) & (u < 320) & (v > 0) & (v < 240)).all()
+
+
+def test_weighted_quantiles():
+    values = np.array([5.0, 1.0, 3.0, 2.0, 4.0])
+    assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, np.ones(5), (0.2, 0.6, 1.0)))
+    weights = np.array([1.0, 3.0, 0.0, 0.0, 0.0])  # of the values 5 and 1
+    assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, weights, (0.75, 0.875, 1.0)))
+
+
+@pytest.mark.parametrize("name", ["donut", "horse", "jacket", "lego60k", "plane3", "fox60k_noreg", "object_id"])
+def test_distances_agree_with_the_cameras_of_the_shared_scenes(data_dir, name):
+    model = read_ply(data_dir / "ply" / f"{name}.ply")
+    frame = scene_frame(model)
+
+    def distance(cameras):
+        return np.median([np.linalg.norm(camera.position - frame.centre) for camera in cameras]) / frame.extent
+
+    wanted = distance(load_cameras(data_dir / "psnr_cameras" / f"{name}.json"))
+    assert 0.8 < distance(virtual_cameras(model)) / wanted < 1.25

@@ -1,0 +1,63 @@
+"""What a plain install leaves out, and one line that says how to get it."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+from csplat.errors import InputError
+from csplat_tools.console import note
+
+__all__ = ["need_pictures", "need_renderer", "need_trainer", "prepare_renderer"]
+
+
+def need_renderer() -> None:
+    """Import what rendering needs: better absent now than after the minutes that reading may take.
+
+    Raises:
+        InputError: numba is not installed.
+    """
+    _need("numba")
+
+
+def prepare_renderer(*, quiet: bool) -> None:
+    """Compile the renderer, or load what was compiled before; say so on a terminal if it takes its time.
+
+    Raises:
+        InputError: numba is not installed.
+    """
+    need_renderer()
+    from csplat_render.warmup import warm_up
+
+    warm_up(None if quiet or not sys.stderr.isatty() else note, gradients=False)
+
+
+def need_trainer(*, plots: bool = False) -> None:
+    """Import what training on the CPU needs: torch is not among it.
+
+    Args:
+        plots: what drawing needs, too.
+
+    Raises:
+        InputError: a package is not installed.
+    """
+    for module, package in (("numba", None), ("scipy", None), ("PIL", "pillow")):
+        _need(module, package, "train")
+    if plots:
+        _need("matplotlib", None, "train")
+
+
+def need_pictures() -> None:
+    """Import what writing pictures needs.
+
+    Raises:
+        InputError: pillow is not installed.
+    """
+    _need("PIL", "pillow")
+
+
+def _need(module: str, package: str | None = None, extra: str = "render") -> None:
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(f"this needs {package or error.name or module}: pip install 'csplat[{extra}]'") from None

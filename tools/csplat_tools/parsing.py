@@ -1,0 +1,55 @@
+"""Values of options that several commands understand alike."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import typer
+
+from csplat_render.conventions import MODES
+
+__all__ = ["parse_colour", "parse_mode", "parse_size"]
+
+_NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height from `640x480`.
+
+    Raises:
+        typer.BadParameter: it is something else.
+    """
+    found = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
+    if found is None:
+        raise typer.BadParameter(f"a size is {text!r}, wanted width and height in pixels, as 640x480")
+    return int(found[1]), int(found[2])
+
+
+def parse_colour(text: str) -> tuple[float, float, float]:
+    """Red, green and blue, 0 to 1, from `1,0.5,0`; `black` and `white` have names.
+
+    Raises:
+        typer.BadParameter: it is something else.
+    """
+    if text.lower() in _NAMED:
+        return _NAMED[text.lower()]
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(math.isfinite(value) and 0.0 <= value <= 1.0 for value in values):
+        raise typer.BadParameter(f"a colour is {text!r}, wanted red,green,blue from 0 to 1, or black, or white")
+    red, green, blue = values
+    return red, green, blue
+
+
+def parse_mode(text: str) -> str:
+    """A mode of the renderer.
+
+    Raises:
+        typer.BadParameter: there is no such mode.
+    """
+    if text not in MODES:
+        raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
+    return text

@@ -1,0 +1,135 @@
+"""Pictures of a scene in a folder: what `csplat render` does, apart from the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render import Camera, render
+from csplat_render.cameras import load_cameras
+from csplat_render.virtual import orbit_cameras
+from csplat_tools.extras import need_pictures, need_renderer
+from csplat_tools.inout import write_array
+from csplat_tools.pictures import check_folder, picture_names, to_bytes, write_png
+
+__all__ = ["Rendered", "find_cameras", "render_folder", "resized"]
+
+F32 = NDArray[np.float32]
+
+_DEFAULT_SIZE = (640, 480)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Pictures that were written.
+
+    Attributes:
+        files: in the order of the cameras.
+        ignored_count: splats that no picture shows because they hold NaN or infinities.
+    """
+
+    files: tuple[Path, ...]
+    ignored_count: int
+
+
+def find_cameras(
+    model: SplatModel, path: str | None, orbit_count: int | None, size: tuple[int, int] | None
+) -> list[Camera]:
+    """Get the cameras that a command line names: a file's, or those of an orbit.
+
+    Args:
+        model: the scene to orbit around.
+        path: of a camera file.
+        orbit_count: how many cameras on a circle.
+        size: width and height of the pictures; the file's own, or 640 by 480, if left out.
+
+    Raises:
+        InputError: not exactly one of the two is given; the file is none; a picture of that size would be distorted.
+    """
+    if (path is None) == (orbit_count is None):
+        raise InputError("wanted the cameras: a file of them, or a number for an orbit")
+    if path is not None:
+        cameras = load_cameras(path)
+        return cameras if size is None else [resized(camera, *size) for camera in cameras]
+    assert orbit_count is not None
+    return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE))
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Let a camera take the same picture in another size.
+
+    Raises:
+        InputError: the picture's shape would change by more than the rounding of a pixel.
+    """
+    across, down = width / camera.W, height / camera.H
+    if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
+        raise InputError(
+            f"a camera takes pictures of {camera.W}x{camera.H} pixels: at {width}x{height} they would be distorted"
+        )
+    return replace(camera, K=np.diag([across, down, 1.0]) @ camera.K, W=width, H=height)
+
+
+def render_folder(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    folder: str,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    mode: str = "standard",
+    depth: bool = False,
+    alpha: bool = False,
+    force: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> Rendered:
+    """Render a scene and write NAME.png for each camera.
+
+    Args:
+        model: the scene.
+        cameras: where to stand. The pictures take the names of their photographs, or numbers.
+        folder: where the files go; it is made if need be.
+        background: red, green, blue, 0..1.
+        mode: `exact`, `standard` or `fast`.
+        depth: write NAME.depth.npy too, [H, W] float32: how far along the camera's axis what is seen there lies on
+            average, scene units; 0 where nothing is.
+        alpha: write NAME.alpha.png too, 255 where nothing of the background shows.
+        force: existing files may be replaced.
+        progress: is told how much is done.
+
+    Raises:
+        InputError: a file exists; or the renderer is not installed.
+        OSError: a file cannot be written.
+    """
+    need_renderer()
+    need_pictures()
+    names = picture_names([camera.image for camera in cameras])
+    endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
+    target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
+    files, ignored = [], 0
+    for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+        if progress is not None:
+            progress("rendering", number / len(cameras))
+        result = render(model, camera, background=background, mode=mode)
+        ignored = max(ignored, result.ignored)
+        files.append(target / f"{name}.png")
+        write_png(files[-1], to_bytes(result.rgb))
+        if alpha:
+            files.append(target / f"{name}.alpha.png")
+            write_png(files[-1], to_bytes(result.alpha))
+        if depth:
+            files.append(target / f"{name}.depth.npy")
+            write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
+    if progress is not None:
+        progress("rendering", 1.0)
+    return Rendered(tuple(files), ignored)
+
+
+def _mean_depth(depth: F32, alpha: F32) -> F32:
+    """The renderer sums weight times depth, and alpha is the sum of the weights."""
+    mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
+    return mean.astype(np.float32)

@@ -1,0 +1,55 @@
+"""Rendering of Gaussian splats on the CPU: numba rasteriser with gradients, exact twin, cameras, image metrics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from csplat_render.camera import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from csplat_render.arrays import HasSplats, RenderResult
+
+__all__ = ["Camera", "render"]
+
+
+def render(
+    model: HasSplats,
+    camera: Camera,
+    *,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    mode: str = "standard",
+    antialiased: bool | None = None,
+    sh_degree: int | None = None,
+    threads: int | None = None,
+) -> RenderResult:
+    """Render one picture. For many of one scene, or gradients, keep a `csplat_render.rasterise.Rasteriser`.
+
+    Args:
+        model: a `SplatModel`, or anything with its six arrays. Its origin is not added: cameras
+            are relative to it, as `means` are.
+        camera: from where.
+        background: red, green, blue behind everything.
+        mode: `standard`; `fast`, which leaves out what hardly shows; or `exact`, the slow twin, in
+            float64.
+        antialiased: apply the mip-splatting filter; None for what the model says.
+        sh_degree: highest degree of the spherical harmonics; None for all there are.
+        threads: how many; None for all.
+
+    Raises:
+        InputError: shapes do not fit together, or an option is not one of these.
+        LimitError: too many splats are too large: `rasterise.MAX_INTERSECTIONS`.
+    """
+    # numba takes a second to import: those who want cameras alone do not wait for it.
+    from csplat_render.rasterise import Rasteriser
+    from csplat_render.twin import render_exact
+
+    if antialiased is None:
+        antialiased = bool(getattr(model, "antialiased", False))
+    if mode == "exact":
+        return render_exact(model, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
+    rasteriser = Rasteriser(mode, np.float32, gradients=False, threads=threads)
+    return rasteriser.forward(model, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)

@@ -1,0 +1,245 @@
+"""One sort of all visible splats by depth, then a counting sort into tiles: the order of blending.
+
+Nothing here depends on the number of threads: the chunks are fixed, and each writes to places that
+a prefix sum over all of them has set aside.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from csplat_render.jit import inline, kernel, parallel_kernel
+
+__all__ = [
+    "CHUNKS",
+    "TILE",
+    "TILE_BITS",
+    "arrange",
+    "count_tiles",
+    "depth_order",
+    "fill_tiles",
+    "record_offsets",
+    "tile_starts",
+]
+
+#: Width and height of a tile in pixels.
+TILE = 16
+
+#: Bits of a pixel position within a tile.
+TILE_BITS = 4
+
+#: Runs of the depth order that are sorted into tiles independently.
+CHUNKS = 8
+
+_DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
+
+
+@kernel
+def depth_order(depth: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> int:
+    """Sort what is drawn by float32 depth, then by index (radix sort, stable).
+
+    Args:
+        depth: [N] float32, above 0 for what is drawn.
+        keys: [N] uint32, scratch.
+        order: [N] int32, scratch.
+        keys2: [N] uint32, scratch.
+        order2: [N] int32, written: indices of the splats that are drawn, nearest first.
+
+    Returns:
+        How many are drawn.
+    """
+    bits = depth.view(np.uint32)  # positive floats sort like their bits
+    buckets = 1 << _DIGIT
+    mask = np.uint32(buckets - 1)
+    counts = np.zeros((3, buckets), np.int64)
+    n = 0
+    for i in range(len(bits)):
+        key = bits[i]
+        if key != 0:
+            keys[n] = key
+            order[n] = i
+            n += 1
+            counts[0, key & mask] += 1
+            counts[1, (key >> np.uint32(_DIGIT)) & mask] += 1
+            counts[2, key >> np.uint32(2 * _DIGIT)] += 1
+    for p in range(3):
+        total = 0
+        for b in range(buckets):
+            count = counts[p, b]
+            counts[p, b] = total
+            total += count
+    _scatter(n, np.uint32(0), mask, counts[0], keys, order, keys2, order2)
+    _scatter(n, np.uint32(_DIGIT), mask, counts[1], keys2, order2, keys, order)
+    _scatter(n, np.uint32(2 * _DIGIT), mask, counts[2], keys, order, keys2, order2)
+    return n
+
+
+@inline
+def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> None:
+    for j in range(n):
+        key = keys[j]
+        b = (key >> shift) & mask
+        to = counts[b]
+        counts[b] = to + 1
+        keys2[to] = key
+        order2[to] = order[j]
+
+
+@inline
+def _span(tile_y: int, j: int, extent: Any, box: Any) -> tuple[int, int]:
+    """First and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
+    first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
+    if last - first < 2 or (box[j, 2] >> TILE_BITS) == ((box[j, 3] - 1) >> TILE_BITS):
+        return first, last  # the box tells all
+    py = extent[j, 5]
+    low = max(tile_y * TILE, box[j, 2]) + 0.5 - py
+    high = min(tile_y * TILE + TILE, box[j, 3]) - 0.5 - py
+    widest = extent[j, 3]
+    slope, half, flat = extent[j, 0], extent[j, 1], extent[j, 2]
+    # Where the ellipse is widest within this row of tiles: to the right, to the left.
+    dy = low if widest < low else (high if widest > high else widest)
+    t = 1.0 - (dy * flat) * (dy * flat)
+    right = dy * slope + half * math.sqrt(t if t > 0.0 else 0.0)
+    dy = low if -widest < low else (high if -widest > high else -widest)
+    t = 1.0 - (dy * flat) * (dy * flat)
+    left = dy * slope - half * math.sqrt(t if t > 0.0 else 0.0)
+    if not (left <= right):
+        return first, last  # rounding at the extremes: the box is always right
+    # A tile's first and last pixel centres lie half a pixel inside it; the other half is for rounding.
+    x0, x1 = (extent[j, 4] + left) * (1.0 / TILE), (extent[j, 4] + right) * (1.0 / TILE)
+    begin = first if x0 < first else (last if x0 > last else int(x0))
+    end = last if x1 > last - 1 else (first if x1 < first else int(x1)) + 1
+    return begin, end
+
+
+@parallel_kernel()
+def arrange(order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any) -> None:
+    """Copy what the sort into tiles reads to the order in which it reads: no waiting for memory there.
+
+    Args:
+        order: [V] int32, splats that are drawn, nearest first.
+        extent: [N, 6], see `project`.
+        box: [N, 4], see `project`.
+        sorted_extent: [V, 6], written.
+        sorted_box: [V, 4], written.
+    """
+    for j in numba.prange(len(order)):
+        i = order[j]
+        for k in range(6):
+            sorted_extent[j, k] = extent[i, k]
+        for k in range(4):
+            sorted_box[j, k] = box[i, k]
+
+
+@parallel_kernel()
+def count_tiles(order: Any, extent: Any, box: Any, tiles_x: int, counts: Any, touched: Any) -> None:
+    """Count the splats of each tile; parallel over chunks of the depth order.
+
+    Args:
+        order: [V] int32, splats that are drawn, nearest first.
+        extent: [V, 6], see `arrange`.
+        box: [V, 4], see `arrange`.
+        tiles_x: tiles side by side.
+        counts: [CHUNKS, tiles] int32, written: splats of each chunk in each tile.
+        touched: [N] int32, written for splats that are drawn: tiles of each.
+    """
+    chunks = counts.shape[0]
+    n = len(order)
+    for chunk in numba.prange(chunks):
+        for t in range(counts.shape[1]):
+            counts[chunk, t] = 0
+        for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+            i = order[j]
+            tiles = 0
+            for ty in range(box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1):
+                x0, x1 = _span(ty, j, extent, box)
+                tiles += max(x1 - x0, 0)
+                for tx in range(x0, x1):
+                    counts[chunk, ty * tiles_x + tx] += 1
+            touched[i] = tiles
+
+
+@kernel
+def tile_starts(counts: Any, starts: Any) -> int:
+    """Turn counts into places: where each tile begins, and where each chunk writes in it.
+
+    Args:
+        counts: [CHUNKS, tiles] int32, replaced by the places relative to the tile's start.
+        starts: [tiles + 1] int64, written.
+
+    Returns:
+        Number of intersections.
+    """
+    total = 0
+    for t in range(counts.shape[1]):
+        starts[t] = total
+        within = 0
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, t]
+            counts[chunk, t] = within
+            within += count
+        total += within
+    starts[counts.shape[1]] = total
+    return total
+
+
+@parallel_kernel()
+def fill_tiles(
+    order: Any,
+    extent: Any,
+    box: Any,
+    tiles_x: int,
+    counts: Any,
+    starts: Any,
+    ids: Any,
+    offsets: Any,
+    slots: Any,
+    slot_tiles: Any,
+) -> None:
+    """Write the splats of each tile, nearest first; parallel over chunks of the depth order.
+
+    Args:
+        order: see `count_tiles`, as the next three.
+        extent: [V, 6], see `arrange`.
+        box: [V, 4], see `arrange`.
+        tiles_x: tiles side by side.
+        counts: [CHUNKS, tiles] int32, from `tile_starts`; used up.
+        starts: [tiles + 1] int64.
+        ids: [intersections] int32, written: splats, tile by tile.
+        offsets: [N + 1] int64, where the gradient records of each splat begin; empty without gradients.
+        slots: [intersections] int32, written: the gradient record of each of `ids`.
+        slot_tiles: [intersections] int32, written: the tile of each gradient record.
+    """
+    chunks = counts.shape[0]
+    n = len(order)
+    with_slots = len(offsets) > 0
+    for chunk in numba.prange(chunks):
+        for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+            i = order[j]
+            slot = offsets[i] if with_slots else 0
+            for ty in range(box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1):
+                x0, x1 = _span(ty, j, extent, box)
+                for tx in range(x0, x1):
+                    t = ty * tiles_x + tx
+                    to = starts[t] + counts[chunk, t]
+                    counts[chunk, t] += 1
+                    ids[to] = i
+                    if with_slots:
+                        slots[to] = slot
+                        slot_tiles[slot] = t
+                        slot += 1
+
+
+@kernel
+def record_offsets(depth: Any, touched: Any, offsets: Any) -> None:
+    """Where the gradient records of each splat begin: the prefix sum of the tiles that each touches."""
+    total = 0
+    for i in range(len(depth)):
+        offsets[i] = total
+        if depth[i] > 0.0:
+            total += touched[i]
+    offsets[len(depth)] = total

@@ -1,0 +1,153 @@
+"""The loop over pixels, forward: tile by tile, splats front to back, a row of 16 pixels at a time.
+
+A splat's exponent is rewritten for each tile, in float64, as a polynomial of the position within
+the tile: so float32 is enough for the pixels, however far away the centre of the splat lies.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from csplat_render.binning import TILE
+from csplat_render.jit import fast_exp, inline, parallel_kernel
+
+__all__ = ["CHECK", "alive_rows", "blend", "tile_polynomial"]
+
+#: Splats between two looks at which rows of a tile are finished.
+CHECK = 16
+
+_HALF = 0.5 * TILE
+
+# Where a splat has alpha >= 1/255 the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
+# pixel, and changes by at most 1/0.3 per pixel: a tile whose centre says more than this sees nothing.
+_STEEPEST = 1e3
+_DEEPEST = -1e4
+
+
+@inline
+def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float, bool]:
+    """Exponent of a splat around the point (x, y): c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
+
+    Returns:
+        c0, cx, cy, cxx, cxy, cyy, and whether anything of the splat can be seen in the tile there.
+    """
+    dx, dy = x - shape[i, 0], y - shape[i, 1]
+    a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
+    cx, cy = -(a * dx + b * dy), -(b * dx + c * dy)
+    c0 = 0.5 * (dx * cx + dy * cy)
+    seen = abs(cx) + abs(cy) < _STEEPEST and c0 > _DEEPEST
+    return c0, cx, cy, -0.5 * a, -b, -0.5 * c, seen
+
+
+@inline
+def alive_rows(T: Any, low: int, high: int) -> tuple[int, int]:
+    """Narrow a range of rows to those where some pixel is not finished."""
+    while low < high:
+        best = T[low, 0]
+        for x in range(1, TILE):
+            best = max(best, T[low, x])
+        if best > 0.0:
+            break
+        low += 1
+    while low < high:
+        best = T[high - 1, 0]
+        for x in range(1, TILE):
+            best = max(best, T[high - 1, x])
+        if best > 0.0:
+            break
+        high -= 1
+    return low, high
+
+
+@parallel_kernel(relaxed=True)
+def blend(
+    starts: Any,
+    ids: Any,
+    shape: Any,
+    box: Any,
+    tiles_x: int,
+    lanes: int,
+    limits: Any,
+    background: Any,
+    rgb: Any,
+    transmittance: Any,
+    depth: Any,
+    used: Any,
+) -> None:
+    """Blend the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+
+    Args:
+        starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
+        ids: [intersections] int32, splats, tile by tile, nearest first.
+        shape: [N, 10] float64, see `project`.
+        box: [N, 4] int32, see `project`.
+        tiles_x: tiles side by side.
+        lanes: how many threads share the tiles; the result does not depend on it.
+        limits: [3], smallest alpha, largest alpha, smallest transmittance; its dtype, float32 or
+            float64, is that of the pixels.
+        background: [3].
+        rgb: [H, W, 3], written.
+        transmittance: [H, W], written: what the background shines through with.
+        depth: [H, W], written: the sum of weight · depth.
+        used: [tiles] int64, written: the end of what was looked at of each tile.
+    """
+    height, width = transmittance.shape
+    for lane in numba.prange(lanes):
+        # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
+        # 16 transmittances, then 16 each of red, green, blue, depth; and the positions in a row.
+        planes = np.zeros((TILE, 6 * TILE), limits.dtype)
+        for x in range(TILE):
+            planes[:, 5 * TILE + x] = x + 0.5 - _HALF
+        alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+        zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+        for tile in range(lane, len(used), lanes):
+            X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+            columns, low, high = min(TILE, width - X0), 0, min(TILE, height - Y0)
+            planes[:, : 5 * TILE] = zero
+            planes[:, :columns] = one
+            planes[:, columns:TILE] = -one  # finished from the start: they are not on the picture
+            end = starts[tile + 1]
+            for k in range(starts[tile], end):
+                if (k - starts[tile]) % CHECK == CHECK - 1:
+                    low, high = alive_rows(planes, low, high)
+                    if low >= high:
+                        end = k
+                        break
+                i = ids[k]
+                c0, cx, cy, cxx, cxy, cyy, seen = tile_polynomial(shape, i, X0 + _HALF, Y0 + _HALF)
+                if not seen:
+                    continue
+                a, o = planes.dtype.type(cxx), planes.dtype.type(shape[i, 5])
+                r, g, b = planes.dtype.type(shape[i, 6]), planes.dtype.type(shape[i, 7]), planes.dtype.type(shape[i, 8])
+                d = planes.dtype.type(shape[i, 9])
+                for y in range(max(box[i, 2] - Y0, low), min(box[i, 3] - Y0, high)):
+                    dy = y + 0.5 - _HALF
+                    row0 = planes.dtype.type(c0 + dy * (cy + dy * cyy))
+                    row1 = planes.dtype.type(cx + dy * cxy)
+                    row = planes[y]
+                    for x in range(TILE):
+                        at = row[5 * TILE + x]
+                        power = (a * at + row1) * at + row0
+                        alpha = min(o * fast_exp(min(power, zero)), alpha_cap)
+                        alpha = alpha if alpha >= alpha_min else zero
+                        before = row[x]
+                        after = before * (one - alpha)
+                        going = after >= stop
+                        weight = alpha * before if going else zero
+                        row[x] = after if going else -abs(before)  # finished: negative from here on
+                        row[TILE + x] += weight * r
+                        row[2 * TILE + x] += weight * g
+                        row[3 * TILE + x] += weight * b
+                        row[4 * TILE + x] += weight * d
+            used[tile] = end
+            for y in range(min(TILE, height - Y0)):
+                for x in range(columns):
+                    left = abs(planes[y, x])
+                    rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + left * background[0]
+                    rgb[Y0 + y, X0 + x, 1] = planes[y, 2 * TILE + x] + left * background[1]
+                    rgb[Y0 + y, X0 + x, 2] = planes[y, 3 * TILE + x] + left * background[2]
+                    transmittance[Y0 + y, X0 + x] = left
+                    depth[Y0 + y, X0 + x] = planes[y, 4 * TILE + x]

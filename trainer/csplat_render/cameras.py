@@ -1,0 +1,176 @@
+"""Camera files, and cameras on a path: looking at a point, orbiting around it.
+
+A camera file is a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes,
+pixel centres at +0.5; `near` and `image` may be left out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.errors import InputError
+from csplat_render.camera import DEFAULT_NEAR, Camera
+
+__all__ = ["intrinsics", "load_cameras", "look_at", "orbit", "save_cameras"]
+
+F64 = NDArray[np.float64]
+
+_PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
+
+
+def load_cameras(path: str | Path) -> list[Camera]:
+    """Read a camera file.
+
+    Args:
+        path: a JSON file, see above.
+
+    Returns:
+        Its cameras, at least one.
+
+    Raises:
+        InputError: the file is absent, is not JSON, or holds something else than cameras.
+    """
+    path = Path(path)
+    try:
+        entries = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:  # JSON and UTF-8 errors alike
+        raise InputError(f"{path} is not a JSON file: {error}") from error
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path} is not a camera file, wanted a list of {{K, viewmat, W, H}}")
+    cameras = []
+    for number, entry in enumerate(entries):
+        try:
+            cameras.append(Camera.from_json(entry))
+        except InputError as error:
+            raise InputError(f"{path}, camera {number}: {error}") from error
+    return cameras
+
+
+def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
+    """Write a camera file that `load_cameras` reads back without loss."""
+    text = ",\n".join(json.dumps(camera.to_json(), allow_nan=False) for camera in cameras)
+    Path(path).write_text(f"[\n{text}\n]\n", "utf-8")
+
+
+def intrinsics(width: int, height: int, field_of_view: float) -> F64:
+    """K of a camera that looks through the middle of its picture.
+
+    Args:
+        width: pixels.
+        height: pixels.
+        field_of_view: across the width, degrees, above 0 and below 180.
+
+    Returns:
+        [3, 3] float64.
+    """
+    if not 0.0 < field_of_view < 180.0:
+        raise InputError(f"the field of view is {field_of_view:g} degrees, wanted above 0 and below 180")
+    focal = 0.5 * width / math.tan(math.radians(field_of_view) / 2.0)
+    return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+
+
+def look_at(
+    position: ArrayLike,
+    target: ArrayLike,
+    up: ArrayLike,
+    K: F64,
+    width: int,
+    height: int,
+    near: float = DEFAULT_NEAR,
+    image: str | None = None,
+) -> Camera:
+    """A camera at one point that looks at another.
+
+    Args:
+        position: [3], where it stands.
+        target: [3], what lies in the middle of the picture (at the principal point).
+        up: [3], what points upwards in the picture; where it is parallel to the line of sight, any
+            direction across is taken.
+        K: [3, 3], intrinsics.
+        width: pixels.
+        height: pixels.
+        near: near plane, scene units.
+        image: a name.
+
+    Raises:
+        InputError: position and target are the same point.
+    """
+    eye = np.array(position, np.float64)
+    forward = np.array(target, np.float64) - eye
+    length = math.sqrt(float(np.sum(forward**2)))
+    if not (math.isfinite(length) and length > 0.0):
+        raise InputError("a camera cannot look at the point where it stands")
+    forward = forward / length
+    right = np.cross(forward, np.array(up, np.float64))
+    if math.sqrt(float(np.sum(right**2))) <= _PARALLEL:
+        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right = right / math.sqrt(float(np.sum(right**2)))
+    down = np.cross(forward, right)
+    viewmat = np.eye(4)
+    for row, axis in enumerate((right, down, forward)):
+        viewmat[row, :3] = axis
+        viewmat[row, 3] = -float(np.sum(axis * eye))  # no BLAS: the same on any machine's threads
+    return Camera(K, viewmat, width, height, near, image)
+
+
+def direction(up: ArrayLike, azimuth: float, elevation: float) -> F64:
+    """A unit vector by its angles.
+
+    Args:
+        up: [3], unit length, which way is up.
+        azimuth: degrees around `up`, to the right-hand side.
+        elevation: degrees above the horizon.
+
+    Returns:
+        [3] float64. Azimuth 0 is an axis of the scene that lies most nearly across `up`.
+    """
+    u = np.array(up, np.float64)
+    first = np.eye(3)[int(np.argmin(np.abs(u)))]
+    first = first - u * float(np.sum(first * u))
+    first = first / math.sqrt(float(np.sum(first**2)))
+    second = np.cross(u, first)
+    a, e = math.radians(azimuth), math.radians(elevation)
+    result: F64 = (first * math.cos(a) + second * math.sin(a)) * math.cos(e) + u * math.sin(e)
+    return result
+
+
+def orbit(
+    centre: ArrayLike,
+    distance: float,
+    up: ArrayLike,
+    count: int,
+    K: F64,
+    width: int,
+    height: int,
+    *,
+    elevation: float = 20.0,
+    near: float = DEFAULT_NEAR,
+) -> list[Camera]:
+    """Cameras on a full circle around a point, all looking at it.
+
+    Args:
+        centre: [3], what they look at.
+        distance: from the centre, scene units, above 0.
+        up: [3], unit length, the axis of the circle.
+        count: how many; played in a loop they turn evenly.
+        K: [3, 3], intrinsics.
+        width: pixels.
+        height: pixels.
+        elevation: degrees above the horizon, above −90 and below 90.
+        near: near plane, scene units.
+    """
+    if count < 1:
+        raise InputError(f"an orbit of {count} cameras, wanted at least 1")
+    middle = np.array(centre, np.float64)
+    return [
+        look_at(middle + distance * direction(up, 360.0 * i / count, elevation), middle, up, K, width, height, near)
+        for i in range(count)
+    ]

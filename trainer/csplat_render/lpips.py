@@ -1,0 +1,231 @@
+"""LPIPS v0.1 with AlexNet (Zhang et al. 2018), a forward pass in NumPy.
+
+The weights are not part of this package. `load_lpips` looks for them
+
+1. in the file that is named, an .npz with the arrays `AlexNet_0/Conv_{0..4}/kernel` (height, width,
+   in, out), `…/bias`, and `NetLinLayer_{0..4}/Conv_0/kernel`;
+2. in the file that the environment variable CSPLAT_LPIPS names;
+3. in the user's cache, `csplat/lpips_alex.npz` under XDG_CACHE_HOME (else `~/.cache`);
+4. where PyTorch is installed: torchvision's AlexNet in torch's own cache, and the linear heads of an
+   installed `lpips` or `torchmetrics` package. Nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+
+__all__ = ["MIN_SIZE", "Lpips", "load_lpips", "save_lpips"]
+
+F32 = NDArray[np.float32]
+
+#: Smallest width and height of a picture, pixels: AlexNet has nothing left of a smaller one.
+MIN_SIZE = 31
+
+#: Where the weights are looked for after the file that is named.
+ENVIRONMENT = "CSPLAT_LPIPS"
+
+_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
+_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+_EPSILON = 1e-10
+_BLOCK = 1 << 23  # values of the matrix that a convolution multiplies at a time
+
+# Kernel (height, width, in, out), stride, padding, pooled before it.
+_LAYERS = (
+    ((11, 11, 3, 64), 4, 2, False),
+    ((5, 5, 64, 192), 1, 2, True),
+    ((3, 3, 192, 384), 1, 1, True),
+    ((3, 3, 384, 256), 1, 1, False),
+    ((3, 3, 256, 256), 1, 1, False),
+)
+_TORCH_INDEX = (0, 3, 6, 8, 10)  # of AlexNet's convolutions among torchvision's `features`
+
+
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """The weights of the five layers, and the distance that they make.
+
+    Attributes:
+        kernels: [height, width, in, out] each, float32.
+        biases: [out] each.
+        heads: [out] each, the weights of the differences of a layer's channels.
+        source: where they came from.
+    """
+
+    kernels: tuple[F32, ...]
+    biases: tuple[F32, ...]
+    heads: tuple[F32, ...]
+    source: str
+
+    def __post_init__(self) -> None:
+        for i, (shape, *_) in enumerate(_LAYERS):
+            for name, array, wanted in (
+                ("kernel", self.kernels[i], shape),
+                ("bias", self.biases[i], shape[-1:]),
+                ("head", self.heads[i], shape[-1:]),
+            ):
+                if array.shape != wanted or not np.isfinite(array).all():
+                    raise InputError(f"{self.source}: {name} {i} has shape {list(array.shape)}, wanted {list(wanted)}")
+
+    def __call__(self, reference: NDArray[Any], image: NDArray[Any]) -> float:
+        """Perceptual distance of two pictures, 0 where they are the same; lower is better.
+
+        Args:
+            reference: [H, W, 3] floating, clipped to [0, 1]; H and W at least `MIN_SIZE`.
+            image: the same.
+        """
+        if reference.shape != image.shape or reference.ndim != 3 or reference.shape[2] != 3:
+            raise InputError(
+                f"LPIPS of pictures of shapes {list(reference.shape)} and {list(image.shape)}, wanted [H, W, 3] twice"
+            )
+        if reference.dtype.kind != "f" or image.dtype.kind != "f":
+            raise InputError(f"LPIPS of {reference.dtype} and {image.dtype}, wanted floating values in 0 to 1")
+        if min(reference.shape[:2]) < MIN_SIZE:
+            raise InputError(f"LPIPS wants pictures of at least {MIN_SIZE}×{MIN_SIZE} pixels")
+        distance = 0.0
+        for a, b, head in zip(_features(reference, self), _features(image, self), self.heads, strict=True):
+            distance += float(np.mean(np.square(_unit(a) - _unit(b)) @ head.astype(np.float64)))
+        return distance
+
+
+def load_lpips(path: str | Path | None = None) -> Lpips:
+    """Find and read the weights, see above.
+
+    Args:
+        path: an .npz file; `None`: the usual places.
+
+    Raises:
+        InputError: the file is no such file, or there are no weights in any of the places.
+    """
+    if path is not None:
+        return _read(Path(path))
+    if named := os.environ.get(ENVIRONMENT):
+        return _read(Path(named))
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csplat" / "lpips_alex.npz"
+    if cache.is_file():
+        return _read(cache)
+    weights = _from_torch()
+    if weights is None:
+        raise InputError(
+            f"no LPIPS weights: neither {cache} nor a file named by {ENVIRONMENT}, nor (with PyTorch) torchvision's "
+            "AlexNet in torch's cache beside an installed lpips package"
+        )
+    return weights
+
+
+def save_lpips(path: str | Path, weights: Lpips) -> None:
+    """Write weights as the .npz file that `load_lpips` reads without PyTorch."""
+    arrays: dict[str, Any] = {}
+    for i in range(len(_LAYERS)):
+        arrays[f"AlexNet_0/Conv_{i}/kernel"] = weights.kernels[i]
+        arrays[f"AlexNet_0/Conv_{i}/bias"] = weights.biases[i]
+        arrays[f"NetLinLayer_{i}/Conv_0/kernel"] = weights.heads[i][None, None, :, None]
+    np.savez(path, **arrays)
+
+
+def _read(path: Path) -> Lpips:
+    count = range(len(_LAYERS))
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Lpips(
+                kernels=tuple(file[f"AlexNet_0/Conv_{i}/kernel"].astype(np.float32) for i in count),
+                biases=tuple(file[f"AlexNet_0/Conv_{i}/bias"].astype(np.float32) for i in count),
+                heads=tuple(file[f"NetLinLayer_{i}/Conv_0/kernel"].astype(np.float32).reshape(-1) for i in count),
+                source=str(path),
+            )
+    except OSError as error:
+        raise InputError(f"LPIPS weights {path}: {error.strerror or error}") from error
+    except (ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is not an .npz file of LPIPS weights") from error
+    except KeyError as error:
+        raise InputError(f"{path} holds no LPIPS weights: {error.args[0]}") from error
+
+
+def _from_torch() -> Lpips | None:
+    """Weights from torch's cache; `None` where a part of them, or torch, is absent.
+
+    Torch is imported by name so that nothing of this package depends on it.
+    """
+    if importlib.util.find_spec("torch") is None:
+        return None
+    heads_path = _heads_path()
+    torch: Any = importlib.import_module("torch")
+    backbones = sorted((Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
+    if heads_path is None or not backbones:
+        return None
+    backbone = torch.load(backbones[-1], map_location="cpu", weights_only=True)
+    heads = torch.load(heads_path, map_location="cpu", weights_only=True)
+    try:
+        return Lpips(
+            # torch: out, in, height, width
+            kernels=tuple(
+                np.ascontiguousarray(backbone[f"features.{i}.weight"].numpy().transpose(2, 3, 1, 0))
+                for i in _TORCH_INDEX
+            ),
+            biases=tuple(backbone[f"features.{i}.bias"].numpy() for i in _TORCH_INDEX),
+            heads=tuple(heads[f"lin{i}.model.1.weight"].numpy().reshape(-1) for i in range(len(_LAYERS))),
+            source=f"{backbones[-1]} and {heads_path}",
+        )
+    except KeyError as error:
+        raise InputError(f"{backbones[-1]} and {heads_path} hold no LPIPS weights: {error.args[0]}") from error
+
+
+def _heads_path() -> Path | None:
+    """The linear heads that an installed package brings along."""
+    for package, inside in (
+        ("lpips", "weights/v0.1/alex.pth"),
+        ("torchmetrics", "functional/image/lpips_models/alex.pth"),
+    ):
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin is not None and (path := Path(spec.origin).parent / inside).is_file():
+            return path
+    return None
+
+
+def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
+    """What AlexNet sees after each of its five convolutions, [h, w, channels] each."""
+    x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - _SHIFT) / _SCALE
+    features = []
+    for (_, stride, padding, pooled), kernel, bias in zip(_LAYERS, weights.kernels, weights.biases, strict=True):
+        x = np.maximum(_convolve(_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
+        features.append(x)
+    return features
+
+
+def _unit(x: F32) -> NDArray[np.float64]:
+    """Every pixel's channels scaled to length 1."""
+    wide = x.astype(np.float64)
+    result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
+    return result
+
+
+def _convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
+    """Convolution of [h, w, in] as a matrix product, some rows of the result at a time."""
+    height, width, inputs, outputs = kernel.shape
+    padded = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
+    windows = sliding_window_view(padded, (height, width), axis=(0, 1))[::stride, ::stride]
+    windows = windows.transpose(0, 1, 3, 4, 2)  # rows, columns, height, width, in
+    matrix = kernel.reshape(-1, outputs)
+    result = np.empty((*windows.shape[:2], outputs), np.float32)
+    step = max(1, _BLOCK // (windows.shape[1] * height * width * inputs))
+    for start in range(0, len(result), step):
+        block = windows[start : start + step]
+        result[start : start + step] = block.reshape(*block.shape[:2], -1) @ matrix
+    return result + bias
+
+
+def _pool(x: F32) -> F32:
+    """Maximum over 3×3, every second pixel."""
+    result: F32 = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
+    return result

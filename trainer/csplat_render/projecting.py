@@ -1,0 +1,239 @@
+"""From splats to ellipses on the picture, in float64: the kernel and the pieces that its gradient shares.
+
+With p and q the two rows of the linearised perspective times the camera's rotation (both in world
+coordinates), r_k the axes of the splat and s_k its standard deviations, the projected half-axes are
+u_k = s_k r_k·p and v_k = s_k r_k·q, and the covariance is (u·u, u·v; u·v, v·v) + dilation. Its
+determinant is computed as |u×v|² + dilation (u·u + v·v) + dilation², with (u×v)_k = s_i s_j
+r_k·(p×q): sums of squares, which lose nothing however long and thin the splat is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from csplat_render.conventions import COMPENSATION_MIN, DILATION, LOG_SCALE_LIMIT
+from csplat_render.harmonics import sh_basis
+from csplat_render.jit import inline, parallel_kernel
+
+__all__ = ["BLOCK", "compensation", "determinants", "direction", "perspective", "project", "rotation", "rows"]
+
+#: Splats that one thread takes at a time.
+BLOCK = 512
+
+
+@inline
+def rotation(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
+    """Rotation matrix of a unit quaternion, row by row; its columns are the splat's axes."""
+    return (
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+
+
+@inline
+def unit(q: Any) -> tuple[float, float, float, float, float]:
+    """A quaternion at unit length, and 1 / its length; zero is the identity, with 0."""
+    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    squared = w * w + x * x + y * y + z * z
+    if squared == 0.0:
+        return 1.0, 0.0, 0.0, 0.0, 0.0
+    inverse = 1.0 / math.sqrt(squared)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@inline
+def deviation(log_scale: float) -> float:
+    """Standard deviation of a log-scale, which is clamped."""
+    return math.exp(min(max(np.float64(log_scale), -LOG_SCALE_LIMIT), LOG_SCALE_LIMIT))
+
+
+@inline
+def perspective(view: Any, x: float, y: float, z: float) -> tuple[float, float, float, float, bool, bool]:
+    """Jacobian of the perspective: (j0, 0, j02; 0, j1, j12); and whether x/z and y/z were inside the limits."""
+    tx, ty = x / z, y / z
+    inside_x = view[17] < tx < view[18]
+    inside_y = view[19] < ty < view[20]
+    tx = min(max(tx, view[17]), view[18])
+    ty = min(max(ty, view[19]), view[20])
+    return view[12] / z, -view[12] * tx / z, view[13] / z, -view[13] * ty / z, inside_x, inside_y
+
+
+@inline
+def rows(view: Any, j0: float, j02: float, j1: float, j12: float) -> tuple[float, float, float, float, float, float]:
+    """The rows p and q: Jacobian times the camera's rotation."""
+    return (
+        j0 * view[0] + j02 * view[6],
+        j0 * view[1] + j02 * view[7],
+        j0 * view[2] + j02 * view[8],
+        j1 * view[3] + j12 * view[6],
+        j1 * view[4] + j12 * view[7],
+        j1 * view[5] + j12 * view[8],
+    )
+
+
+@inline
+def determinants(pq: Any, r: Any, s0: float, s1: float, s2: float, trace: float) -> tuple[float, float]:
+    """Determinant of the projected covariance, without and with the dilation."""
+    c0 = pq[1] * pq[5] - pq[2] * pq[4]
+    c1 = pq[2] * pq[3] - pq[0] * pq[5]
+    c2 = pq[0] * pq[4] - pq[1] * pq[3]
+    w0 = s1 * s2 * (r[0] * c0 + r[3] * c1 + r[6] * c2)
+    w1 = s2 * s0 * (r[1] * c0 + r[4] * c1 + r[7] * c2)
+    w2 = s0 * s1 * (r[2] * c0 + r[5] * c1 + r[8] * c2)
+    bare = w0 * w0 + w1 * w1 + w2 * w2
+    return bare, bare + DILATION * trace + DILATION * DILATION
+
+
+@inline
+def compensation(bare: float, dilated: float) -> float:
+    """Factor of the opacity in the antialiased mode: what the dilation added, taken off again."""
+    return math.sqrt(max(bare / dilated, COMPENSATION_MIN))
+
+
+@inline
+def direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
+    """Direction from the camera to a point, of unit length, and 1 / the distance."""
+    x, y, z = mean[0] - view[21], mean[1] - view[22], mean[2] - view[23]
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@inline
+def finite_row(i: int, means: Any, quats: Any, scales: Any, opacities: Any, sh0: Any, shN: Any, higher: int) -> bool:
+    """Whether everything that is used of a splat is finite."""
+    total = np.float64(opacities[i])
+    for k in range(3):
+        total += abs(np.float64(means[i, k])) + abs(np.float64(scales[i, k])) + abs(np.float64(sh0[i, k]))
+    for k in range(4):
+        total += abs(np.float64(quats[i, k]))
+    for k in range(higher):
+        total += abs(np.float64(shN[i, k, 0])) + abs(np.float64(shN[i, k, 1])) + abs(np.float64(shN[i, k, 2]))
+    return math.isfinite(total)
+
+
+@parallel_kernel()
+def project(
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    sh0: Any,
+    shN: Any,
+    degree: int,
+    view: Any,
+    width: int,
+    height: int,
+    antialiased: bool,
+    alpha_min: float,
+    shape: Any,
+    extent: Any,
+    box: Any,
+    depth: Any,
+    radii: Any,
+    ignored: Any,
+) -> None:
+    """Project every splat; parallel over blocks of splats, one splat at a time.
+
+    Args:
+        means: [N, 3], float32 or float64, as the next five.
+        quats: [N, 4], of any length.
+        scales: [N, 3], logarithms.
+        opacities: [N], alpha.
+        sh0: [N, 3].
+        shN: [N, K, 3], K at least (degree + 1)**2 - 1.
+        degree: of the spherical harmonics that are evaluated.
+        view: [24], see `view_vector`.
+        width: of the picture.
+        height: of the picture.
+        antialiased: compensate the dilation.
+        alpha_min: what is too faint to draw.
+        shape: [N, 10] float64, written for splats in view: centre x and y, inverse covariance a
+            b c, opacity, red, green, blue, depth.
+        extent: [N, 6] float64, written, of the ellipse of `alpha_min`: how far the middle of its
+            chord moves per row, its half-width at the height of the centre, 1 / its half-height,
+            the height at which it reaches farthest to the right; centre x and y.
+        box: [N, 4] int32, written: x0, x1, y0, y1 of the pixels that it may touch, x1 and y1 beyond.
+        depth: [N] float32, written: 0 for what is not drawn.
+        radii: [N] float32, written: 3 standard deviations along the longest axis; 0 as above.
+        ignored: [ceil(N / BLOCK)] int64, written: how many splats held NaN or infinity.
+    """
+    n = means.shape[0]
+    higher = (degree + 1) * (degree + 1) - 1
+    for block in numba.prange((n + BLOCK - 1) // BLOCK):
+        basis = np.empty(16, np.float64)
+        bad = 0
+        for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            depth[i], radii[i] = 0.0, 0.0
+            if not finite_row(i, means, quats, scales, opacities, sh0, shN, higher):
+                bad += 1
+                continue
+            X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+            z = view[6] * X + view[7] * Y + view[8] * Z + view[11]
+            if not (z > view[16] and opacities[i] >= alpha_min):
+                continue
+            x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
+            y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
+            qw, qx, qy, qz, _ = unit(quats[i])
+            r = rotation(qw, qx, qy, qz)
+            s0, s1, s2 = deviation(scales[i, 0]), deviation(scales[i, 1]), deviation(scales[i, 2])
+            j0, j02, j1, j12, _, _ = perspective(view, x, y, z)
+            pq = rows(view, j0, j02, j1, j12)
+            u0 = s0 * (r[0] * pq[0] + r[3] * pq[1] + r[6] * pq[2])
+            u1 = s1 * (r[1] * pq[0] + r[4] * pq[1] + r[7] * pq[2])
+            u2 = s2 * (r[2] * pq[0] + r[5] * pq[1] + r[8] * pq[2])
+            v0 = s0 * (r[0] * pq[3] + r[3] * pq[4] + r[6] * pq[5])
+            v1 = s1 * (r[1] * pq[3] + r[4] * pq[4] + r[7] * pq[5])
+            v2 = s2 * (r[2] * pq[3] + r[5] * pq[4] + r[8] * pq[5])
+            A = u0 * u0 + u1 * u1 + u2 * u2
+            B = u0 * v0 + u1 * v1 + u2 * v2
+            C = v0 * v0 + v1 * v1 + v2 * v2
+            bare, dilated = determinants(pq, r, s0, s1, s2, A + C)
+            A += DILATION
+            C += DILATION
+            opacity = np.float64(opacities[i])
+            if antialiased:
+                opacity *= compensation(bare, dilated)
+            px = view[12] * (x / z) + view[14]
+            py = view[13] * (y / z) + view[15]
+            if not (opacity >= alpha_min and math.isfinite(dilated) and math.isfinite(px) and math.isfinite(py)):
+                continue
+            # opacity · exp(−½ d²) = alpha_min; a little more, so that rounding never takes a pixel away.
+            reach = math.sqrt(2.0 * math.log(opacity / alpha_min)) * (1.0 + 1e-6) + 1e-6
+            rx, ry = reach * math.sqrt(A), reach * math.sqrt(C)
+            x0 = math.ceil(min(max(px - rx - 0.5, 0.0), np.float64(width)))
+            x1 = math.floor(min(max(px + rx + 0.5, 0.0), np.float64(width)))
+            y0 = math.ceil(min(max(py - ry - 0.5, 0.0), np.float64(height)))
+            y1 = math.floor(min(max(py + ry + 0.5, 0.0), np.float64(height)))
+            if x1 <= x0 or y1 <= y0:
+                continue
+            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
+            shape[i, 0], shape[i, 1] = px, py
+            shape[i, 2], shape[i, 3], shape[i, 4] = C / dilated, -B / dilated, A / dilated
+            shape[i, 5] = opacity
+            extent[i, 0], extent[i, 1], extent[i, 2] = B / C, reach * math.sqrt(dilated / C), 1.0 / ry
+            extent[i, 3], extent[i, 4], extent[i, 5] = rx * (B / A), px, py
+            dx, dy, dz, _ = direction(view, means[i])
+            sh_basis(degree, dx, dy, dz, basis)
+            for c in range(3):
+                colour = 0.5 + basis[0] * sh0[i, c]
+                for k in range(higher):
+                    colour += basis[k + 1] * shN[i, k, c]
+                shape[i, 6 + c] = max(colour, 0.0)
+            shape[i, 9] = z
+            near32 = np.float32(z)
+            if math.isfinite(near32):
+                depth[i] = near32
+                half = 0.5 * (A - C)
+                radii[i] = 3.0 * math.sqrt(0.5 * (A + C) + math.sqrt(half * half + B * B))
+        ignored[block] = bad

@@ -1,0 +1,194 @@
+"""The exact twin: the same pictures straight from the equations, in float64 NumPy, slow.
+
+Every splat is evaluated at every pixel. It shares the conventions with the rasteriser and none of
+its means: no tiles, no bounds, no fast exponential. What a comparison decides (too faint, capped,
+finished, clamped, which splat is nearer) can be recorded and held fast, so that a finite difference
+sees a smooth function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.model import sh_degree_of
+from csplat_render.arrays import HasSplats, RenderResult
+from csplat_render.camera import Camera
+from csplat_render.conventions import (
+    ALPHA_CAP,
+    ALPHA_MIN,
+    COMPENSATION_MIN,
+    DILATION,
+    FOV_MARGIN,
+    LOG_SCALE_LIMIT,
+    TRANSMITTANCE_MIN,
+)
+from csplat_render.harmonics import sh_basis
+from csplat_render.jit import python
+
+__all__ = ["Decisions", "render_exact"]
+
+Array = NDArray[Any]
+
+_CHUNK = 64  # splats that are evaluated at all pixels at a time
+
+
+@dataclass
+class Decisions:
+    """What the comparisons of one picture decided; handed to `render_exact` again, it is not asked anew."""
+
+    order: Array | None = None
+    masks: list[Array] = field(default_factory=list)
+    _next: int = -1
+
+    def ask(self, mask: Array) -> Array:
+        """Record a comparison's outcome, or return what was recorded for it."""
+        if self._next < 0:
+            self.masks.append(mask)
+            return mask
+        self._next += 1
+        return self.masks[self._next - 1]
+
+    def replay(self) -> None:
+        """From the first comparison on, answer what was recorded."""
+        self._next = 0
+
+
+def render_exact(
+    splats: HasSplats,
+    camera: Camera,
+    *,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    antialiased: bool = False,
+    sh_degree: int | None = None,
+    decisions: Decisions | None = None,
+) -> RenderResult:
+    """Render a picture as `Rasteriser.forward` does, from the equations.
+
+    Args:
+        splats: what to render.
+        camera: from where.
+        background: red, green, blue behind everything.
+        antialiased: scale opacities by what the dilation added.
+        sh_degree: highest degree of the spherical harmonics; None for all there are.
+        decisions: records the outcomes of all comparisons; if it holds some, they are used.
+
+    Returns:
+        The picture, float64; `intersections` is 0.
+    """
+    decisions = Decisions() if decisions is None else decisions
+    available = sh_degree_of(splats.shN.shape[1])
+    degree = available if sh_degree is None else min(sh_degree, available)
+    with np.errstate(all="ignore"):
+        order, drawn, ignored = _project(splats, camera, degree, antialiased, decisions)
+        rgb, transmittance, depth = _blend(drawn, camera, decisions)
+    rgb += transmittance[..., None] * np.asarray(background, np.float64)
+    radii = np.zeros(len(splats.means), np.float32)
+    radii[order] = 3.0 * np.sqrt(np.linalg.eigvalsh(drawn["covariance"])[:, 1])
+    return RenderResult(rgb, 1.0 - transmittance, depth, radii, len(order), 0, ignored)
+
+
+def _project(
+    splats: HasSplats, camera: Camera, degree: int, antialiased: bool, decisions: Decisions
+) -> tuple[Array, dict[str, Array], int]:
+    """Centre, inverse covariance, opacity, colour and depth of what is in front, nearest first."""
+    coefficients = np.concatenate([splats.sh0[:, None], splats.shN[:, : (degree + 1) ** 2 - 1]], 1, dtype=np.float64)
+    arrays = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], coefficients]
+    finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], axis=0)
+    index = np.flatnonzero(finite)
+    means, quats, scales, opacities, coefficients = (np.asarray(array[index], np.float64) for array in arrays)
+
+    # Camera coordinates, term by term: a matrix product may round otherwise, and order is decided by it.
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    X, Y, Z = means.T
+    x, y, z = (R[k, 0] * X + R[k, 1] * Y + R[k, 2] * Z + t[k] for k in range(3))
+    if decisions.order is None:
+        order = np.argsort(z.astype(np.float32), kind="stable")
+        decisions.order = order[(z[order] > camera.near) & (z[order].astype(np.float32) < np.inf)]
+    order = decisions.order
+    means, scales, coefficients, x, y, z = (v[order] for v in (means, scales, coefficients, x, y, z))
+    opacity = opacities[order, 0]
+
+    # Σ = M Mᵀ with M = rotation · deviations; its image under the linearised perspective is T M Mᵀ Tᵀ.
+    w, i, j, k = _unit(quats[order]).T
+    rotation = np.array(
+        [
+            [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)],
+            [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)],
+            [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)],
+        ]
+    ).transpose(2, 0, 1)
+    M = rotation * np.exp(np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))[:, None, :]
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    tx = _clamp(x / z, fx, cx, camera.W, decisions)
+    ty = _clamp(y / z, fy, cy, camera.H, decisions)
+    zero = np.zeros_like(z)
+    jacobian = np.array([[fx / z, zero, -fx * tx / z], [zero, fy / z, -fy * ty / z]]).transpose(2, 0, 1)
+    half_axes = jacobian @ R @ M
+    bare_covariance = half_axes @ half_axes.transpose(0, 2, 1)
+    covariance = bare_covariance + DILATION * np.eye(2)
+    # Cauchy–Binet: the determinant of A Aᵀ is the sum of the squared 2 × 2 minors of A.
+    minors = np.cross(half_axes[:, 0], half_axes[:, 1])
+    bare = (minors * minors).sum(1)
+    dilated = bare + DILATION * np.trace(bare_covariance, axis1=1, axis2=2) + DILATION**2
+    if antialiased:
+        ratio = bare / dilated
+        opacity = opacity * np.sqrt(np.where(decisions.ask(ratio > COMPENSATION_MIN), ratio, COMPENSATION_MIN))
+
+    direction = means - camera.position
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    basis = np.empty(((degree + 1) ** 2, len(z)))
+    python(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
+    colour = np.einsum("kn,nkc->nc", basis, coefficients) + 0.5
+    colour = np.where(decisions.ask(colour > 0.0), colour, 0.0)
+    drawn = {
+        "centre": np.stack([fx * x / z + cx, fy * y / z + cy], 1),
+        "covariance": covariance,
+        "a": covariance[:, 1, 1] / dilated,
+        "b": -covariance[:, 0, 1] / dilated,
+        "c": covariance[:, 0, 0] / dilated,
+        "opacity": opacity,
+        "colour": colour,
+        "depth": z,
+    }
+    return index[order], drawn, int(np.count_nonzero(~finite))
+
+
+def _unit(quats: Array) -> Array:
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(length > 0.0, quats / length, [1.0, 0.0, 0.0, 0.0])
+
+
+def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
+    """Limit x/z or y/z to a little more than what the picture shows."""
+    margin = FOV_MARGIN * 0.5 * size / focal
+    low, high = -centre / focal - margin, (size - centre) / focal + margin
+    return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)
+
+
+def _blend(drawn: dict[str, Array], camera: Camera, decisions: Decisions) -> tuple[Array, Array, Array]:
+    """Colour, transmittance and depth of every pixel."""
+    ys, xs = np.mgrid[: camera.H, : camera.W].reshape(2, -1) + 0.5
+    before = np.ones(len(xs))
+    rgb, depth = np.zeros((len(xs), 3)), np.zeros(len(xs))
+    going = np.ones(len(xs), bool)
+    for start in range(0, len(drawn["depth"]), _CHUNK):
+        part = {name: values[start : start + _CHUNK, None] for name, values in drawn.items()}
+        dx, dy = xs - part["centre"][..., 0], ys - part["centre"][..., 1]
+        power = -0.5 * (part["a"] * dx * dx + 2.0 * part["b"] * dx * dy + part["c"] * dy * dy)
+        alpha = part["opacity"] * np.exp(np.minimum(power, 0.0))
+        alpha = np.where(decisions.ask(alpha < ALPHA_CAP), alpha, ALPHA_CAP)
+        alpha = np.where(decisions.ask(alpha >= ALPHA_MIN), alpha, 0.0)
+        after = before * np.cumprod(1.0 - alpha, axis=0)
+        seen = decisions.ask(going & (after >= TRANSMITTANCE_MIN))
+        through = np.concatenate([before[None], after[:-1]])
+        weight = np.where(seen, alpha * through, 0.0)
+        rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])
+        depth += (weight * part["depth"]).sum(0)
+        count = seen.sum(0)  # once a pixel is finished it stays so: the last one seen is the count-th
+        before = np.where(count > 0, np.take_along_axis(after, np.maximum(count - 1, 0)[None], 0)[0], before)
+        going = seen[-1]
+    return rgb.reshape(camera.H, camera.W, 3), before.reshape(camera.H, camera.W), depth.reshape(camera.H, camera.W)

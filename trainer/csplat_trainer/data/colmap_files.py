@@ -1,0 +1,240 @@
+"""COLMAP's sparse models, binary and text: cameras, images, points3D."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat_trainer.data.dataset import Lens
+
+__all__ = ["ColmapImage", "read_cameras", "read_images", "read_points"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+# Number in binary files, name, how many parameters. Those with a lens below are supported.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapImage:
+    """A registered picture.
+
+    Attributes:
+        name: path below the folder of pictures.
+        camera: id of its camera.
+        viewmat: [4, 4] float64, world to camera; COLMAP's axes are OpenCV's.
+    """
+
+    name: str
+    camera: int
+    viewmat: F64
+
+
+def read_cameras(path: Path) -> dict[int, Lens]:
+    """Read cameras.bin or cameras.txt.
+
+    Args:
+        path: the file; its ending tells which.
+
+    Raises:
+        InputError: the file is damaged, or holds a lens that cannot be undone here.
+    """
+    cameras = {}
+    if path.suffix == ".txt":
+        for words, where in _lines(path):
+            numbers = _numbers(words[2:], where)
+            if len(numbers) < 2:
+                raise InputError(f"{where}: wanted id, model, width, height, parameters")
+            cameras[_integer(words[0], where)] = _lens(words[1], numbers[0], numbers[1], numbers[2:], where)
+        return cameras
+    data = _Bytes(path)
+    for _ in range(data.count(24)):
+        number, model, width, height = data.unpack("<iiQQ")
+        if model not in _MODELS:
+            raise InputError(f"{path}: camera {number} has the unknown model {model}")
+        name, parameters = _MODELS[model]
+        values = [float(value) for value in data.unpack(f"<{parameters}d")]
+        cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
+    data.end()
+    return cameras
+
+
+def read_images(path: Path) -> list[ColmapImage]:
+    """Read images.bin or images.txt; the matches of each picture are skipped."""
+    images = []
+    if path.suffix == ".txt":
+        # Two lines each, of which the second may be empty.
+        for words, where in _lines(path, every=2):
+            if len(words) < 10:
+                raise InputError(f"{where}: wanted id, rotation, translation, camera and name")
+            pose = _numbers(words[1:8], where)
+            images.append(ColmapImage(" ".join(words[9:]), _integer(words[8], where), _viewmat(pose, where)))
+        return images
+    data = _Bytes(path)
+    for _ in range(data.count(73)):
+        number, *pose, camera = data.unpack("<i7di")
+        name = data.string()
+        (matches,) = data.unpack("<Q")
+        data.skip(24 * matches)
+        images.append(ColmapImage(name, camera, _viewmat(pose, f"{path}, image {number}")))
+    data.end()
+    return images
+
+
+def read_points(path: Path) -> tuple[F32, F32]:
+    """Read points3D.bin or points3D.txt.
+
+    Returns:
+        Points, [P, 3] float32, and their colours, [P, 3] float32 in 0..1. Points that are not
+        finite are left out.
+    """
+    points: list[tuple[float, ...]] = []
+    if path.suffix == ".txt":
+        for words, where in _lines(path):
+            if len(words) < 7:
+                raise InputError(f"{where}: wanted id, position and colour")
+            points.append(tuple(_numbers(words[1:7], where)))
+    else:
+        data = _Bytes(path)
+        for _ in range(data.count(51)):
+            _, x, y, z, red, green, blue, _, track = data.unpack("<Q3d3BdQ")
+            data.skip(8 * track)
+            points.append((x, y, z, red, green, blue))
+        data.end()
+    table = np.array(points, np.float64).reshape(-1, 6)
+    table = table[np.isfinite(table).all(axis=1)]
+    return table[:, :3].astype(np.float32), (np.clip(table[:, 3:], 0.0, 255.0) / 255.0).astype(np.float32)
+
+
+class _Bytes:
+    """A binary file that is read from front to back, never beyond its end."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or error}") from error
+        self._path = path
+        self._at = 0
+
+    def unpack(self, layout: str) -> tuple[Any, ...]:
+        size = struct.calcsize(layout)
+        self._need(size)
+        values = struct.unpack_from(layout, self._data, self._at)
+        self._at += size
+        return values
+
+    def count(self, smallest: int) -> int:
+        """The number of records that follow, each of at least `smallest` bytes."""
+        count = int(self.unpack("<Q")[0])
+        self._need(count * smallest)
+        return count
+
+    def string(self) -> str:
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise InputError(f"{self._path} ends within a name at byte {self._at}")
+        text = self._data[self._at : end].decode("utf-8", "replace")
+        self._at = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        self._need(size)
+        self._at += size
+
+    def end(self) -> None:
+        if self._at != len(self._data):
+            raise InputError(f"{self._path}: {len(self._data) - self._at} bytes follow its last record")
+
+    def _need(self, size: int) -> None:
+        if size > len(self._data) - self._at:
+            raise InputError(f"{self._path} ends at byte {len(self._data)}, wanted {size} more from byte {self._at}")
+
+
+def _lines(path: Path, every: int = 1) -> Iterator[tuple[list[str], str]]:
+    """Words of the lines that are no comments, and where they stand."""
+    try:
+        text = path.read_text("utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file") from error
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+    for i, (number, line) in enumerate(lines):
+        if i % every == 0 and line.strip():
+            yield line.split(), f"{path}, line {number}"
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _integer(word: str, where: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise InputError(f"{where}: {word!r} is not an id") from None
+
+
+def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
+    match model, values:
+        case "SIMPLE_PINHOLE", [f, cx, cy]:
+            lens = Lens(width, height, f, f, cx, cy)
+        case "PINHOLE", [fx, fy, cx, cy]:
+            lens = Lens(width, height, fx, fy, cx, cy)
+        case "SIMPLE_RADIAL", [f, cx, cy, k]:
+            lens = Lens(width, height, f, f, cx, cy, (k, 0.0, 0.0, 0.0))
+        case "RADIAL", [f, cx, cy, k1, k2]:
+            lens = Lens(width, height, f, f, cx, cy, (k1, k2, 0.0, 0.0))
+        case "OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2]:
+            lens = Lens(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
+        case _:
+            raise InputError(
+                f"{where}: the lens {model} with {len(values)} parameters is not supported; wanted PINHOLE, "
+                "SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV (COLMAP's image_undistorter makes PINHOLE of others)"
+            )
+    if not (width >= 1 and height >= 1 and lens.fx > 0 and lens.fy > 0 and np.isfinite(values).all()):
+        raise InputError(f"{where}: the lens {model} has a size or focal length that is no number above 0")
+    return lens
+
+
+def _viewmat(pose: list[float] | tuple[float, ...], where: str) -> F64:
+    """A matrix of a rotation w x y z and a translation."""
+    q, t = np.array(pose[:4], np.float64), np.array(pose[4:7], np.float64)
+    length = float(np.linalg.norm(q))
+    if not (np.isfinite(length) and length > 0.0 and np.isfinite(t).all()):
+        raise InputError(f"{where}: the pose is not finite or its rotation is zero")
+    w, x, y, z = q / length
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = t
+    return viewmat

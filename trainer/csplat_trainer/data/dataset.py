@@ -1,0 +1,149 @@
+"""`DataSet`, and what all readers share: shots that are not read yet, their split, the near plane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat_render.camera import DEFAULT_NEAR
+from csplat_trainer.pictures import Picture
+
+__all__ = ["DataSet", "Found", "Lens", "Shot", "near_plane", "split_every"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_NEAR = 0.03  # of the cameras' distance from what they look at
+
+
+@dataclass(frozen=True, eq=False)
+class DataSet:
+    """Posed pictures to train on and to judge by.
+
+    Attributes:
+        name: kind and place, for messages: `COLMAP set /data/garden`.
+        train: pictures to learn from, at least one.
+        test: pictures that were held out; none if the set is too small or names none.
+        points: [P, 3] float32, points of the scene; `None` where the set has none.
+        points_rgb: [P, 3] float32 in 0..1, their colours.
+        report: what was found, left out and changed, a line each.
+    """
+
+    name: str
+    train: list[Picture]
+    test: list[Picture]
+    points: F32 | None = None
+    points_rgb: F32 | None = None
+    report: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole with OpenCV's radial and tangential distortion, for pictures of one size.
+
+    Attributes:
+        width: of the pictures that the numbers are meant for, pixels.
+        height: the same.
+        fx: focal length across, pixels.
+        fy: focal length down, pixels.
+        cx: principal point, pixels; the centre of the first pixel lies at 0.5.
+        cy: the same.
+        distortion: k1, k2, p1, p2.
+    """
+
+    width: float
+    height: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The same lens for pictures of another size; each axis is scaled by itself."""
+        x, y = width / self.width, height / self.height
+        return Lens(width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.distortion)
+
+    @property
+    def distorts(self) -> bool:
+        """Whether it is more than a pinhole."""
+        return any(value != 0.0 for value in self.distortion)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A picture that is known but not read.
+
+    Attributes:
+        name: as the set writes it.
+        path: the file.
+        lens: how it was taken.
+        viewmat: [4, 4] float64, world to camera, OpenCV axes.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    viewmat: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a reader found: everything but the pixels.
+
+    Attributes:
+        kind: `Blender set`, …
+        train: shots to train on.
+        test: shots that are held out.
+        points: [P, 3] float32 or `None`.
+        points_rgb: [P, 3] float32 in 0..1 or `None`.
+        report: lines for the user.
+    """
+
+    kind: str
+    train: list[Shot]
+    test: list[Shot]
+    points: F32 | None = None
+    points_rgb: F32 | None = None
+    report: list[str] = field(default_factory=list)
+
+
+def split_every(shots: Sequence[Shot], every: int) -> tuple[list[Shot], list[Shot]]:
+    """Hold out the first and then every so-manieth shot, in the order of their names.
+
+    Args:
+        shots: all that were found.
+        every: 8 is the custom; 0 holds out none.
+
+    Returns:
+        Shots to train on, shots to test on.
+    """
+    if every < 0 or every == 1:
+        raise InputError(f"a test picture every {every} pictures, wanted 2 or more, or 0 for none")
+    ordered = sorted(shots, key=lambda shot: shot.name)
+    if every == 0 or len(ordered) < 2:
+        return ordered, []
+    return [s for i, s in enumerate(ordered) if i % every], ordered[::every]
+
+
+def near_plane(shots: Sequence[Shot]) -> float:
+    """A near plane that suits a set: a small part of the distance to what its cameras look at.
+
+    Scene units are arbitrary where poses come from photographs; the renderer's default, which it
+    never exceeds, may lie beyond the scene.
+    """
+    rotations = np.stack([shot.viewmat[:3, :3] for shot in shots])
+    positions = -np.einsum("nji,nj->ni", rotations, np.stack([shot.viewmat[:3, 3] for shot in shots]))
+    axes = rotations[:, 2]
+    # The point nearest to all lines of sight; a little of the middle keeps parallel lines solvable.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    left = across.sum(axis=0) + 1e-6 * len(shots) * np.eye(3)
+    right = np.einsum("nij,nj->i", across, positions) + 1e-6 * len(shots) * positions.mean(axis=0)
+    focus = np.linalg.solve(left, right)
+    distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
+    return min(DEFAULT_NEAR, _NEAR * distance) if distance > 0.0 else DEFAULT_NEAR

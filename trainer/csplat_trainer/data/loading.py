@@ -1,0 +1,90 @@
+"""`load`: recognise a data set, read it, say what was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from csplat.errors import InputError
+from csplat_render.camera import MAX_IMAGE_SIZE
+from csplat_trainer.data.colmap import find_model, read_colmap
+from csplat_trainer.data.dataset import DataSet, Found, near_plane
+from csplat_trainer.data.pixels import read_picture, undistorted_lens
+from csplat_trainer.data.transforms import read_blender, read_transforms
+
+__all__ = ["load"]
+
+
+def load(
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    *,
+    images: str | None = None,
+    test_every: int = 8,
+    near: float | None = None,
+) -> DataSet:
+    """Read a data set of posed pictures.
+
+    | recognised by | kind |
+    |---|---|
+    | `transforms_train.json` | NeRF-synthetic, made with Blender; RGBA |
+    | `transforms.json` | instant-ngp, nerfstudio; OpenCV distortion is undone |
+    | `sparse/0/cameras.bin` or `.txt` | COLMAP, as Mip-NeRF 360, Tanks and Temples, Deep Blending are laid out |
+
+    Args:
+        path: its folder, or the `transforms.json`.
+        size: width and height to bring all pictures to, each axis by itself; `None`: as they are.
+        images: COLMAP sets: which folder of pictures, `images_4`; `None`: `images`, or with `size`
+            the smallest that is large enough.
+        test_every: which share is held out where the set names no test pictures; 0: none.
+        near: near plane of the cameras, scene units; `None`: one that suits the set.
+
+    Returns:
+        All pictures, undistorted and in memory, with their cameras.
+
+    Raises:
+        InputError: there is no data set, it is damaged, or it holds no pictures.
+    """
+    path = Path(path)
+    if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
+        raise InputError(f"pictures of {size[0]}×{size[1]} pixels, wanted 1 to {MAX_IMAGE_SIZE} each way")
+    found = _find(path, size, images, test_every)
+    if not found.train:
+        raise InputError(f"{path} leaves no pictures to train on")
+    shots = [*found.train, *found.test]
+    near = near_plane(shots) if near is None else near
+    train = [read_picture(shot, size, near) for shot in found.train]
+    test = [read_picture(shot, size, near) for shot in found.test]
+    name = f"{found.kind} {path}"
+    sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
+    shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
+    points = "" if found.points is None else f", {len(found.points)} points"
+    report = [f"{name}: {len(train)} training and {len(test)} test pictures of {shown} pixels{points}", *found.report]
+    if any(shot.lens.distorts for shot in shots):
+        zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
+        report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
+    return DataSet(name, train, test, found.points, found.points_rgb, tuple(report))
+
+
+def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> Found:
+    if path.is_file() and path.suffix == ".json":
+        if path.name == "transforms_train.json":
+            return read_blender(path.parent)
+        return read_transforms(path, test_every)
+    if not path.is_dir():
+        raise InputError(f"{path} is neither a folder nor a transforms.json")
+    model = find_model(path)
+    if (path / "transforms_train.json").is_file():
+        found = read_blender(path)
+    elif (path / "transforms.json").is_file():
+        found = read_transforms(path / "transforms.json", test_every)
+    elif model is not None:
+        return read_colmap(path, model, size, images, test_every)
+    else:
+        raise InputError(
+            f"{path} is no data set: wanted transforms_train.json (Blender), transforms.json (instant-ngp) "
+            "or sparse/0/cameras.bin (COLMAP)"
+        )
+    if model is not None:
+        found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
+    return found

@@ -1,0 +1,141 @@
+"""From a shot to a picture: read the file, undo the lens, change the size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from csplat.errors import InputError
+from csplat_render.camera import Camera
+from csplat_trainer.data.dataset import Lens, Shot
+from csplat_trainer.pictures import Picture
+
+__all__ = ["find_image", "image_size", "read_picture", "undistorted_lens"]
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
+_ZOOM_STEP = 0.005
+_MAX_ZOOM = 1.5
+_BORDER_POINTS = 65
+
+
+def read_picture(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture:
+    """Read a shot's file.
+
+    Args:
+        shot: which.
+        size: width and height of the picture; `None`: the file's.
+        near: the camera's near plane, scene units.
+
+    Returns:
+        The picture, undistorted, RGBA where the file has transparency.
+
+    Raises:
+        InputError: the file is no image, or its lens cannot be undone.
+    """
+    image = _open(shot.path)
+    lens = shot.lens.scaled(*image.size)
+    pixels: U8 = np.asarray(image)
+    if lens.distorts:
+        straight = undistorted_lens(lens)
+        pixels = _undistort(pixels, lens, straight)
+        lens = straight
+    if size is not None and size != image.size:
+        # Bicubic, as INRIA's loader; its negative lobes would push colours beyond a clipped alpha.
+        method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
+        pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
+        lens = lens.scaled(*size)
+    K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+    height, width = pixels.shape[:2]
+    camera = Camera(K, shot.viewmat, width, height, near, shot.name)
+    return Picture(camera, np.ascontiguousarray(pixels))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file; its pixels are not read."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path} is not an image that can be read: {error}") from error
+
+
+def find_image(path: Path) -> Path | None:
+    """The file itself, or one with another ending in its place; `None` where there is none."""
+    if path.is_file():
+        return path
+    candidates = [path.with_name(path.name + ending) for ending in _ENDINGS]
+    candidates += [path.with_suffix(ending) for ending in _ENDINGS]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def undistorted_lens(lens: Lens) -> Lens:
+    """The pinhole that a lens's pictures are straightened to.
+
+    The focal lengths grow, in steps of half a per cent, until every pixel of the straight picture
+    lies within the distorted one: nothing has to be invented at the border.
+
+    Raises:
+        InputError: no reasonable zoom achieves that: the numbers describe no such lens.
+    """
+    zoom = 1.0
+    while zoom <= _MAX_ZOOM:
+        straight = Lens(lens.width, lens.height, lens.fx * zoom, lens.fy * zoom, lens.cx, lens.cy)
+        if _border_is_inside(lens, straight):
+            return straight
+        zoom += _ZOOM_STEP
+    raise InputError(f"the distortion {lens.distortion} cannot be undone over the whole picture")
+
+
+def _open(path: Path) -> Image.Image:
+    """An image in RGB or RGBA, eight bits, as it is stored: poses know nothing of EXIF rotation."""
+    try:
+        with Image.open(path) as image:
+            transparent = "A" in image.getbands() or "transparency" in image.info
+            return image.convert("RGBA" if transparent else "RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path} is not an image that can be read: {error}") from error
+
+
+def _border_is_inside(lens: Lens, straight: Lens) -> bool:
+    u = np.linspace(0.5, lens.width - 0.5, _BORDER_POINTS)
+    v = np.linspace(0.5, lens.height - 0.5, _BORDER_POINTS)
+    ends_u, ends_v = np.repeat(u[[0, -1]], _BORDER_POINTS), np.repeat(v[[0, -1]], _BORDER_POINTS)
+    x, y = _distort(np.concatenate([ends_u, u, u]), np.concatenate([np.tile(v, 2), ends_v]), lens, straight)
+    margin = 0.5 - 1e-6  # half a pixel beyond the centres the border's colour still holds
+    inside = (x >= 0.5 - margin) & (x <= lens.width - 0.5 + margin)
+    inside &= (y >= 0.5 - margin) & (y <= lens.height - 0.5 + margin)
+    return bool(inside.all())
+
+
+def _distort(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
+    """Where pixels of the straight picture lie in the distorted one (OpenCV's model)."""
+    x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
+    k1, k2, p1, p2 = lens.distortion
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * k2)
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return lens.fx * xd + lens.cx, lens.fy * yd + lens.cy
+
+
+def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
+    """Straighten a picture, linear between pixels, colours weighted by their alpha."""
+    height, width = pixels.shape[:2]
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    x, y = _distort(u, v, lens, straight)
+    channels = [pixels[..., i].astype(np.float64) for i in range(pixels.shape[2])]
+    if len(channels) == 4:
+        channels[:3] = [channel * channels[3] for channel in channels[:3]]
+    at = np.stack([y - 0.5, x - 0.5])
+    moved = [map_coordinates(channel, at, order=1, mode="nearest") for channel in channels]
+    if len(moved) == 4:
+        moved[:3] = [channel / np.maximum(moved[3], 1e-3) for channel in moved[:3]]
+    result: U8 = np.clip(np.rint(np.stack(moved, axis=2)), 0, 255).astype(np.uint8)
+    return result

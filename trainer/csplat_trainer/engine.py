@@ -1,0 +1,192 @@
+"""One training step: picture, loss, gradients, Adam, noise; on the CPU, without torch."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numba import prange
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from csplat_render.camera import Camera
+from csplat_render.rasterise import Rasteriser, Splats
+from csplat_trainer.densify import ScreenGradients
+from csplat_trainer.kernels import parallel_kernel
+from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
+from csplat_trainer.mcmc import add_noise
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.parameters import Parameters, adam_step
+from csplat_trainer.perceptual import PerceptualLoss
+from csplat_trainer.pictures import Picture, compose
+
+__all__ = ["CpuEngine", "Engine"]
+
+F32 = NDArray[np.float32]
+
+
+class Engine(Protocol):
+    """What trains: the numba kernels of the CPU, or gsplat's on a GPU."""
+
+    screen: ScreenGradients | None
+
+    @property
+    def parameters(self) -> Parameters:
+        """The state of the optimisation, in the memory of the CPU."""
+        ...
+
+    @parameters.setter
+    def parameters(self, parameters: Parameters) -> None:
+        """Go on from another state."""
+        ...
+
+    def step(
+        self, picture: Picture, background: F32, degree: int, rates: dict[str, float], rng: Generator
+    ) -> LossValue:
+        """Make one step of training on one picture."""
+        ...
+
+    def render(self, camera: Camera, background: F32, degree: int) -> F32:
+        """The picture at present, [H, W, 3]."""
+        ...
+
+
+class CpuEngine:
+    """Training steps in numba; all buffers are kept from one step to the next.
+
+    Args:
+        parameters: where to start; changed in place by `step`.
+        options: weights of the loss, antialiasing, noise.
+        perceptual: a further term of the loss.
+
+    Attributes:
+        parameters: the state of the optimisation.
+        screen: gradients on screen since it was last replaced, where the strategy wants them.
+    """
+
+    def __init__(self, parameters: Parameters, options: TrainOptions, perceptual: PerceptualLoss | None = None) -> None:
+        self.parameters = parameters
+        self.screen = ScreenGradients.none(len(parameters)) if options.strategy == "gradient" else None
+        self._options = options
+        self._perceptual = perceptual
+        self._samples = options.strategy in ("mcmc", "fixed")
+        self._rasteriser = Rasteriser("standard", np.float32)
+        self._losses: dict[tuple[int, int], tuple[PhotometricLoss, F32]] = {}
+        self._alphas = self._logit_gradient = np.empty(0, np.float32)
+        self._normals = np.empty((0, 3), np.float32)
+
+    def step(
+        self, picture: Picture, background: F32, degree: int, rates: dict[str, float], rng: Generator
+    ) -> LossValue:
+        """Make one step of training on one picture.
+
+        Args:
+            picture: what the splats are to look like.
+            background: [3], behind both.
+            degree: of the SH bands that are evaluated.
+            rates: learning rate of each group of parameters.
+            rng: makes the noise.
+
+        Returns:
+            The photometric figures before the step.
+        """
+        options, camera = self._options, picture.camera
+        loss, photograph = self._loss_for(camera)
+        compose(picture, background, photograph)
+        rgb = self._forward(camera, background, degree)
+        value, slope = loss(rgb, photograph)
+        if self._perceptual is not None:
+            slope += self._perceptual.gradient(rgb, photograph, options.lpips_weight)
+        gradients = self._rasteriser.backward(slope)
+        values, count = self.parameters.values, max(1, len(self.parameters))
+        _chain(
+            self._alphas,
+            gradients.opacities,
+            values["scales"],
+            gradients.scales,
+            np.float32(options.opacity_weight / count if self._samples else 0.0),
+            np.float32(options.scale_weight / (3 * count) if self._samples else 0.0),
+            self._logit_gradient,
+        )
+        if self.screen is not None:
+            self.screen.add(_half_pictures(gradients.means2d, camera), gradients.radii > 0)
+        steps = {
+            "means": gradients.means,
+            "quats": gradients.quats,
+            "scales": gradients.scales,
+            "logits": self._logit_gradient,
+            "sh0": gradients.sh0,
+            "shN": gradients.shN,
+        }
+        adam_step(self.parameters, steps, rates)
+        if self._samples and options.noise > 0.0:
+            if self._normals.shape != values["means"].shape:
+                self._normals = np.empty_like(values["means"])
+            rng.standard_normal(out=self._normals, dtype=np.float32)
+            add_noise(self.parameters, options.noise * rates["means"], self._normals)
+        return value
+
+    def render(self, camera: Camera, background: F32, degree: int) -> F32:
+        """The picture at present, [H, W, 3]; a buffer that the next picture overwrites."""
+        return self._forward(camera, background, degree)
+
+    def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
+        v = self.parameters.values
+        if len(self._alphas) != len(v["logits"]):
+            self._alphas, self._logit_gradient = np.empty_like(v["logits"]), np.empty_like(v["logits"])
+        _activate(v["logits"], self._alphas)
+        splats = Splats(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
+        result = self._rasteriser.forward(
+            splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree
+        )
+        return result.rgb
+
+    def _loss_for(self, camera: Camera) -> tuple[PhotometricLoss, F32]:
+        """Loss and photograph buffer of a size of picture."""
+        size = (camera.H, camera.W)
+        if size not in self._losses:
+            weights = LOSS_WEIGHTS[self._options.loss]
+            self._losses[size] = PhotometricLoss(*size, *weights), np.empty((*size, 3), np.float32)
+        return self._losses[size]
+
+
+def _half_pictures(norms: F32, camera: Camera) -> F32:
+    """Gradient norms per pixel as norms per half a picture, which thresholds are stated in."""
+    return norms * np.float32(0.5 * max(camera.W, camera.H))
+
+
+@parallel_kernel(relaxed=True)
+def _activate(logits: F32, alphas: F32) -> None:
+    """Opacities of logits; vectorises over splats."""
+    one = np.float32(1.0)
+    for i in prange(len(logits)):
+        alphas[i] = one / (one + np.exp(-logits[i]))
+
+
+@parallel_kernel(relaxed=True)
+def _chain(
+    alphas: F32,
+    by_alpha: F32,
+    scales: F32,
+    by_scale: F32,
+    opacity_weight: np.float32,
+    scale_weight: np.float32,
+    by_logit: F32,
+) -> None:
+    """From opacities to logits, plus the gradients of both regularisers; vectorises over splats.
+
+    Args:
+        alphas: [N].
+        by_alpha: [N], gradient by opacity.
+        scales: [N, 3], logarithms.
+        by_scale: [N, 3], gradient by log-scale; the regulariser's is added.
+        opacity_weight: of the sum of opacities.
+        scale_weight: of the sum of standard deviations.
+        by_logit: [N], written.
+    """
+    for i in prange(len(alphas)):
+        alpha = alphas[i]
+        by_logit[i] = (by_alpha[i] + opacity_weight) * alpha * (np.float32(1.0) - alpha)
+        if scale_weight > np.float32(0.0):
+            for k in range(3):
+                by_scale[i, k] += scale_weight * np.exp(scales[i, k])

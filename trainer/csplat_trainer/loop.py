@@ -1,0 +1,287 @@
+"""`train`: from pictures to splats."""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import PCG64, Generator
+from numpy.typing import NDArray
+
+import csplat
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.lpips import Lpips, load_lpips
+from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from csplat_trainer.data import DataSet
+from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
+from csplat_trainer.engine import CpuEngine, Engine
+from csplat_trainer.evaluate import evaluate
+from csplat_trainer.mcmc import grow, relocate
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.outputs import Outputs, TrainResult
+from csplat_trainer.parameters import Parameters, to_model
+from csplat_trainer.perceptual import PerceptualLoss
+from csplat_trainer.pictures import compose
+from csplat_trainer.report import Progress, peak_memory, save_picture, side_by_side
+from csplat_trainer.resume import adapt
+from csplat_trainer.starting import Scene, scene_of, starting_splats
+
+__all__ = ["train"]
+
+F32 = NDArray[np.float32]
+
+_COLOURS = {"black": 0.0, "white": 1.0, "random": 1.0}  # random: what evaluations are in front of
+_RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
+_FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
+
+
+def train(
+    data: DataSet,
+    options: TrainOptions | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    outputs: Outputs | None = None,
+) -> TrainResult:
+    """Train splats on pictures.
+
+    The same pictures, options and library versions give the same splats on the same machine, at
+    any number of threads.
+
+    Args:
+        data: pictures, and points of the scene where they are known.
+        options: how.
+        progress: told every `log_every` steps.
+        outputs: checkpoints and early pictures.
+
+    Raises:
+        InputError: there is no picture, an option does not suit the data, or a file is not what it
+            is said to be.
+
+    """
+    run = _Run(data, options or TrainOptions(), outputs or Outputs())
+    return run.to_the_end(progress)
+
+
+@dataclass
+class _Window:
+    """Steps since the last entry of the log."""
+
+    losses: list[float] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+
+class _Run:
+    """A run: the engine, the random numbers, the log."""
+
+    def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
+        if not data.train:
+            raise InputError("there is no picture to train on")
+        self._data, self._options, self._outputs = data, options, outputs
+        self._scene = scene_of(data.train)
+        self._rng = Generator(PCG64(options.seed))
+        self._iteration = 0
+        self._queue: list[int] = []
+        self._log: dict[str, Any] = {"entries": [], "evaluations": [], "losses": [], "seconds": 0.0}
+        if outputs.resume is None:
+            parameters = Parameters.starting_at(self._start(self._scene))
+            self._log["growth"] = options.growth_from(len(parameters))
+        else:
+            parameters = self._go_on(load_checkpoint(outputs.resume))
+        self._lpips = _lpips(options, outputs)
+        self._engine = _engine(parameters, options, self._lpips)
+        self._background = np.full(3, _COLOURS[options.background], np.float32)
+
+    def to_the_end(self, progress: Callable[[Progress], None] | None) -> TrainResult:
+        options, outputs = self._options, self._outputs
+        window = _Window()
+        spent = float(self._log["seconds"])  # by what was resumed
+        begin, first = time.perf_counter(), self._iteration
+        while self._iteration < options.iterations:
+            self._iteration += 1
+            step = self._iteration
+            degree = options.active_degree(step - 1)
+            value = self._step(degree)
+            window.losses.append(value[0])
+            window.errors.append(value[1])
+            if options.refines_after(step):
+                self._refine()
+            seconds = time.perf_counter() - begin
+            if step % options.log_every == 0 or step == options.iterations:
+                left = seconds / (step - first) * (options.iterations - step)
+                now = self._entry(window, degree, spent + seconds, left)
+                window = _Window()
+                if progress is not None:
+                    progress(now)
+            if options.eval_every and step % options.eval_every == 0 and step < options.iterations and self._data.test:
+                self._evaluate(options.eval_views)
+            if outputs.preview_due(step, options.iterations):
+                self._preview(degree)
+            if outputs.checkpoint is not None and outputs.checkpoint_every and step % outputs.checkpoint_every == 0:
+                self._log["seconds"] = spent + time.perf_counter() - begin
+                self._save()
+        self._log["seconds"] = spent + time.perf_counter() - begin
+        if outputs.checkpoint is not None:
+            self._save()
+        metrics = self._evaluate(options.eval_views) if self._data.test else None
+        return TrainResult(self._model(), self._full_log(metrics), metrics)
+
+    def _start(self, scene: Scene) -> dict[str, F32]:
+        options, data = self._options, self._data
+        count = options.initial_splats
+        if count == 0 and options.strategy in ("fixed", "none"):
+            count = options.max_splats
+        if count == 0:
+            points = 0 if data.points is None or options.init in ("hull", "box") else len(data.points)
+            count = points or max(1, int(_FIRST_SHARE * options.max_splats))
+        return starting_splats(
+            data.train,
+            scene,
+            min(count, options.max_splats),
+            options.sh_degree,
+            self._rng,
+            init=options.init,
+            points=data.points,
+            colours=data.points_rgb,
+        )
+
+    def _go_on(self, checkpoint: Checkpoint) -> Parameters:
+        options = self._options
+        self._rng.bit_generator.state = checkpoint.rng_state
+        self._iteration = checkpoint.iteration
+        self._queue = [index for index in checkpoint.queue if index < len(self._data.train)]
+        self._log |= checkpoint.log
+        return adapt(checkpoint.parameters, options, self._rng)
+
+    def _step(self, degree: int) -> tuple[float, float]:
+        if not self._queue:
+            self._queue = self._rng.permutation(len(self._data.train)).tolist()
+        picture = self._data.train[self._queue.pop()]
+        background = self._background
+        if self._options.background == "random":
+            background = self._rng.random(3, dtype=np.float32)
+        rates = self._options.learning_rates(self._iteration, self._scene.extent)
+        value = self._engine.step(picture, background, degree, rates, self._rng)
+        if not math.isfinite(value.loss):
+            raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
+        self._log["losses"].append(float(f"{value.loss:.6g}"))
+        return value.loss, value.mse
+
+    def _refine(self) -> None:
+        options, parameters = self._options, self._engine.parameters
+        if options.strategy == "gradient":
+            assert self._engine.screen is not None
+            densify(
+                parameters,
+                self._engine.screen,
+                self._scene.extent,
+                options.grad_threshold,
+                options.max_splats,
+                options.dead_opacity,
+                self._rng,
+            )
+            if self._iteration % _RESET_EVERY == 0 and self._iteration + _RESET_EVERY / 2 < options.iterations:
+                reset_opacities(parameters)
+            self._engine.screen = ScreenGradients.none(len(parameters))
+        else:
+            relocate(parameters, options.dead_opacity, self._rng)
+            if options.strategy == "mcmc":
+                grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
+        self._engine.parameters = parameters
+
+    def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> Progress:
+        mse = sum(window.errors) / len(window.errors)
+        now = Progress(
+            iteration=self._iteration,
+            iterations=self._options.iterations,
+            loss=sum(window.losses) / len(window.losses),
+            psnr=99.0 if mse <= 10.0**-9.9 else -10.0 * math.log10(mse),
+            splat_count=len(self._engine.parameters),
+            sh_degree=degree,
+            seconds=seconds,
+            seconds_left=left,
+        )
+        entry = asdict(now)
+        del entry["iterations"], entry["seconds_left"]
+        self._log["entries"].append(entry)
+        return now
+
+    def _evaluate(self, views: int) -> dict[str, Any]:
+        degree = self._options.active_degree(self._iteration)
+        test = list(self._data.test)
+        if views and views < len(test):
+            test = [test[index * len(test) // views] for index in range(views)]
+        metrics = evaluate(
+            lambda camera: self._engine.render(camera, self._background, degree), test, self._background, self._lpips
+        )
+        self._log["evaluations"].append({"iteration": self._iteration, **metrics})
+        return metrics
+
+    def _preview(self, degree: int) -> None:
+        assert self._outputs.previews is not None
+        folder = Path(self._outputs.previews)
+        folder.mkdir(parents=True, exist_ok=True)
+        picture = (self._data.test or self._data.train)[0]
+        size = (picture.camera.H, picture.camera.W, 3)
+        photograph = compose(picture, self._background, np.empty(size, np.float32))
+        rendered = self._engine.render(picture.camera, self._background, degree)
+        save_picture(folder / f"{self._iteration:06d}.png", side_by_side(photograph, rendered))
+
+    def _save(self) -> None:
+        assert self._outputs.checkpoint is not None
+        save_checkpoint(
+            self._outputs.checkpoint,
+            Checkpoint(
+                self._iteration,
+                self._engine.parameters,
+                dict(self._rng.bit_generator.state),
+                self._queue,
+                asdict(self._options),
+                self._log,
+            ),
+        )
+
+    def _model(self) -> SplatModel:
+        return to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
+
+    def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
+        return {
+            "csplat": csplat.__version__,
+            "machine": platform.machine(),
+            "options": asdict(self._options),
+            "train_views": len(self._data.train),
+            "test_views": len(self._data.test),
+            "splat_count": len(self._engine.parameters),
+            "scene_extent": self._scene.extent,
+            "peak_memory_bytes": peak_memory(),
+            "metrics": metrics,
+            **self._log,
+        }
+
+
+def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
+    """Weights of LPIPS where they are at hand; a loss that wants them must have them."""
+    try:
+        return load_lpips(outputs.lpips_weights)
+    except InputError:
+        if options.lpips_weight > 0.0 or outputs.lpips_weights is not None:
+            raise
+        return None
+
+
+def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) -> Engine:
+    if options.device == "cpu":
+        wanted = options.lpips_weight > 0.0 and lpips is not None
+        return CpuEngine(parameters, options, PerceptualLoss(lpips) if wanted and lpips is not None else None)
+    if options.lpips_weight > 0.0:
+        raise InputError("the perceptual loss runs on the CPU alone: wanted --device cpu, or no --lpips-weight")
+    try:
+        from csplat_trainer.cuda import CudaEngine
+    except ImportError:
+        raise InputError("device cuda: torch is not installed (pip install 'csplat[train]')") from None
+    return CudaEngine(parameters, options)

@@ -1,0 +1,271 @@
+"""The photometric loss, L1 and SSIM in one pass, with its gradient.
+
+    loss = l1_weight · mean |x − y| + ssim_weight · (1 − mean SSIM(x, y))
+
+SSIM is that of the INRIA trainer: an 11×11 Gaussian window of σ 1.5, zeros beyond the border,
+C1 = 0.01², C2 = 0.03², the mean over all pixels and channels. Both windows of the literature's
+losses are a choice of weights: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of simple strategies).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from csplat_trainer.kernels import parallel_kernel, relaxed_kernel
+
+__all__ = ["LOSS_WEIGHTS", "LossValue", "PhotometricLoss", "photometric_loss_twin"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+#: Weights of L1 and of 1 − SSIM, by the name of the option.
+LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}
+
+_C1, _C2 = 0.01**2, 0.03**2
+_SIGMA = 1.5
+_RADIUS = 5
+_PAD = 3 * _RADIUS  # values on either side of a row; three channels lie beside each other
+
+
+def _window() -> F64:
+    taps = np.exp(-(np.arange(-_RADIUS, _RADIUS + 1) ** 2) / (2.0 * _SIGMA**2))
+    normalised: F64 = taps / taps.sum()
+    return normalised
+
+
+_WINDOW = _window()
+_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(tap) for tap in _WINDOW[_RADIUS:])  # centre, then outwards
+
+
+@dataclass(frozen=True)
+class LossValue:
+    """What one call of `PhotometricLoss` found.
+
+    Attributes:
+        loss: the weighted sum.
+        l1: mean absolute difference.
+        ssim: mean SSIM.
+        mse: mean squared difference.
+    """
+
+    loss: float
+    l1: float
+    ssim: float
+    mse: float
+
+    @property
+    def psnr(self) -> float:
+        """PSNR in dB for a peak of 1, at most 99."""
+        return 99.0 if self.mse <= 10.0**-9.9 else -10.0 * math.log10(self.mse)
+
+
+class PhotometricLoss:
+    """L1 + SSIM against photographs of one size; its buffers are kept between calls.
+
+    Args:
+        height: of the pictures, in pixels.
+        width: of the pictures, in pixels.
+        l1_weight: factor of the mean absolute difference.
+        ssim_weight: factor of 1 − SSIM.
+    """
+
+    def __init__(self, height: int, width: int, l1_weight: float = 0.8, ssim_weight: float = 0.2) -> None:
+        self.l1_weight, self.ssim_weight = float(l1_weight), float(ssim_weight)
+        self._shape = (height, width, 3)
+        rows, row = height + 2 * _RADIUS, 3 * width
+        self._across = np.zeros((5, rows, row), np.float32)  # blurred along the rows; zeros above and below
+        self._partial = np.zeros((3, height, row + 2 * _PAD), np.float32)  # zeros left and right
+        self._partial_across = np.zeros((3, rows, row), np.float32)
+        self._sums = np.zeros((height, 3), np.float64)
+        self._gradient = np.empty(self._shape, np.float32)
+
+    def __call__(self, rendered: F32, photograph: F32) -> tuple[LossValue, F32]:
+        """Compare two pictures.
+
+        Args:
+            rendered: [H, W, 3], C-contiguous.
+            photograph: [H, W, 3], C-contiguous.
+
+        Returns:
+            The figures, and the gradient of `loss` by `rendered`, [H, W, 3]: a buffer that the next
+            call overwrites.
+        """
+        assert rendered.shape == self._shape == photograph.shape
+        flat = (self._shape[0], 3 * self._shape[1])
+        x, y = rendered.reshape(flat), photograph.reshape(flat)
+        gradient = self._gradient.reshape(flat)
+        count = x.size
+        l1_step = np.float32(self.l1_weight / count)
+        if self.ssim_weight != 0.0:
+            _blur_products(x, y, self._across)
+            _ssim_partials(x, y, self._across, self._partial, self._sums)
+            _blur_partials(self._partial, self._partial_across)
+            _combine(x, y, self._partial_across, l1_step, np.float32(-self.ssim_weight / count), gradient)
+        else:
+            _l1_alone(x, y, l1_step, gradient, self._sums)
+        l1, ssim, mse = (float(value) / count for value in self._sums.sum(axis=0))
+        loss = self.l1_weight * l1 + (self.ssim_weight * (1.0 - ssim) if self.ssim_weight != 0.0 else 0.0)
+        return LossValue(loss, l1, ssim, mse), self._gradient
+
+
+@relaxed_kernel
+def _blur_across(row: F32, out: F32) -> None:
+    """Blur a row that has five pixels of zeros on either side; vectorises over its values."""
+    for i in range(out.shape[0]):
+        out[i] = (
+            _W0 * row[i + 15]
+            + _W1 * (row[i + 12] + row[i + 18])
+            + _W2 * (row[i + 9] + row[i + 21])
+            + _W3 * (row[i + 6] + row[i + 24])
+            + _W4 * (row[i + 3] + row[i + 27])
+            + _W5 * (row[i] + row[i + 30])
+        )
+
+
+@parallel_kernel(relaxed=True)
+def _blur_products(x: F32, y: F32, across: F32) -> None:
+    """Blur x, y, x², y², xy along each row; vectorises over the values of a row."""
+    height, width = x.shape
+    for r in prange(height):
+        rows = np.zeros((5, width + 2 * _PAD), np.float32)
+        a, b, aa, bb, ab = rows[0], rows[1], rows[2], rows[3], rows[4]
+        for i in range(width):
+            u, v = x[r, i], y[r, i]
+            a[i + _PAD] = u
+            b[i + _PAD] = v
+            aa[i + _PAD] = u * u
+            bb[i + _PAD] = v * v
+            ab[i + _PAD] = u * v
+        for f in range(5):
+            _blur_across(rows[f], across[f, r + _RADIUS])
+
+
+@parallel_kernel(relaxed=True)
+def _ssim_partials(x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
+    """SSIM of each value, its derivatives by mean, square and product; vectorises over a row."""
+    height, width = x.shape
+    c1, c2, two, one = np.float32(_C1), np.float32(_C2), np.float32(2.0), np.float32(1.0)
+    for r in prange(height):
+        moments = np.empty((5, width), np.float32)
+        for f in range(5):
+            _blur_down(across[f], r, moments[f])
+        m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
+        p0, p1, p2 = partial[0, r], partial[1, r], partial[2, r]
+        ssim_sum, l1_sum, square_sum = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for i in range(width):
+            mx, my = m1[i], m2[i]
+            a = two * mx * my + c1
+            b = two * (e12[i] - mx * my) + c2
+            c = mx * mx + my * my + c1
+            d = (e11[i] - mx * mx) + (e22[i] - my * my) + c2
+            over_cd = one / (c * d)
+            ssim = a * b * over_cd
+            by_square = -ssim / d
+            by_product = two * a * over_cd
+            p0[i + _PAD] = two * my * b * over_cd - two * mx * ssim / c - two * mx * by_square - my * by_product
+            p1[i + _PAD] = two * by_square
+            p2[i + _PAD] = by_product
+            difference = x[r, i] - y[r, i]
+            ssim_sum += ssim
+            l1_sum += abs(difference)
+            square_sum += difference * difference
+        sums[r, 0] = l1_sum
+        sums[r, 1] = ssim_sum
+        sums[r, 2] = square_sum
+
+
+@relaxed_kernel
+def _blur_down(field: F32, r: int, out: F32) -> None:
+    """Blur across the rows r .. r + 10 of a field; vectorises over the values of a row."""
+    for i in range(out.shape[0]):
+        out[i] = (
+            _W0 * field[r + 5, i]
+            + _W1 * (field[r + 4, i] + field[r + 6, i])
+            + _W2 * (field[r + 3, i] + field[r + 7, i])
+            + _W3 * (field[r + 2, i] + field[r + 8, i])
+            + _W4 * (field[r + 1, i] + field[r + 9, i])
+            + _W5 * (field[r, i] + field[r + 10, i])
+        )
+
+
+@parallel_kernel(relaxed=True)
+def _blur_partials(partial: F32, across: F32) -> None:
+    """Blur the three derivatives along each row; vectorises over the values of a row."""
+    for r in prange(partial.shape[1]):
+        for f in range(3):
+            _blur_across(partial[f, r], across[f, r + _RADIUS])
+
+
+@parallel_kernel(relaxed=True)
+def _combine(x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32) -> None:
+    """Blur the derivatives across the rows and add the gradient of L1; vectorises over a row."""
+    height, width = x.shape
+    for r in prange(height):
+        blurred = np.empty((3, width), np.float32)
+        for f in range(3):
+            _blur_down(across[f], r, blurred[f])
+        p0, p1, p2 = blurred[0], blurred[1], blurred[2]
+        for i in range(width):
+            difference = x[r, i] - y[r, i]
+            ssim = p0[i] + x[r, i] * p1[i] + y[r, i] * p2[i]
+            gradient[r, i] = l1_step * np.sign(difference) + ssim_step * ssim
+
+
+@parallel_kernel(relaxed=True)
+def _l1_alone(x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
+    """L1 and squared error of each row; vectorises over the values of a row."""
+    height, width = x.shape
+    for r in prange(height):
+        l1_sum, square_sum = np.float32(0.0), np.float32(0.0)
+        for i in range(width):
+            difference = x[r, i] - y[r, i]
+            l1_sum += abs(difference)
+            square_sum += difference * difference
+            gradient[r, i] = l1_step * np.sign(difference)
+        sums[r, 0] = l1_sum
+        sums[r, 1] = np.nan  # not computed
+        sums[r, 2] = square_sum
+
+
+def photometric_loss_twin(
+    rendered: F64, photograph: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
+) -> tuple[LossValue, F64]:
+    """The slow twin of `PhotometricLoss`: float64, whole pictures, one formula after the other.
+
+    Args:
+        rendered: [H, W, 3].
+        photograph: [H, W, 3].
+        l1_weight: factor of the mean absolute difference.
+        ssim_weight: factor of 1 − SSIM.
+
+    Returns:
+        The figures, and the gradient of `loss` by `rendered`, [H, W, 3].
+    """
+    x, y = rendered.astype(np.float64), photograph.astype(np.float64)
+    m1, m2 = _blur_twin(x), _blur_twin(y)
+    s11, s22, s12 = _blur_twin(x * x) - m1 * m1, _blur_twin(y * y) - m2 * m2, _blur_twin(x * y) - m1 * m2
+    a, b, c, d = 2 * m1 * m2 + _C1, 2 * s12 + _C2, m1 * m1 + m2 * m2 + _C1, s11 + s22 + _C2
+    ssim = a * b / (c * d)
+    by_square, by_product = -ssim / d, 2 * a / (c * d)
+    by_mean = 2 * m2 * b / (c * d) - 2 * m1 * ssim / c - 2 * m1 * by_square - m2 * by_product
+    # The window is symmetric, so that the transpose of the blur is the blur.
+    ssim_gradient = _blur_twin(by_mean) + 2 * x * _blur_twin(by_square) + y * _blur_twin(by_product)
+    gradient = (l1_weight * np.sign(x - y) - ssim_weight * ssim_gradient) / x.size
+    l1, mean_ssim, mse = float(np.abs(x - y).mean()), float(ssim.mean()), float(np.square(x - y).mean())
+    return LossValue(l1_weight * l1 + ssim_weight * (1 - mean_ssim), l1, mean_ssim, mse), gradient
+
+
+def _blur_twin(image: F64) -> F64:
+    blurred = image
+    for axis in (0, 1):
+        widths = [(_RADIUS, _RADIUS) if one == axis else (0, 0) for one in range(3)]
+        padded = np.pad(blurred, widths)
+        blurred = np.zeros_like(image)
+        for k, tap in enumerate(_WINDOW):
+            blurred += tap * np.take(padded, np.arange(k, k + image.shape[axis]), axis)
+    return blurred

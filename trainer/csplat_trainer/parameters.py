@@ -1,0 +1,182 @@
+"""What training changes: the parameters of the splats and Adam's memory of them.
+
+Opacities are logits here, and quaternions unit: each step ends by bringing them back to length 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel, normalise_quats
+from csplat_trainer.kernels import parallel_kernel, relaxed_kernel
+
+__all__ = ["GROUPS", "Parameters", "Splats", "adam_step", "from_model", "to_model"]
+
+F32 = NDArray[np.float32]
+Splats = dict[str, F32]
+
+#: Names of the arrays of `Splats`, in the order of everything that goes through them.
+GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
+_LOGIT_LIMIT = 14.0  # float32 alpha has few digits beyond
+_BLOCK = 1 << 13  # values that one thread takes at a time
+
+
+@dataclass
+class Parameters:
+    """The state of an optimisation. Arrays are replaced when the number of splats changes.
+
+    Attributes:
+        values: means [N, 3], quats [N, 4], scales [N, 3] (log), logits [N], sh0 [N, 3], shN [N, K, 3].
+        first: Adam's running mean of the gradients, the same shapes.
+        second: Adam's running mean of their squares.
+        step: how many steps Adam has made.
+    """
+
+    values: Splats
+    first: Splats
+    second: Splats
+    step: int = 0
+
+    @classmethod
+    def starting_at(cls, values: Splats) -> Parameters:
+        """Parameters that have not moved yet."""
+        first, second = ({name: np.zeros_like(values[name]) for name in GROUPS} for _ in range(2))
+        return cls(values, first, second)
+
+    def __len__(self) -> int:
+        return len(self.values["means"])
+
+    @property
+    def alphas(self) -> F32:
+        """Opacities, [N]."""
+        return sigmoid(self.values["logits"])
+
+    def forget(self, rows: NDArray[np.int64]) -> None:
+        """Clear Adam's memory of some splats."""
+        for name in GROUPS:
+            self.first[name][rows] = 0.0
+            self.second[name][rows] = 0.0
+
+    def keep(self, rows: NDArray[np.int64]) -> None:
+        """Keep some splats, in this order."""
+        for part in (self.values, self.first, self.second):
+            for name in GROUPS:
+                part[name] = np.ascontiguousarray(part[name][rows])
+
+    def append(self, values: Splats) -> None:
+        """Add splats that Adam knows nothing of."""
+        for name in GROUPS:
+            self.values[name] = np.concatenate([self.values[name], values[name]])
+            for memory in (self.first, self.second):
+                memory[name] = np.concatenate([memory[name], np.zeros_like(values[name])])
+
+
+def from_model(model: SplatModel, sh_degree: int) -> Splats:
+    """Parameters of the splats of a model, with SH of another degree (cut, or zeros) where wanted."""
+    alpha = np.clip(model.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
+    coefficients = (sh_degree + 1) ** 2 - 1
+    shN = np.zeros((len(model), coefficients, 3), np.float32)
+    common = min(coefficients, model.shN.shape[1])
+    shN[:, :common] = model.shN[:, :common]
+    return {
+        "means": model.means.copy(),
+        "quats": normalise_quats(model.quats),
+        "scales": model.scales.copy(),
+        "logits": np.log(alpha / (1.0 - alpha)).astype(np.float32),
+        "sh0": model.sh0.copy(),
+        "shN": shN,
+    }
+
+
+def to_model(values: Splats, *, antialiased: bool = False) -> SplatModel:
+    """The splats as a model."""
+    return SplatModel(
+        means=values["means"].copy(),
+        quats=normalise_quats(values["quats"]),
+        scales=values["scales"].copy(),
+        opacities=sigmoid(values["logits"]),
+        sh0=values["sh0"].copy(),
+        shN=values["shN"].copy(),
+        antialiased=antialiased,
+    )
+
+
+def sigmoid(logits: F32) -> F32:
+    """Opacities of logits, in float64, rounded once."""
+    alpha: F32 = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
+    return alpha
+
+
+def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]) -> None:
+    """One step of Adam (no weight decay), then unit quaternions and bounded logits.
+
+    Args:
+        parameters: changed in place.
+        gradients: of the loss, shapes as `Parameters.values`.
+        rates: learning rate of each group.
+    """
+    parameters.step += 1
+    correction1 = 1.0 - _BETA1**parameters.step
+    correction2 = math.sqrt(1.0 - _BETA2**parameters.step)
+    for name in GROUPS:
+        value = parameters.values[name]
+        if value.size:
+            _adam(
+                value.reshape(-1),
+                gradients[name].reshape(-1),
+                parameters.first[name].reshape(-1),
+                parameters.second[name].reshape(-1),
+                np.float32(rates[name] / correction1),
+                np.float32(1.0 / correction2),
+            )
+    _constrain(parameters.values["quats"], parameters.values["logits"])
+
+
+@parallel_kernel(relaxed=True)
+def _adam(value: F32, gradient: F32, first: F32, second: F32, rate: np.float32, over: np.float32) -> None:
+    """Adam on a flat array; vectorises over its values."""
+    b1, b2 = np.float32(_BETA1), np.float32(_BETA2)
+    a1, a2 = np.float32(1.0 - _BETA1), np.float32(1.0 - _BETA2)
+    epsilon, tiny = np.float32(_EPSILON), np.float32(1e-30)
+    blocks = (value.shape[0] + _BLOCK - 1) // _BLOCK
+    for block in prange(blocks):
+        begin = block * _BLOCK
+        count = min(_BLOCK, value.shape[0] - begin)
+        p, g = value[begin : begin + count], gradient[begin : begin + count]
+        m, v = first[begin : begin + count], second[begin : begin + count]
+        for i in range(count):
+            slope = g[i]
+            mean = b1 * m[i] + a1 * slope
+            square = b2 * v[i] + a2 * slope * slope
+            # A splat that no picture sees decays towards denormal numbers, which are slow.
+            mean = mean if abs(mean) > tiny else np.float32(0.0)
+            square = square if square > tiny else np.float32(0.0)
+            m[i] = mean
+            v[i] = square
+            p[i] -= rate * mean / (np.sqrt(square) * over + epsilon)
+
+
+@relaxed_kernel
+def _constrain(quats: F32, logits: F32) -> None:
+    """Bring quaternions to unit length and logits into their bounds, one splat after the other."""
+    limit = np.float32(_LOGIT_LIMIT)
+    for i in range(quats.shape[0]):
+        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        if length > np.float32(1e-12):
+            over = np.float32(1.0) / length
+            quats[i, 0] = w * over
+            quats[i, 1] = x * over
+            quats[i, 2] = y * over
+            quats[i, 3] = z * over
+        else:
+            quats[i, 0] = np.float32(1.0)
+            quats[i, 1] = quats[i, 2] = quats[i, 3] = np.float32(0.0)
+        logits[i] = min(max(logits[i], -limit), limit)

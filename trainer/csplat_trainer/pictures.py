@@ -1,0 +1,84 @@
+"""`Picture`: a photograph and its camera, as training wants them: bytes, made float when their turn comes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat_render.camera import Camera
+from csplat_trainer.kernels import parallel_kernel
+
+__all__ = ["Picture", "compose"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One view of a data set.
+
+    Attributes:
+        camera: where it was taken; its W and H are the picture's.
+        pixels: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
+            premultiplied) alpha.
+
+    Raises:
+        InputError: the pixels have another shape or dtype.
+    """
+
+    camera: Camera
+    pixels: U8
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.H, self.camera.W)
+        if self.pixels.dtype != np.uint8 or self.pixels.ndim != 3 or self.pixels.shape[2] not in (3, 4):
+            raise InputError(f"a picture is {self.pixels.dtype} {list(self.pixels.shape)}, wanted uint8 [H, W, 3 or 4]")
+        if self.pixels.shape[:2] != shape:
+            raise InputError(f"a picture has {self.pixels.shape[:2]} pixels, its camera {shape} (height, width)")
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether there is an alpha channel."""
+        return bool(self.pixels.shape[2] == 4)
+
+    def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
+        """Some pixels, RGBA in 0..1, [M, 4]; alpha 1 where there is none."""
+        values = self.pixels[rows, columns].astype(np.float64) / 255.0
+        return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
+
+
+def compose(picture: Picture, background: F32, out: F32) -> F32:
+    """The picture as floats, in front of a background.
+
+    Args:
+        picture: what to show.
+        background: [3], the colour behind it.
+        out: [H, W, 3] float32, overwritten.
+
+    Returns:
+        `out`.
+    """
+    _compose(np.ascontiguousarray(picture.pixels), background, out)
+    return out
+
+
+@parallel_kernel()
+def _compose(pixels: U8, background: F32, out: F32) -> None:
+    """Blend each row with the background; a thread takes a run of rows."""
+    over = np.float32(1.0 / 255.0)
+    for r in prange(pixels.shape[0]):
+        for c in range(pixels.shape[1]):
+            if pixels.shape[2] == 4:
+                alpha = np.float32(pixels[r, c, 3]) * over
+                rest = np.float32(1.0) - alpha
+                for k in range(3):
+                    out[r, c, k] = alpha * (np.float32(pixels[r, c, k]) * over) + rest * background[k]
+            else:
+                for k in range(3):
+                    out[r, c, k] = np.float32(pixels[r, c, k]) * over

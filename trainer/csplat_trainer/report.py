@@ -1,0 +1,121 @@
+"""What a training run tells: progress, log, loss plot, early pictures."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.files import atomic_writer
+
+__all__ = ["Progress", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side", "write_log"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_WINDOW_SHARE = 50  # the moving average spans this part of the run
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        iteration: steps made.
+        iterations: steps in all.
+        loss: mean over the steps since the last report.
+        psnr: of the training pictures since the last report, pooled, dB.
+        splat_count: splats at present.
+        sh_degree: that is trained at present.
+        seconds: since the start.
+        seconds_left: at the present pace.
+    """
+
+    iteration: int
+    iterations: int
+    loss: float
+    psnr: float
+    splat_count: int
+    sh_degree: int
+    seconds: float
+    seconds_left: float
+
+
+def peak_memory() -> int | None:
+    """Most memory that this process has held, bytes; `None` where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(most) if sys.platform == "darwin" else int(most) * 1024
+
+
+def write_log(path: str | Path, log: dict[str, Any]) -> None:
+    """Write the log of a run as JSON."""
+    with atomic_writer(str(path)) as stream:
+        stream.write(json.dumps(log, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def moving_average(values: Sequence[float], window: int) -> F64:
+    """Mean of each value and those before it, `window` of them at most.
+
+    Args:
+        values: in order of time.
+        window: at least 1.
+    """
+    sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
+    ends = np.arange(1, len(sums))
+    starts = np.maximum(ends - window, 0)
+    means: F64 = (sums[ends] - sums[starts]) / (ends - starts)
+    return means
+
+
+def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> None:
+    """Draw the loss over the steps, with its moving average, as a PNG.
+
+    Args:
+        path: of the picture.
+        losses: of each step.
+        title: above the plot.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    window = max(1, len(losses) // _WINDOW_SHARE)
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    steps = np.arange(1, len(losses) + 1)
+    axes.plot(steps, losses, color="0.8", linewidth=0.6, label="each step")
+    axes.plot(steps, moving_average(losses, window), color="C0", label=f"mean of the last {window}")
+    axes.set(xlabel="iteration", ylabel="loss", yscale="log", title=title)
+    axes.grid(visible=True, which="both", alpha=0.2)
+    axes.legend()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    with atomic_writer(str(path)) as stream:
+        stream.write(buffer.getvalue())
+
+
+def side_by_side(*pictures: F32) -> F32:
+    """Pictures of one height beside each other."""
+    return np.concatenate(pictures, axis=1)
+
+
+def save_picture(path: str | Path, picture: F32) -> None:
+    """Write a picture, [H, W, 3] float in 0..1 (clipped), as a PNG."""
+    from PIL import Image
+
+    rounded = np.rint(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(rounded).save(buffer, format="png")
+    with atomic_writer(str(path)) as stream:
+        stream.write(buffer.getvalue())

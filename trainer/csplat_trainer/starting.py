@@ -1,0 +1,205 @@
+"""Where splats start: at known points, inside the visual hull of the masks, or anywhere in a box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from csplat.errors import InputError
+from csplat_render.camera import Camera
+from csplat_trainer.parameters import Splats
+from csplat_trainer.pictures import Picture
+
+__all__ = ["Scene", "scene_of", "starting_splats"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+SH_C0 = 0.28209479177387814
+
+_OPACITY = 0.5
+_BATCH = 20_000  # points drawn at a time
+_BATCHES = 400  # before what was found must do
+_MASK = 0.02  # alpha at and above which a pixel belongs to the object
+_MISSES = 0.02  # share of the pictures that may miss a point of the hull: rounding to pixels
+_NEIGHBOURS = 3
+_BOX_SHARE = 0.9  # of what the middle camera sees at the distance of the focus
+_PHOTO_BOX = 1.5  # photographs show what lies around their subject too
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the cameras say about a scene.
+
+    Attributes:
+        extent: 1.1 times the greatest distance of a camera from their centre (INRIA's unit of the
+            learning rate of the means), scene units.
+        focus: [3], the point nearest to all lines of sight.
+        half: half the side of the box around `focus` in which splats may start, scene units.
+    """
+
+    extent: float
+    focus: F64
+    half: float
+
+
+def scene_of(pictures: Sequence[Picture]) -> Scene:
+    """Find out where the scene lies.
+
+    Args:
+        pictures: at least one.
+    """
+    cameras = [picture.camera for picture in pictures]
+    positions = np.array([camera.position for camera in cameras])
+    axes = np.array([camera.viewmat[2, :3] for camera in cameras])
+    spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
+    # Least squares over the distances from the lines; the small term holds parallel ones together.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weight = 1e-3 * len(cameras)
+    guess = (positions + axes * max(float(spread), 1e-6)).mean(axis=0)
+    left = across.sum(axis=0) + weight * np.eye(3)
+    focus = np.linalg.solve(left, np.einsum("nij,nj->i", across, positions) + weight * guess)
+    distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
+    half_view = float(np.median([0.5 * min(c.W / c.K[0, 0], c.H / c.K[1, 1]) for c in cameras]))
+    half = distance * half_view * _BOX_SHARE
+    if not any(picture.has_alpha for picture in pictures):
+        half = distance * _PHOTO_BOX
+    extent = 1.1 * float(spread)
+    if extent <= 0.0:  # one camera, or several in one place
+        extent = max(distance, 1e-3)
+    return Scene(extent, focus, max(half, 1e-6))
+
+
+def starting_splats(
+    pictures: Sequence[Picture],
+    scene: Scene,
+    count: int,
+    sh_degree: int,
+    rng: Generator,
+    *,
+    init: str = "auto",
+    points: F32 | None = None,
+    colours: F32 | None = None,
+) -> Splats:
+    """Place the splats that training begins with.
+
+    Args:
+        pictures: of the training views.
+        scene: where it lies.
+        count: how many splats.
+        sh_degree: of the parameters; bands above 0 begin at zero.
+        rng: chooses.
+        init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
+        points: [P, 3], points of the scene, where the data set has any.
+        colours: [P, 3] in 0..1, their colours.
+
+    Raises:
+        InputError: there are no points, or no masks, to start from.
+    """
+    have_points = points is not None and len(points) > 0
+    have_masks = any(picture.has_alpha for picture in pictures)
+    if init == "points" and not have_points:
+        raise InputError("the data set holds no points to start from: wanted --init hull or box")
+    if init == "hull" and not have_masks:
+        raise InputError("the pictures have no alpha channel to make a hull of: wanted --init points or box")
+    if have_points and init in ("points", "auto"):
+        assert points is not None
+        means, colour = _at_points(points, colours, count, rng)
+    else:
+        masked = have_masks and init in ("hull", "auto")
+        means, colour = _in_box(pictures, scene, count, rng, masked=masked)
+    return _splats(means, colour, sh_degree, rng)
+
+
+def _at_points(points: F32, colours: F32 | None, count: int, rng: Generator) -> tuple[F64, F64]:
+    """Some of the points, or all of them and more beside them where more are wanted."""
+    order = rng.permutation(len(points))
+    chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
+    means = points[chosen].astype(np.float64)
+    colour = np.full((len(points), 3), 0.5) if colours is None else np.asarray(colours, np.float64)
+    beside = np.arange(len(chosen)) >= len(points)
+    if beside.any():
+        spread = _neighbour_distances(points.astype(np.float64))[chosen[beside]]
+        means[beside] += rng.standard_normal((int(beside.sum()), 3)) * spread[:, None]
+    return means, colour[chosen]
+
+
+def _in_box(pictures: Sequence[Picture], scene: Scene, count: int, rng: Generator, *, masked: bool) -> tuple[F64, F64]:
+    """Points that cameras see, inside the hull of the masks where wanted, with the mean of their pixels."""
+    found: list[F64] = []
+    colours: list[F64] = []
+    total = 0
+    for _ in range(_BATCHES):
+        points = scene.focus + scene.half * rng.uniform(-1.0, 1.0, (_BATCH, 3))
+        seen, hits, colour = _look(pictures, points)
+        keep = seen > 0
+        if masked:
+            keep &= hits >= (1.0 - _MISSES) * seen - 1e-9
+            keep &= 2 * seen >= len(pictures)
+        found.append(points[keep])
+        colours.append(colour[keep])
+        total += int(keep.sum())
+        if total >= count:
+            break
+    if total == 0:  # masks that do not fit together, cameras that look elsewhere
+        return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), 0.5)
+    means, colour = np.concatenate(found), np.concatenate(colours)
+    chosen = np.concatenate([np.arange(total), rng.integers(0, total, max(0, count - total))])[:count]
+    return means[chosen], colour[chosen]
+
+
+def _look(pictures: Sequence[Picture], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+    """How many pictures see each point, in how many it falls on the object, the mean colour there."""
+    seen, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    colour = np.zeros((len(points), 3))
+    for picture in pictures:
+        inside, pixels = _pixels_at(picture, points)
+        seen[inside] += 1
+        on = pixels[:, 3] >= _MASK
+        hits[inside[on]] += 1
+        colour[inside[on]] += pixels[on, :3]
+    return seen, hits, np.where(hits[:, None] > 0, colour / np.maximum(hits, 1)[:, None], 0.5)
+
+
+def _pixels_at(picture: Picture, points: F64) -> tuple[NDArray[np.int64], F64]:
+    """The points that fall into a picture, and its pixels there, RGBA in 0..1."""
+    camera: Camera = picture.camera
+    V, K = camera.viewmat, camera.K
+    x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))
+    ahead = z > camera.near
+    depth = np.where(ahead, z, 1.0)
+    u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+    inside = np.flatnonzero(ahead & (u >= 0) & (u < camera.W) & (v >= 0) & (v < camera.H))
+    return inside, picture.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
+
+
+def _splats(means: F64, colour: F64, sh_degree: int, rng: Generator) -> Splats:
+    count = len(means)
+    spacing = np.log(_neighbour_distances(means)).astype(np.float32)
+    quats = rng.standard_normal((count, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return {
+        "means": means.astype(np.float32),
+        "quats": quats.astype(np.float32),
+        "scales": np.repeat(spacing[:, None], 3, axis=1),
+        "logits": np.full(count, math.log(_OPACITY / (1.0 - _OPACITY)), np.float32),
+        "sh0": ((colour - 0.5) / SH_C0).astype(np.float32),
+        "shN": np.zeros((count, (sh_degree + 1) ** 2 - 1, 3), np.float32),
+    }
+
+
+def _neighbour_distances(points: F64) -> F64:
+    """Root mean square distance to the nearest three others, never 0."""
+    if len(points) < 2:
+        return np.ones(len(points))
+    k = min(_NEIGHBOURS, len(points) - 1)
+    distances = KDTree(points).query(points, k + 1)[0][:, 1:]
+    spacing: F64 = np.sqrt(np.square(distances).mean(axis=1))
+    floor = 1e-4 * max(float(np.median(spacing)), 1e-9)
+    return np.maximum(spacing, floor)
