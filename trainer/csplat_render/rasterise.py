@@ -61,7 +61,7 @@ class Rasteriser:
 
     Args:
         mode: `standard`, or `fast`: leaves out alpha below 1.5/255 and what shines through with less
-            than 1/255: a sixth of the time, for errors of 45 to 48 dB on trained scenes.
+            than 1/255: a sixth of the time, for errors of 40 to 52 dB on trained scenes.
         dtype: of pixels and gradients, float32 or float64 (which is for tests). Projection is in
             float64 in any case.
         gradients: whether `backward` will be called; without it `forward` is a little faster.
