@@ -15,11 +15,13 @@ main() {
     step "import contracts" "$DEV/lint-imports"
     step "generated files" "$DEV/python" spec/generate.py --check
     step "vectors and annexes" "$DEV/python" -m csplat_conformance.recipes --check
-    if have_node; then
+    if have node "pyright and the JavaScript tests"; then
         step "types (pyright)" "$DEV/pyright"
-        step "types (tsc)" javascript_types
+        if have npm "the types of the JavaScript decoder"; then
+            step "types (tsc)" npm run --silent --prefix codec/js types
+        fi
         step "JavaScript" javascript_tests
-        if have_chromium; then
+        if have chromium "the decoder in a browser"; then
             step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
         fi
     fi
@@ -35,33 +37,15 @@ step() {
     "$@"
 }
 
-have_node() {
-    command -v node >/dev/null && return 0
-    printf '\n==== SKIPPED: pyright and the JavaScript tests, because node is not installed ====\n'
+# have PROGRAM WHAT: false, with one loud line, where WHAT must be skipped; a failure where CI=true.
+have() {
+    command -v "$1" >/dev/null && return 0
+    printf '\n==== SKIPPED: %s, because %s is not installed ====\n' "$2" "$1"
     if [ "${CI:-}" = true ]; then
         echo "CI=true: a skip is a failure" >&2
         exit 1
     fi
     return 1
-}
-
-have_chromium() {
-    command -v chromium >/dev/null && return 0
-    printf '\n==== SKIPPED: the decoder in a browser, because chromium is not installed ====\n'
-    if [ "${CI:-}" = true ]; then
-        echo "CI=true: a skip is a failure" >&2
-        exit 1
-    fi
-    return 1
-}
-
-javascript_types() {
-    if ! command -v npm >/dev/null; then
-        echo "==== SKIPPED: npm is not installed ===="
-        [ "${CI:-}" != true ]
-        return
-    fi
-    npm run --silent --prefix codec/js types
 }
 
 # The counts when all is well, every failure in full otherwise.

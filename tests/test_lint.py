@@ -197,6 +197,14 @@ def test_degree_4_is_named(path):
         read_ply(path)
 
 
+def test_a_negative_count_is_refused_in_words(path):
+    rows = good_rows()
+    path.write_bytes(header(rows).replace(b"element vertex 5", b"element vertex -5") + rows.tobytes())
+    assert "error" == found(path)["malformed"].kind
+    with pytest.raises(InputError, match="-5 rows are declared"):
+        read_ply(path)
+
+
 def test_a_truncated_file_is_refused_with_the_count(path):
     rows = good_rows()
     path.write_bytes(header(rows) + rows.tobytes()[:-1])

@@ -183,7 +183,12 @@ def _header_findings(header: bytes, size: int) -> list[Finding]:
         findings.append(Finding("non-ascii-header", count, text, "note"))
     for line in header.splitlines():
         words = line.split()
-        if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
+        if words[:1] != [b"element"] or len(words) != 3:
+            continue
+        if words[2].startswith(b"-"):
+            text = f"{words[2].decode('ascii', 'replace')} rows are declared"
+            findings.append(Finding("malformed", 1, text, "error"))
+        elif words[2].isdigit():
             count = int(words[2])
             if count > size:  # a row takes a byte at least: do not let anyone allocate for it
                 text = f"{count} rows are declared, the file has {size} bytes"

@@ -147,29 +147,6 @@ def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: in
     return search(points, entries, near_groups, threads)[0]
 
 
-def distortion(points: I16 | I32, weights: F32, entries: I32, index: U32) -> float:
-    """Return the weighted mean of the squared distances |point - entry|**2.
-
-    Args:
-        points: [N, D], N > 0.
-        weights: [N], as in `cluster`.
-        entries: [K, D].
-        index: [N], rows of `entries`.
-
-    Raises:
-        InputError: as `cluster`, or no points.
-    """
-    w = _check(points, weights)
-    if not len(points):
-        raise InputError("distortion: no points")
-    total = 0.0
-    for a in range(0, len(points), _PART):
-        part = slice(a, a + _PART)
-        d = points[part].astype(np.float64) - entries[index[part]]
-        total += float((np.einsum("nd,nd->n", d, d) * w[part]).sum())
-    return total / float(w.sum())
-
-
 def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
     """Renumber so that more frequent entries come first, equal ones in their old order.
 
