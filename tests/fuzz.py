@@ -1,105 +1,162 @@
-"""Fuzz the decoder: structure-aware mutants of the conformance vectors, all checksums repaired.
+"""Fuzz the decoders and the PLY reader: mutants with an eye for structure, checksums repaired.
 
-A mutant must decode within small limits or be refused with a CsplatError (CNF-3). Anything else, a case that takes
-longer than five seconds, or memory beyond the limit is a finding: it is made smaller and saved, exit status 1.
+| target | must |
+|---|---|
+| decoder | decode within small limits, or refuse with a CsplatError (CNF-3) |
+| js | give the verdict and the arrays of the Python decoder |
+| validator | find something wrong exactly where the decoder refuses |
+| ply | give a sound model or an InputError, as lint says |
+
+Anything else, a case that takes more than five seconds of processor time, or memory beyond the limit is a finding: it
+is made smaller and saved below out/fuzz, exit status 1. What reaches edges between lines that nothing reached before
+joins the corpus.
 
     python tests/fuzz.py --seconds 60
-    python tests/fuzz.py --count 100000 --seed 7 --jobs 2
-    python tests/fuzz.py --seconds 600 scene.csplat
-    python tests/fuzz.py --case 1234 --seed 7          # one case again, its bytes on standard output
+    python tests/fuzz.py --target js --seconds 600 --seed 7
+    python tests/fuzz.py --target decoder --count 100000 --jobs 2 scene.csplat
+    python tests/fuzz.py --target ply --replay tests/corpus/ply/*
 
-Case number n of a seed is the same whatever the number of jobs.
+Process k of a seed and a number of jobs sees the same cases each time, until its time is up.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import multiprocessing
 import queue
 import random
+import re
 import resource
 import signal
 import sys
+import tempfile
 import time
 import traceback
-import zlib
 from collections import Counter
 from pathlib import Path
 
-from csplat import decoder
-from csplat.errors import CsplatError
-from csplat_conformance.builder import build
-from csplat_conformance.mutate import mapped, mutant
-from csplat_conformance.recipes import all_recipes
-from csplat_conformance.repair import repair
+from csplat_conformance.fuzzing.edges import Edges
+from csplat_conformance.fuzzing.plies import PlyTarget
+from csplat_conformance.fuzzing.targets import DecoderTarget, JsTarget
+from csplat_conformance.fuzzing.validating import ValidatorTarget
+from csplat_conformance.node import missing_javascript
 
-LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
+TARGETS = ("decoder", "js", "validator", "ply")
 SECONDS_PER_CASE = 5
+HANG_SECONDS = 60  # in native code, where no alarm arrives
 MEMORY_ABOVE_START = 256_000_000  # bytes of resident memory; the limits allow 32 MB of arrays
 ADDRESS_SPACE_ABOVE_START = 2_000_000_000  # allocations beyond this fail with MemoryError at once
-LARGEST_BASE = 3000  # bytes: small files make many cases a second
-BATCH = 200
-OUT = Path("out/fuzz")
+TRACED_SHARE = 0.5  # of the cases: tracing takes three times as long
+GROWN_SHARE = 0.5  # of the cases start from the corpus that grew, the others from the seeds
+GROWN_MAX = 4000
+SOURCE_BYTES_MAX = 20_000
+BATCH_SECONDS = 1.0
+NUMBER = re.compile(r"0x[0-9a-f]+|[0-9]+")
 
 
-class TooSlowError(Exception):
-    """A case ran longer than it may."""
+class TooSlowError(BaseException):
+    """A case ran longer than it may. No Exception: nothing on the way may take it for an error of its own."""
 
 
 def main() -> int:
     args = arguments()
-    if args.case is not None:
-        data, _ = case(args.seed, args.case, bases(args.files))
-        sys.stdout.buffer.write(data)
-        return 0
-    began = time.monotonic()
-    tally, findings = run(args)
-    seconds = time.monotonic() - began
-    report(tally, findings, seconds, args)
+    targets = list(TARGETS) if args.target == "all" else [args.target]
+    if "js" in targets and missing_javascript():
+        print(f"SKIPPED: the JavaScript decoder: {missing_javascript()}", file=sys.stderr)
+        targets.remove("js")
+        if not targets:
+            return 1
+    if args.replay:
+        return replay(targets[0], args.files)
+    if args.seconds is not None:
+        args.seconds /= len(targets)
+    findings = []
+    for name in targets:
+        began = time.monotonic()
+        tally, found, reached = run(name, args)
+        findings += found
+        report(name, tally, found, reached, time.monotonic() - began, args)
+    print(f"{len(findings)} kinds of findings")
     return 1 if findings else 0
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="*", type=Path, help="further valid files to start from")
-    parser.add_argument("--seconds", type=float, help="stop after this time (default 60)")
-    parser.add_argument("--count", type=int, help="stop after this many cases")
+    parser.add_argument("files", nargs="*", type=Path, help="further valid files to start from, of one target")
+    parser.add_argument(
+        "--target", choices=(*TARGETS, "all"), default="decoder", help="what is fuzzed (default decoder)"
+    )
+    parser.add_argument("--seconds", type=float, help="stop after this time, shared among the targets (default 60)")
+    parser.add_argument("--count", type=int, help="stop after this many cases of each target")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
-    parser.add_argument("--case", type=int, help="write the bytes of this case and stop")
+    parser.add_argument("--out", type=Path, default=Path("out/fuzz"), help="where findings go (default out/fuzz)")
+    parser.add_argument("--plain", action="store_true", help="without coverage: neither guided nor reported")
+    parser.add_argument(
+        "--replay", action="store_true", help="read the files as they are, and say what becomes of them"
+    )
     args = parser.parse_args()
+    if args.replay and (args.target == "all" or not args.files):
+        parser.error("--replay wants one --target and files")
+    if args.files and args.target == "all":
+        parser.error("files belong to one --target")
     if args.seconds is None and args.count is None:
         args.seconds = 60.0
     return args
 
 
-def bases(files):
-    """Return the files that mutants start from: valid vectors with all their fields, and the given ones."""
-    built = [build(recipe.scene) for recipe in all_recipes() if recipe.scene is not None]
-    small = [base for base in built if len(base.data) <= LARGEST_BASE]
-    return small + [mapped(path.read_bytes()) for path in files]
+def made(name, scratch=None):
+    """Return a target."""
+    if name == "js":
+        return JsTarget(scratch)
+    return {"decoder": DecoderTarget, "validator": ValidatorTarget, "ply": PlyTarget}[name]()
 
 
-def case(seed, number, starts):
-    """Return case `number` of a seed: its bytes, and whether checksums were repaired."""
-    return mutant(random.Random(f"{seed} {number}"), starts)  # noqa: S311 - repeatable, no secret
+def replay(name, paths):
+    """Let a target read files as they are."""
+    target, wrong = made(name), 0
+    signal.signal(signal.SIGPROF, too_slow)
+    for path in paths:
+        became, what = attempt(target, path.read_bytes())
+        wrong += bool(what)
+        print(f"{path}: {became}{': ' * bool(what)}{what}")
+    target.close()
+    return 1 if wrong else 0
 
 
 # Parent --------------------------------------------------------------------------------------------
 
 
-def run(args):
-    """Share the cases among processes until time or count is used up; return tally and findings."""
+def run(name, args):
+    """Share the cases among processes until time or count is used up; return tally, findings, coverage."""
     context = multiprocessing.get_context("spawn")
     results, stop = context.Queue(), context.Event()
     clocks = [context.Value("d", 0.0) for _ in range(args.jobs)]
-    processes = [
-        context.Process(target=work, args=(k, args, clocks[k], results, stop), daemon=True) for k in range(args.jobs)
-    ]
-    for process in processes:
-        process.start()
-    tally, findings, done = Counter(), [], 0
-    deadline = None
+    with tempfile.TemporaryDirectory(prefix="csplat-fuzz-") as scratch:
+        jobs = [(k, name, args, clocks[k], results, stop, Path(scratch)) for k in range(args.jobs)]
+        processes = [context.Process(target=work, args=job, daemon=False) for job in jobs]
+        for process in processes:
+            process.start()
+        tally, findings, lines = gathered(args, processes, clocks, results, stop)
+        for process in processes:
+            if process is not None:
+                process.join()
+        target = made(name, Path(scratch))
+        edges = Edges(target.watched)
+        every = edges.all_lines()
+        reached = [] if args.plain else [f"{len(lines & every):,} of {len(every):,} lines of functions"]
+        reached += [text for text in (target.coverage(),) if text]
+        missing = sorted(f"{Path(file).name}:{line}" for file, line in every - lines)
+        args.out.mkdir(parents=True, exist_ok=True)
+        (args.out / f"{name}-unreached.txt").write_text("\n".join(missing) + "\n", encoding="utf-8")
+        target.close()
+    return tally, findings, reached
+
+
+def gathered(args, processes, clocks, results, stop):
+    """Collect what the processes report until all are done; stop them when the time is up."""
+    tally, findings, lines, done, deadline = Counter(), [], set(), 0, None
     while done < args.jobs:
         try:
             kind, value = results.get(timeout=1)
@@ -111,13 +168,16 @@ def run(args):
             tally += value
         elif kind == "finding" and value["what"] not in {finding["what"] for finding in findings}:
             findings.append(value)
-            print(f"FINDING case {value['case']}: {value['what']}", file=sys.stderr)
+            print(
+                f"FINDING case {value['case']}: {value['what']}, saved as {value['path']}", file=sys.stderr, flush=True
+            )
         elif kind == "done":
             done += 1
+            lines |= value
         if deadline is not None and time.monotonic() > deadline:
             stop.set()
         done += stuck(processes, clocks, findings)
-    return tally, findings
+    return tally, findings, lines
 
 
 def stuck(processes, clocks, findings):
@@ -127,7 +187,7 @@ def stuck(processes, clocks, findings):
         if process is None:
             continue
         since = clocks[k].value
-        hangs = since and time.monotonic() - since > 4 * SECONDS_PER_CASE
+        hangs = since and time.monotonic() - since > HANG_SECONDS
         if hangs or (process.exitcode not in (None, 0)):
             what = "hang in native code" if hangs else f"the process died: {process.exitcode}"
             findings.append({"case": f"of worker {k}", "what": what, "path": "-"})
@@ -137,83 +197,83 @@ def stuck(processes, clocks, findings):
     return gone
 
 
-def report(tally, findings, seconds, args):
-    executions = sum(count for name, count in tally.items() if not name.startswith("("))
+def report(name, tally, findings, reached, seconds, args):
+    executions = sum(count for key, count in tally.items() if not key.startswith("("))
     rate = executions / max(seconds, 1e-9)
-    print(f"{executions:,} executions in {seconds:.0f} s, {rate:,.0f}/s, seed {args.seed}, {args.jobs} processes")
-    for name, count in sorted(tally.items(), key=lambda item: (item[0].startswith("("), -item[1])):
-        print(f"  {name:<16} {count:>9,}  {100 * count / max(executions, 1):5.1f} %")
+    print(
+        f"{name}: {executions:,} executions in {seconds:.0f} s, {rate:,.0f}/s, seed {args.seed}, {args.jobs} processes"
+    )
+    for text in reached:
+        print(f"  coverage: {text}")
+    for key, count in sorted(tally.items(), key=lambda item: (item[0].startswith("("), -item[1])):
+        print(f"  {key:<16} {count:>9,}  {100 * count / max(executions, 1):5.1f} %")
     for finding in findings:
         print(f"FINDING case {finding['case']}: {finding['what']}, saved as {finding['path']}")
-    print(f"{len(findings)} kinds of findings")
 
 
 # Worker --------------------------------------------------------------------------------------------
 
 
-def work(k, args, clock, results, stop):
+def work(k, name, args, clock, results, stop, scratch):
     """Run every case whose number is k modulo the number of processes."""
-    starts = bases(args.files)
-    for base in starts:
-        decoder.decode(base.data)  # warms up whatever loads late
-    signal.signal(signal.SIGALRM, too_slow)
+    target = made(name, scratch)
+    seeds, grown = target.seeds(args.files), []
+    edges = Edges(target.watched)
+    for seed in seeds:
+        became, what = attempt(target, seed.data)  # warms up whatever loads late
+        assert not what, f"a seed is a finding: {what}"
+    signal.signal(signal.SIGPROF, too_slow)
     start_bytes = limit_memory()
     results.put(("started", k))
-    tally, number, known = Counter(), k, set()
+    tally, number, known, told = Counter(), k, set(), time.monotonic()
     while not stop.is_set() and (args.count is None or number < args.count):
         clock.value = time.monotonic()
-        data, repaired = case(args.seed, number, starts)
-        name, what = attempt(data)
-        grown = resident_bytes() - start_bytes
-        if not what and grown > MEMORY_ABOVE_START:
-            what, start_bytes = f"resident memory grew by {grown:,} bytes", resident_bytes()
-        tally[name] += 1
-        tally["(not repaired)"] += not repaired
+        one, traced = case(target, args.seed, number, seeds, grown, plain=args.plain)
+        run = functools.partial(attempt, target, one.data)
+        (became, what), new = edges.watch(run) if traced else (run(), 0)
+        if new and not what:
+            tally["(new edges)"] += 1
+            source = one.source() if len(one.data) < SOURCE_BYTES_MAX and len(grown) < GROWN_MAX else None
+            grown += [source] if source is not None else []
+        what = what or target.memory()
+        used = resident_bytes() - start_bytes
+        if not what and used > MEMORY_ABOVE_START:
+            what, start_bytes = f"resident memory grew by {used:,} bytes", resident_bytes()
+        tally.update((became, *one.notes))
         if what and what not in known:
             known.add(what)
-            results.put(("finding", saved(args.seed, number, data, what, starts)))
+            results.put(("finding", saved(target, args, number, one.data, what, seeds)))
         number += args.jobs
-        if sum(tally.values()) >= BATCH:
+        if time.monotonic() - told > BATCH_SECONDS:
             results.put(("tally", tally))
-            tally = Counter()
+            tally, told = Counter(), time.monotonic()
     clock.value = 0.0
     results.put(("tally", tally))
-    results.put(("done", k))
+    target.close()
+    results.put(("done", k if args.plain else edges.lines()))
 
 
-def attempt(data):
-    """Decode one mutant: (name for the tally, what is wrong or an empty string)."""
-    signal.setitimer(signal.ITIMER_REAL, SECONDS_PER_CASE)
+def case(target, seed, number, seeds, grown, *, plain=False):
+    """Return case `number` of a seed, and whether its coverage is to be looked at."""
+    rng = random.Random(f"{seed} {number}")  # noqa: S311 - repeatable, no secret
+    traced = not plain and rng.random() < TRACED_SHARE
+    corpus = grown if grown and rng.random() < GROWN_SHARE else seeds
+    return target.mutant(rng, corpus), traced
+
+
+def attempt(target, data):
+    """Let the target read one file: (name for the tally, what is wrong or an empty string)."""
+    signal.setitimer(signal.ITIMER_PROF, SECONDS_PER_CASE)
     try:
-        chance = zlib.crc32(data)
-        # One thread is three times as fast on small files; now and then as many as there are.
-        model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
-        if chance % 8 == 1:
-            return agreed(data, len(model))
-    except CsplatError as error:
-        return error.code, ""
+        return target.attempt(data)
     except TooSlowError:
-        return "finding", f"slower than {SECONDS_PER_CASE} s"
+        return "finding", f"more than {SECONDS_PER_CASE} s of processor time"
     except BaseException as error:  # noqa: BLE001 - every other exception is what this program looks for
         where = traceback.extract_tb(error.__traceback__)[-1]
-        return "finding", f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        words = NUMBER.sub("#", str(error))[:200]  # one kind of finding, whatever the numbers
+        return "finding", f"{type(error).__name__}: {words} ({Path(where.filename).name}:{where.lineno})"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-    if len(model) > LIMITS.splats:
-        return "finding", "more splats than the limits allow"
-    return "decoded", ""
-
-
-def agreed(data, count):
-    """Decode a sound file in the other ways: they must find it sound too."""
-    try:
-        integers = decoder.decode_integers(data, limits=LIMITS, threads=1)
-        tiles = list(decoder.iter_tiles(data, limits=LIMITS))
-    except CsplatError as error:
-        return "finding", f"decode accepts what another way refuses: {error}"
-    if not len(integers["means"]) == sum(len(tile.means) for tile in tiles) == count:
-        return "finding", "ways of decoding differ in the number of splats"
-    return "decoded", ""
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def too_slow(signal_number, frame):  # noqa: ARG001 - the signature of a handler
@@ -235,28 +295,27 @@ def resident_bytes():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def saved(seed, number, data, what, starts):
+def saved(target, args, number, data, what, seeds):
     """Make a finding smaller and write it; return what to print."""
-    OUT.mkdir(parents=True, exist_ok=True)
-    small = minimised(data, what, starts)
-    path = OUT / f"seed{seed}-case{number}.csplat"
-    path.write_bytes(small)
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / f"{target.name}-seed{args.seed}-case{number}{target.suffix}"
+    path.write_bytes(minimised(target, data, what, seeds))
     return {"case": number, "what": what, "path": str(path)}
 
 
-def minimised(data, what, starts):
-    """Undo as many changed bytes as leave the finding in place, where the length is that of a base."""
-    if not what or what.startswith(("slower", "resident")):
+def minimised(target, data, what, seeds):
+    """Return the simplest file found that shows the same."""
+    if what.startswith(("more than", "resident", "Node holds")):
         return data
-    same = [base.data for base in starts if len(base.data) == len(data)]
-    if not same:
+    candidates = target.smaller(data, seeds)
+    try:
+        candidate = next(candidates)
+        while True:
+            same = attempt(target, candidate)[1] == what
+            data = candidate if same else data
+            candidate = candidates.send(candidate if same else None)
+    except StopIteration:
         return data
-    base = min(same, key=lambda other: sum(a != b for a, b in zip(other, data, strict=True)))
-    for at in [i for i in range(len(data)) if data[i] != base[i]]:
-        candidate = repair(data[:at] + base[at : at + 1] + data[at + 1 :])
-        if attempt(candidate)[1] == what:
-            data = candidate
-    return data
 
 
 if __name__ == "__main__":

@@ -1,61 +1,110 @@
 """The fuzzer itself: the same cases every time, and it sees what it looks for."""
 
 import importlib.util
+import random
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from csplat import decoder
-from csplat.errors import FormatError
+from csplat.errors import FormatError, InputError
+from csplat_conformance import node, validator
+from csplat_conformance.answers import Answer
 from csplat_conformance.builder import build
+from csplat_conformance.fuzzing import plies, targets
+from csplat_conformance.fuzzing.edges import Edges
+from csplat_conformance.fuzzing.plies import PlyTarget
+from csplat_conformance.fuzzing.ply_mutants import Ply
+from csplat_conformance.fuzzing.targets import DecoderTarget, JsTarget, compared
+from csplat_conformance.fuzzing.validating import ValidatorTarget
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.mutate import mapped
+from csplat_conformance.mutate import mapped, mutant
 from csplat_conformance.repair import repair
+from csplat_conformance.report import Status
 from csplat_conformance.samples import rich_scene
 
-SPEC = importlib.util.spec_from_file_location("fuzz", Path(__file__).parent / "fuzz.py")
+PROGRAM = Path(__file__).parent / "fuzz.py"
+SPEC = importlib.util.spec_from_file_location("fuzz", PROGRAM)
 fuzz = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(fuzz)
 
 BASES = [build(rich_scene())]
+CORPUS = Path(__file__).parent / "corpus"
+needs_node = pytest.mark.skipif(bool(node.missing_javascript()), reason=f"skipped: {node.missing_javascript()}")
 
 
 @pytest.fixture(autouse=True)
 def alarm():
-    before = signal.signal(signal.SIGALRM, fuzz.too_slow)
+    before = signal.signal(signal.SIGPROF, fuzz.too_slow)
     yield
-    signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGPROF, before)
+
+
+@pytest.fixture(scope="module")
+def ply_target():
+    target = PlyTarget()
+    yield target
+    target.close()
+
+
+def cases(target, seed, count, corpus):
+    return [fuzz.case(target, seed, number, corpus, [])[0].data for number in range(count)]
+
+
+def attempt(data):
+    return fuzz.attempt(DecoderTarget(), data)
+
+
+# Mutants of csplat files ---------------------------------------------------------------------------
 
 
 def test_cases_are_the_same_for_a_seed():
-    first = [fuzz.case(5, number, BASES) for number in range(50)]
+    first = cases(DecoderTarget(), 5, 50, BASES)
 
-    assert first == [fuzz.case(5, number, BASES) for number in range(50)]
-    assert first != [fuzz.case(6, number, BASES) for number in range(50)]
+    assert first == cases(DecoderTarget(), 5, 50, BASES)
+    assert first != cases(DecoderTarget(), 6, 50, BASES)
 
 
 def test_most_mutants_have_sound_checksums():
-    mutants = [fuzz.case(2, number, BASES) for number in range(300)]
+    mutants = [mutant(random.Random(number), BASES) for number in range(300)]  # noqa: S311 - no secret
 
     assert sum(repaired for _, repaired in mutants) > 240
     assert all(data == repair(data) for data, repaired in mutants if repaired)
 
 
 def test_mutants_reach_the_streams():
-    names = {fuzz.attempt(fuzz.case(1, number, BASES)[0])[0] for number in range(1500)}
+    names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 1500, BASES)}
 
     assert {"decoded", "E_STREAM", "E_CODER", "E_CODEBOOK", "E_BOX", "E_RANGE"} <= names
     assert "finding" not in names
 
 
+def test_a_mutant_can_be_mutated_again():
+    target, corpus = DecoderTarget(), list(BASES)
+    for number in range(400):
+        one, _ = fuzz.case(target, 3, number, BASES, corpus[1:])
+        source = one.source()
+        corpus += [source] if source is not None else []
+
+    assert len(corpus) > 200
+    assert "finding" not in {attempt(data)[0] for data in cases(target, 4, 300, corpus)}
+
+
 def test_a_file_of_any_origin_is_a_base():
     base = mapped((VECTORS / "valid" / "rich.csplat").read_bytes())
-    names = {fuzz.attempt(fuzz.case(1, number, [base])[0])[0] for number in range(300)}
+    names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 300, [base])}
 
     assert len(names) > 5
     assert "finding" not in names
+
+
+# What is a finding ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("error", [KeyError("a"), MemoryError(), RecursionError(), ValueError("b"), SystemExit(0)])
@@ -65,7 +114,13 @@ def test_another_exception_is_a_finding(monkeypatch, error):
 
     monkeypatch.setattr(decoder, "decode", broken)
 
-    assert "finding" == fuzz.attempt(b"")[0]
+    assert "finding" == attempt(b"")[0]
+
+
+def test_a_warning_is_a_finding(monkeypatch):
+    monkeypatch.setattr(decoder, "decode", lambda *_args, **_options: __import__("warnings").warn("odd", stacklevel=1))
+
+    assert "UserWarning: odd" in attempt(b"")[1]
 
 
 def test_a_refusal_is_none(monkeypatch):
@@ -74,14 +129,14 @@ def test_a_refusal_is_none(monkeypatch):
 
     monkeypatch.setattr(decoder, "decode", refuse)
 
-    assert ("E_CRC", "") == fuzz.attempt(b"")
+    assert ("E_CRC", "") == attempt(b"")
 
 
 def test_a_slow_case_is_a_finding(monkeypatch):
     monkeypatch.setattr(fuzz, "SECONDS_PER_CASE", 0.05)
-    monkeypatch.setattr(decoder, "decode", lambda *_args, **_options: time.sleep(2))
+    monkeypatch.setattr(decoder, "decode", lambda *_args, **_options: [None for _ in iter(time.process_time, 1e9)])
 
-    assert ("finding", "slower than 0.05 s") == fuzz.attempt(b"")
+    assert ("finding", "more than 0.05 s of processor time") == attempt(b"")
 
 
 def test_a_finding_is_made_smaller(monkeypatch):
@@ -99,15 +154,176 @@ def test_a_finding_is_made_smaller(monkeypatch):
     damaged[at + 30] ^= 255
     data = repair(bytes(damaged))
 
-    small = fuzz.minimised(data, fuzz.attempt(data)[1], BASES)
+    small = fuzz.minimised(DecoderTarget(), data, attempt(data)[1], BASES)
 
-    assert [at] == [i for i in range(_spec_end(), len(base)) if small[i] != base[i] and i not in _index_crc()]
-
-
-def _spec_end():
-    return 64
+    crc = BASES[0].fields["index.crc"].offset
+    sums = {*range(64), *range(crc, crc + 4)}
+    assert [at] == [i for i in range(len(base)) if small[i] != base[i] and i not in sums]
 
 
-def _index_crc():
-    entry = BASES[0].fields["index.crc"]
-    return range(entry.offset, entry.offset + 4)
+# Two decoders --------------------------------------------------------------------------------------
+
+
+PASSED = Answer(Status.PASSED, "", {"splat_count": 1}, {"floats.means": (12, "ab")})
+REFUSED = Answer(Status.REFUSED, code="E_CRC", clause="CHK-1")
+BASE_FILE = bytes(64)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "name"),
+    [
+        (PASSED, PASSED, "decoded"),
+        (REFUSED, REFUSED, "E_CRC"),
+        (REFUSED, Answer(Status.REFUSED, code="E_BOX"), "another code"),
+        (PASSED, Answer(Status.REFUSED, code="E_LIMIT"), "E_LIMIT"),
+        (PASSED, REFUSED, "finding"),
+        (REFUSED, PASSED, "finding"),
+        (PASSED, Answer(Status.PASSED, "", {"splat_count": 2}, PASSED.arrays), "finding"),
+        (PASSED, Answer(Status.PASSED, "", PASSED.header, {"floats.means": (12, "cd")}), "finding"),
+        (PASSED, Answer(Status.PASSED, "", PASSED.header, {}), "finding"),
+        (PASSED, Answer(Status.REFUSED, code="E_UNSUPPORTED"), "finding"),
+    ],
+)
+def test_two_decoders_have_to_agree(ours, theirs, name):
+    assert name == compared(BASE_FILE, ours, theirs)[0]
+
+
+def test_a_decoder_of_base_may_refuse_archive():
+    archive = bytes(12) + b"\1" + bytes(51)
+
+    assert ("another profile", "") == compared(archive, PASSED, Answer(Status.REFUSED, code="E_UNSUPPORTED"))
+
+
+@needs_node
+def test_both_decoders_agree_on_mutants():
+    target = JsTarget()
+    names = {fuzz.attempt(target, data)[0] for data in cases(target, 2, 300, BASES)}
+    target.close()
+
+    assert {"decoded", "E_INDEX", "E_STREAM"} <= names
+    assert "finding" not in names
+
+
+@needs_node
+def test_a_javascript_process_that_ends_is_a_finding_and_starts_again(monkeypatch):
+    target = JsTarget()
+    assert ("decoded", "") == fuzz.attempt(target, BASES[0].data)
+    target._node._process.kill()
+
+    assert "JavaScript, crashed" in fuzz.attempt(target, BASES[0].data)[1]
+    assert ("decoded", "") == fuzz.attempt(target, BASES[0].data)
+    monkeypatch.setattr(targets, "_JS_MEMORY", 1)
+    assert target.memory().startswith("Node holds")
+    target.close()
+
+
+@needs_node
+def test_a_javascript_process_that_hangs_is_a_finding(tmp_path):
+    for path in node.js_folder().glob("*.mjs"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "decoder.mjs").write_text(
+        "export class CsplatError extends Error {}\nexport const decode = () => { for (;;); };\n"
+    )
+    with node.JsDecoder(tmp_path, timeout=1.5) as hanging:
+        assert Status.HUNG == hanging.ask(b"").status
+
+
+def test_validator_and_decoder_agree_on_mutants():
+    names = {fuzz.attempt(ValidatorTarget(), data) for data in cases(ValidatorTarget(), 2, 400, BASES)}
+
+    assert {("decoded", ""), ("E_INDEX", ""), ("E_STREAM", "")} <= names
+    assert "finding" not in {name for name, _ in names}
+
+
+@pytest.mark.parametrize(("violations", "data"), [((), BASES[0].data[:-1]), (("CHK-1",), BASES[0].data)])
+def test_a_validator_that_disagrees_is_a_finding(monkeypatch, violations, data):
+    found = SimpleNamespace(violations=[SimpleNamespace(clause=clause) for clause in violations])
+    monkeypatch.setattr(validator, "validate", lambda *_args, **_options: found)
+
+    assert "finding" == fuzz.attempt(ValidatorTarget(), data)[0]
+
+
+# PLY -----------------------------------------------------------------------------------------------
+
+
+def test_every_seed_of_the_ply_target_is_read(ply_target):
+    became = [fuzz.attempt(ply_target, seed.data) for seed in ply_target.seeds([]) if seed.lines]
+
+    assert {("read", "")} == set(became)
+    others = [seed.data for seed in ply_target.seeds([]) if not seed.lines]
+    assert [("refused", "")] * 3 == [fuzz.attempt(ply_target, data) for data in others]
+
+
+def test_a_ply_is_taken_apart_and_put_together_again(ply_target):
+    for seed in ply_target.seeds([]):
+        assert seed.data == Ply.parse(seed.data).data
+
+
+def test_mutants_of_plies_are_read_and_refused_and_nothing_else(ply_target):
+    names = [fuzz.attempt(ply_target, data)[0] for data in cases(ply_target, 1, 400, ply_target.seeds([]))]
+
+    assert {"read", "refused"} == set(names)
+    assert 40 < names.count("read") < 360
+
+
+@pytest.mark.parametrize(("name", "wrong"), [("read_ply", ValueError("x")), ("lint_ply", IndexError("y"))])
+def test_another_exception_of_the_reader_is_a_finding(monkeypatch, ply_target, name, wrong):
+    def broken(*_args, **_options):
+        raise wrong
+
+    monkeypatch.setattr(plies, name, broken)
+
+    assert type(wrong).__name__ in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
+
+
+def test_a_reader_that_disagrees_with_lint_is_a_finding(monkeypatch, ply_target):
+    def refuse(*_args, **_options):
+        raise InputError("no")
+
+    monkeypatch.setattr(plies, "read_ply", refuse)
+
+    assert "lint finds nothing wrong" in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
+
+
+def test_a_ply_is_made_smaller(monkeypatch, ply_target):
+    def broken(path, **_options):
+        if b"scale_1" in path.read_bytes():
+            raise KeyError("scale_1")
+        raise InputError("no")
+
+    monkeypatch.setattr(plies, "read_ply", broken)
+    data = ply_target.seeds([])[1].data
+    small = fuzz.minimised(ply_target, data, fuzz.attempt(ply_target, data)[1], [])
+
+    assert b"property float scale_1\nend_header\n" == small
+
+
+# Coverage, program, regressions --------------------------------------------------------------------
+
+
+def test_edges_are_new_once():
+    edges = Edges([Path(decoder.__file__).parent])
+    run = lambda: attempt(BASES[0].data)  # noqa: E731 - called twice
+
+    assert edges.watch(run)[1] > 300
+    assert 0 == edges.watch(run)[1]
+    assert edges.watch(lambda: attempt(BASES[0].data[:100]))[1] > 0
+    assert edges.lines() <= edges.all_lines() | {line for line in edges.lines() if "<" in line[0]}
+
+
+@pytest.mark.parametrize("target", ["decoder", "validator", "ply", pytest.param("js", marks=needs_node)])
+def test_the_program_says_what_it_did(tmp_path, target):
+    words = [sys.executable, str(PROGRAM), "--target", target, "--count", "40", "--jobs", "1", "--out", str(tmp_path)]
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+
+    assert (0, "") == (run.returncode, run.stderr)
+    assert f"{target}: 40 executions" in run.stdout
+    assert "coverage:" in run.stdout
+    assert "0 kinds of findings" in run.stdout
+
+
+@pytest.mark.parametrize("path", sorted(CORPUS.glob("*/*")), ids=lambda path: path.name)
+def test_what_was_found_once_stays_mended(path, ply_target):
+    target = {"ply": ply_target, "decoder": DecoderTarget()}[path.parent.name]
+
+    assert "" == fuzz.attempt(target, path.read_bytes())[1]

@@ -6,6 +6,7 @@ parser stumbled. Only names and the first bytes are looked at; nothing is parsed
 
 from __future__ import annotations
 
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -114,7 +115,7 @@ def _zip_holds_meta(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.rsplit("/", 1)[-1] == "meta.json" for name in archive.namelist())
-    except (OSError, zipfile.BadZipFile):
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # of broken archives
         return path.suffix.lower() == ".sog"
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -136,7 +137,11 @@ def _parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None
         return None
     with _open(path, header) as stream:
         try:
-            parsed = plyfile.PlyData.read(stream)
+            # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an
+            # empty table, which plyfile then refuses.
+            with np.errstate(over="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                parsed = plyfile.PlyData.read(stream)
         except plyfile.PlyElementParseError as error:
             findings.append(_row_finding(error))
             return None

@@ -28,12 +28,12 @@ def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tup
     Returns:
         [N, 3] float32 and three float64, in scene units.
     """
-    if facts.origin is not None and not facts.origin_is_added:
-        return means.astype(np.float32, copy=False), facts.origin
-    if means.dtype == np.float32:
-        return means, (0.0, 0.0, 0.0)
-    origin = facts.origin if facts.origin is not None else _origin_for(means)
     with np.errstate(over="ignore"):  # the model refuses what leaves float32
+        if facts.origin is not None and not facts.origin_is_added:
+            return means.astype(np.float32, copy=False), facts.origin
+        if means.dtype == np.float32:
+            return means, (0.0, 0.0, 0.0)
+        origin = facts.origin if facts.origin is not None else _origin_for(means)
         return (means - np.array(origin)).astype(np.float32), origin
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from csplat import _spec
 from csplat_conformance.reference import expected
 from csplat_conformance.samples import Recipe
 
-__all__ = ["VECTORS", "Vector", "describe", "load", "summarise", "to_json"]
+__all__ = ["VECTORS", "Vector", "describe", "load", "picture_name", "summarise", "to_json"]
 
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
@@ -38,6 +38,7 @@ class Vector:
         profile: name of the profile that a decoder needs; for refusals base where the file names none.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
         error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted).
+        views: renderings: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (dB at least).
     """
 
     name: str
@@ -49,6 +50,7 @@ class Vector:
     profile: str
     expect: dict[str, Any]
     error: dict[str, Any]
+    views: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def data(self) -> bytes:
@@ -61,8 +63,14 @@ def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
     return [Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"]]
 
 
-def describe(recipe: Recipe, data: bytes) -> Vector:
-    """Return a recipe's entry for the bytes that it made."""
+def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:
+    """Return a recipe's entry for the bytes that it made.
+
+    Args:
+        recipe: what the entry is about.
+        data: the file.
+        pictures: a PNG for each of the recipe's views.
+    """
     expect: dict[str, Any] = {}
     error: dict[str, Any] = {}
     if recipe.scene is not None:
@@ -73,6 +81,15 @@ def describe(recipe: Recipe, data: bytes) -> Vector:
     else:
         error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
         error |= {"also": list(recipe.also), "optional": recipe.optional}
+    views = [
+        {
+            "camera": view.camera,
+            "picture": picture_name(recipe.name, number),
+            "sha256": hashlib.sha256(picture).hexdigest(),
+            "psnr": view.psnr,
+        }
+        for number, (view, picture) in enumerate(zip(recipe.views, pictures, strict=True))
+    ]
     named = data[_PROFILE_AT] if len(data) >= _spec.HEADER_SIZE else _spec.PROFILE_BASE
     return Vector(
         name=recipe.name,
@@ -84,7 +101,13 @@ def describe(recipe: Recipe, data: bytes) -> Vector:
         profile=_spec.PROFILE_NAMES.get(named, _spec.PROFILE_NAMES[_spec.PROFILE_BASE]),
         expect=expect,
         error=error,
+        views=views,
     )
+
+
+def picture_name(name: str, number: int) -> str:
+    """Return the path of a vector's reference picture, below the folder of the vectors."""
+    return f"{name}.{number}.png"
 
 
 def summarise(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
@@ -100,6 +123,7 @@ def _summary(array: NDArray[Any]) -> list[Any]:
 
 def to_json(vectors: Sequence[Vector]) -> str:
     """Return the text of manifest.json, one vector a line."""
-    lines = [json.dumps(vars(vector), ensure_ascii=False, separators=(",", ":")) for vector in vectors]
+    entries = [{key: value for key, value in vars(vector).items() if key != "views" or value} for vector in vectors]
+    lines = [json.dumps(entry, ensure_ascii=False, separators=(",", ":")) for entry in entries]
     head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
     return head[:-1] + ', "vectors": [\n' + ",\n".join(lines) + "\n]}\n"

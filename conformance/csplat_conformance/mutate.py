@@ -16,7 +16,7 @@ from csplat_conformance.coders import deflate_fixed, deflate_stored
 from csplat_conformance.fields import Field
 from csplat_conformance.repair import repair
 
-__all__ = ["mapped", "mutant"]
+__all__ = ["mapped", "mutant", "mutant_of"]
 
 _UNREPAIRED_SHARE = 0.1
 _CRC_SIZE = 4
@@ -32,20 +32,31 @@ def mutant(rng: random.Random, bases: Sequence[Built]) -> tuple[bytes, bool]:
         rng: where all chance comes from.
         bases: valid files with the places of their fields.
     """
-    base = rng.choice(bases)
+    data, repaired, _ = mutant_of(rng, rng.choice(bases), bases)
+    return data, repaired
+
+
+def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[bytes, bool, bool]:
+    """Damage a file: the bytes, whether checksums were repaired, whether the fields still lie where they were.
+
+    Args:
+        rng: where all chance comes from.
+        base: the file, with the places of its fields.
+        bases: others, whose chunks may be put in.
+    """
     data = bytearray(base.data)
     for _ in range(rng.choice((0, 1, 1, 1, 2, 3))):
         rng.choice(_IN_PLACE)(rng, base, data)
-    result = bytes(data)
+    result, in_place = bytes(data), True
     if rng.random() < 0.4:
-        result = _laid_out(rng, base, data, bases)
+        result, in_place = _laid_out(rng, base, data, bases), False
     if rng.random() < 0.03:
-        result = result[: rng.randrange(len(result) + 1)]
+        result, in_place = result[: rng.randrange(len(result) + 1)], False
     if rng.random() < 0.01:
-        result += rng.randbytes(rng.randrange(1, 9))
+        result, in_place = result + rng.randbytes(rng.randrange(1, 9)), False
     if rng.random() < _UNREPAIRED_SHARE:
-        return result, False
-    return repair(result), True
+        return result, False, in_place
+    return repair(result), True, in_place
 
 
 def mapped(data: bytes) -> Built:

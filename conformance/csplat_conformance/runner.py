@@ -1,193 +1,175 @@
 """Run a decoder over the vectors and compare what it returns with the manifest.
 
-    >>> from csplat_conformance.runner import run_builtin
-    >>> [result.name for result in run_builtin("valid/*") if not result.passed]
-    []
+    >>> from csplat_conformance.runner import Choice, run_builtin
+    >>> run_builtin(Choice(pattern="valid/*")).passed
+    True
 
-`run_builtin` calls `csplat.decoder` in this process. `run_command` starts another decoder for each vector:
-
-    my-decoder INPUT OUTDIR
-
-It exits 0 and leaves in OUTDIR `header.json` (the header facts of the manifest) and one file of raw little-endian
-values in C order for each array, `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (NAME of an extra column
-in percent-encoding); or it exits 1 and its last line on stdout is JSON, `{"code": "E_CRC"}`. It may leave out
-integer arrays; everything else is compared.
+`run_builtin` calls `csplat.decoder` in this process; `run_command` starts another decoder for each vector, by the
+protocol of `protocol`. What the levels ask for is told in `answers` and `views`.
 """
 
 from __future__ import annotations
 
 import fnmatch
-import hashlib
-import json
-import shlex
-import subprocess
-import tempfile
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-from urllib.parse import quote
 
 from csplat import _spec
-from csplat.errors import CsplatError
-from csplat_conformance.manifest import VECTORS, Vector, load, summarise
+from csplat.errors import InputError
+from csplat_conformance import adapter, views
+from csplat_conformance.answers import LEVELS, PARTS, judge
+from csplat_conformance.manifest import VECTORS, Vector, load
+from csplat_conformance.process import split_command
+from csplat_conformance.protocol import ask
+from csplat_conformance.report import Outcome, Report
 
-__all__ = ["Result", "run_builtin", "run_command"]
+__all__ = ["PROFILES", "TIMEOUT_SECONDS", "Choice", "parse_levels", "run_builtin", "run_command"]
 
-_FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-_TIMEOUT_SECONDS = 60
+#: Profiles that a decoder may have.
+PROFILES = (_spec.PROFILE_NAMES[_spec.PROFILE_BASE], _spec.PROFILE_NAMES[_spec.PROFILE_ARCHIVE])
+
+#: Seconds that another decoder has for each vector; the largest is of 65,536 splats.
+TIMEOUT_SECONDS = 60.0
+
+#: Called after each vector: how many are done, of how many.
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Result:
-    """What became of one vector.
+class Choice:
+    """What is run, and how strictly.
 
     Attributes:
-        name: of the vector.
-        passed: whether the decoder did what the manifest says.
-        message: what it did instead; for a refusal with another clause or offset a remark.
-        clauses: ids that the vector covers.
+        pattern: shell pattern of the vectors' names, `invalid/*`; None for all.
+        clause: shell pattern of clauses, `HDR-*`: vectors that cover one of them; None for all.
+        levels: of 1 to 4.
+        profile: what the decoder reads; one of `base` has to refuse `archive` as unsupported.
+        exact: of refusals demand code, clause and offset, and optional refusals too: for csplat's own decoders.
+        timeout: seconds for one process.
+        jobs: processes at a time; None for as many as there are processors.
     """
 
-    name: str
-    passed: bool
-    message: str = ""
-    clauses: tuple[str, ...] = ()
+    pattern: str | None = None
+    clause: str | None = None
+    levels: tuple[int, ...] = tuple(PARTS)
+    profile: str = PROFILES[-1]
+    exact: bool = False
+    timeout: float = TIMEOUT_SECONDS
+    jobs: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.levels or any(level not in LEVELS for level in self.levels):
+            raise InputError(f"levels {list(self.levels)}, wanted some of {list(LEVELS)}")
+        if self.profile not in PROFILES:
+            raise InputError(f"the profile {self.profile!r}, wanted {' or '.join(PROFILES)}")
+        if not self.timeout > 0:
+            raise InputError(f"a timeout of {self.timeout:g} s, wanted more than 0")
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"{self.jobs} jobs, wanted 1 or more")
 
 
-def run_builtin(filter: str | None = None) -> list[Result]:
-    """Run this package's own decoder over the vectors: optional refusals, clauses and offsets are demanded of it.
+def parse_levels(text: str) -> tuple[int, ...]:
+    """Return the levels that a word names: `3` is all up to 3, `1,3` is those two.
+
+    Raises:
+        InputError: there are no such levels.
+    """
+    try:
+        numbers = [int(part.strip().upper().removeprefix("L")) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"the level {text!r}, wanted 1 to {LEVELS[-1]}, or some of them as 1,3") from None
+    if any(number not in LEVELS for number in numbers):
+        raise InputError(f"the level {text!r}, wanted 1 to {LEVELS[-1]}, or some of them as 1,3")
+    return tuple(level for level in LEVELS if level <= numbers[0]) if len(numbers) == 1 else tuple(sorted(set(numbers)))
+
+
+def run_builtin(choice: Choice | None = None, progress: Progress | None = None) -> Report:
+    """Run this package's own decoder over the vectors: code, clause and offset of refusals are demanded of it.
 
     Args:
-        filter: shell pattern of the names, `invalid/*`; None for all.
-
-    Returns:
-        A result for each vector, in the order of the manifest.
+        choice: what is run; `profile`, `exact`, `timeout` and `jobs` do not apply.
+        progress: is told how many vectors are done.
     """
-    return [_run_ours(vector) for vector in _chosen(filter)]
+    choice = choice or Choice()
+
+    def run(vector: Vector) -> list[Outcome]:
+        outcomes = []
+        if any(level in choice.levels for level in PARTS):
+            outcomes = judge(vector, adapter.answer(vector.data), choice.levels, exact=True)
+        if 4 in choice.levels and vector.views:
+            if views.can_render():
+                outcomes += views.judge_ours(vector)
+            else:
+                outcomes += views.skipped_views(vector, "needs the packages of the extra render")
+        return outcomes
+
+    chosen = _chosen(choice)
+    results = []
+    for done, vector in enumerate(chosen, 1):
+        results.append(run(vector))
+        if progress:
+            progress(done, len(chosen))
+    return _report("csplat's decoder", choice, results)
 
 
-def run_command(command: str, filter: str | None = None) -> list[Result]:
-    """Run another decoder over the vectors.
+def run_command(
+    command: str | None, choice: Choice | None = None, *, render: str | None = None, progress: Progress | None = None
+) -> Report:
+    """Run another decoder, another renderer, or both over the vectors.
 
     Args:
-        command: its command line, with `{input}` and `{outdir}` where they belong.
-        filter: shell pattern of the names; None for all.
+        command: command line of the decoder with `{input}` and `{outdir}`; None to test a renderer alone.
+        choice: what is run.
+        render: command line of the renderer with `{input}`, `{camera}` and `{out}` or `{outdir}`, for L4.
+        progress: is told how many vectors are done.
 
-    Returns:
-        A result for each vector; a crash, a hang or another exit status is a failure.
+    Raises:
+        InputError: a command line that cannot be run.
     """
-    return [_run_one(command, vector) for vector in _chosen(filter)]
+    choice = choice or Choice()
+    if command is not None:
+        split_command(command, ("input", "outdir"))
+    if render is not None:
+        split_command(render, ("input", "camera", "outdir" if "{outdir}" in render else "out"))
+
+    def run(vector: Vector) -> list[Outcome]:
+        outcomes = []
+        if command is not None and any(level in choice.levels for level in PARTS):
+            answer = ask(command, VECTORS / vector.file, choice.timeout)
+            outcomes = judge(vector, answer, choice.levels, exact=choice.exact, profile=choice.profile)
+        if 4 in choice.levels:
+            if render is None:
+                outcomes += views.skipped_views(vector, "no command of a renderer was given")
+            else:
+                outcomes += views.judge_command(vector, render, choice.timeout)
+        return outcomes
+
+    chosen = _chosen(choice)
+    if command is None:
+        chosen = [vector for vector in chosen if vector.views]
+    results = []
+    with ThreadPoolExecutor(choice.jobs or os.cpu_count() or 1) as pool:
+        for done, outcomes in enumerate(pool.map(run, chosen), 1):
+            results.append(outcomes)
+            if progress:
+                progress(done, len(chosen))
+    return _report(command or render or "", choice, results)
 
 
-def _chosen(pattern: str | None) -> Iterator[Vector]:
-    return (vector for vector in load() if pattern is None or fnmatch.fnmatchcase(vector.name, pattern))
+def _chosen(choice: Choice) -> list[Vector]:
+    return [
+        vector
+        for vector in load()
+        if (choice.pattern is None or fnmatch.fnmatchcase(vector.name, choice.pattern))
+        and (choice.clause is None or fnmatch.filter(vector.clauses, choice.clause))
+    ]
 
 
-def _run_ours(vector: Vector) -> Result:
-    """Decode one vector to floats and to integers; both ways must do what the manifest says."""
-    clauses, data = tuple(vector.clauses), vector.data
-    if not vector.error:
-        try:
-            message = _difference(vector.expect, _decoded(data))
-        except CsplatError as error:
-            message = str(error)
-        return Result(vector.name, not message, message, clauses)
-    from csplat import decoder
-
-    wanted = vector.error
-    message = ""
-    for decode in (decoder.decode, decoder.decode_integers):
-        try:
-            decode(data)
-        except CsplatError as error:
-            found = (error.code, getattr(error, "clause", None), getattr(error, "offset", None))
-            # Of our own decoder the suite wants clause and offset too, and no other code.
-            if found != (wanted["code"], wanted["clause"], wanted["offset"]):
-                planted = f"{wanted['code']} at byte {wanted['offset']} ({wanted['clause']})"
-                message = f"planted {planted}, reported {error}"
-        else:
-            message = f"{decode.__name__} accepted it"
-    return Result(vector.name, not message, message, clauses)
-
-
-def _decoded(data: bytes) -> dict[str, Any]:
-    """Return what our decoder makes of a file, in the form of the manifest."""
-    from csplat import decoder
-
-    model = decoder.decode(data)
-    integers = decoder.decode_integers(data)
-    header = decoder.read_header(data)
-    flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
-    facts = {
-        "profile": header.profile,
-        "splat_count": header.splat_count,
-        "tile_count": len(header.tiles),
-        "sh_degree": header.sh_degree,
-        "scene_flags": [_spec.SCENE_FLAG_NAMES[bit] for bit, is_set in flags.items() if is_set],
-        "axes": "" if header.coordinate_system == "unspecified" else header.coordinate_system,
-        "unit_metres": header.unit_metres or 0.0,
-        "origin": list(header.origin),
-    }
-    floats = summarise({name: getattr(model, name) for name in _FLOATS})
-    return {"header": facts, "integers": summarise(integers), "floats": floats, "extra": summarise(model.extra)}
-
-
-def _difference(expect: dict[str, Any], found: dict[str, Any]) -> str:
-    """Return the names of what differs, or an empty string."""
-    wrong = []
-    for part, values in expect.items():
-        have = found.get(part, {})
-        wrong += [
-            f"{part}.{name}: {have.get(name)} for {value}" for name, value in values.items() if have.get(name) != value
-        ]
-        wrong += [f"{part}.{name}: not asked for" for name in have if name not in values]
-    return "; ".join(wrong)
-
-
-def _run_one(command: str, vector: Vector) -> Result:
-    clauses = tuple(vector.clauses)
-    with tempfile.TemporaryDirectory() as outdir:
-        words = [word.format(input=VECTORS / vector.file, outdir=outdir) for word in shlex.split(command)]
-        try:
-            run = subprocess.run(words, capture_output=True, timeout=_TIMEOUT_SECONDS, check=False)  # noqa: S603 - the caller's command
-        except subprocess.TimeoutExpired:
-            return Result(vector.name, False, f"hang: {_TIMEOUT_SECONDS} s", clauses)
-        if run.returncode not in (0, 1):
-            return Result(vector.name, False, f"crash: exit status {run.returncode}", clauses)
-        if run.returncode == 1:
-            return _refused(vector, run.stdout)
-        if vector.error:
-            optional = vector.error["optional"]
-            return Result(vector.name, optional, "accepted" + " (optional)" * optional, clauses)
-        message = _outdir_difference(vector, Path(outdir))
-        return Result(vector.name, not message, message, clauses)
-
-
-def _refused(vector: Vector, stdout: bytes) -> Result:
-    try:
-        code = json.loads(stdout.splitlines()[-1])["code"]
-    except (ValueError, LookupError, TypeError):
-        return Result(vector.name, False, "exit status 1 without a JSON line", tuple(vector.clauses))
-    if not vector.error:
-        return Result(vector.name, False, f"refused: {code}", tuple(vector.clauses))
-    # Another order of checks may find another code first: a refusal is what counts.
-    message = "" if code == vector.error["code"] else f"planted {vector.error['code']}, reported {code}"
-    return Result(vector.name, True, message, tuple(vector.clauses))
-
-
-def _outdir_difference(vector: Vector, outdir: Path) -> str:
-    wrong = []
-    try:
-        header = json.loads((outdir / "header.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return "no header.json"
-    wrong += [f"header.{key}" for key, value in vector.expect["header"].items() if header.get(key) != value]
-    for part in ("integers", "floats", "extra"):
-        for name, (_, _, digest) in vector.expect[part].items():
-            path = outdir / f"{part}.{quote(name, safe='')}.bin"
-            if path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == digest:
-                continue
-            if path.exists() or part != "integers":
-                wrong.append(f"{part}.{name}")
-    return "; ".join(wrong)
+def _report(subject: str, choice: Choice, results: Sequence[list[Outcome]]) -> Report:
+    outcomes = [outcome for result in results for outcome in result]
+    notes = []
+    if choice.profile != PROFILES[-1]:
+        notes.append(f"profile {choice.profile}: files of another profile have to be refused as unsupported")
+    return Report("decoder", subject, outcomes, notes)

@@ -29,6 +29,7 @@ __all__ = [
     "SCALES",
     "SH0",
     "Recipe",
+    "View",
     "attributes",
     "axis",
     "book",
@@ -58,6 +59,19 @@ _LEVELS_OPACITIES, _LEVELS_QUATS = 255, 127
 
 
 @dataclass(frozen=True)
+class View:
+    """A rendering.
+
+    Attributes:
+        camera: K, viewmat, W, H and near, as a camera file has them.
+        psnr: what a renderer's picture has to reach against the reference, in dB.
+    """
+
+    camera: dict[str, Any]
+    psnr: float
+
+
+@dataclass(frozen=True)
 class Recipe:
     """One vector.
 
@@ -71,6 +85,7 @@ class Recipe:
         offset: the defect's byte, if a single one is to blame.
         also: further codes that a decoder may report.
         optional: decoders that do not use the chunk may accept the file.
+        views: how it has to look, for scenes that are rendered.
     """
 
     name: str
@@ -82,6 +97,7 @@ class Recipe:
     offset: int | None = None
     also: tuple[str, ...] = ()
     optional: bool = False
+    views: tuple[View, ...] = ()
 
 
 def integers(seed: int, count: int, low: int, high: int) -> list[int]:

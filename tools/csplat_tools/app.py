@@ -9,7 +9,7 @@ import typer
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 from csplat_tools.commands.compare import compare
-from csplat_tools.commands.conformance import conformance
+from csplat_tools.commands.conformance_encoder import conformance
 from csplat_tools.commands.decode import decode
 from csplat_tools.commands.encode import encode
 from csplat_tools.commands.info import info

@@ -7,27 +7,29 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from csplat.decoder import Limits, decode, decode_scene
+from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.inout import mapped_csplat, ply_path, read_array, write_array, write_bytes, write_model
 from csplat_tools.models import without_bands
-from csplat_tools.proof import Proof, prove
 
 __all__ = [
     "Encoded",
+    "Encoder",
     "SceneFacts",
-    "Verified",
     "decode_file",
     "encode_file",
     "findings_as_json",
-    "verify_file",
+    "limits_for",
 ]
 
 #: What is told how far a stage has come: its name, and 0 to 1.
 Report = Callable[[str, float], None]
+
+#: Makes a file of a scene.
+Encoder = Callable[[SplatModel, EncodeOptions, Report | None], EncodeResult]
 
 _SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
 
@@ -56,21 +58,6 @@ class SceneFacts:
         if self.licence is not None:
             changes["metadata"] = {**model.metadata, "licence": self.licence}
         return replace(model, **changes) if changes else model
-
-
-@dataclass(frozen=True)
-class Verified:
-    """A file that is intact.
-
-    Attributes:
-        splat_count: its splats.
-        checks: names of the checks that were made.
-        proof: of its stated errors; `None` where no source was given.
-    """
-
-    splat_count: int
-    checks: tuple[str, ...]
-    proof: Proof | None
 
 
 @dataclass(frozen=True)
@@ -117,6 +104,7 @@ def encode_file(
     strict: bool = False,
     importance: str | None = None,
     source_index: str | None = None,
+    encoder: Encoder | None = None,
     progress: Report | None = None,
 ) -> Encoded:
     """Read a PLY, encode it, write the file.
@@ -129,6 +117,7 @@ def encode_file(
         strict: refuse what would be repaired.
         importance: a .npy file with one weight per splat of the PLY as read.
         source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
+        encoder: does more than to encode; `importance` is not for it.
         progress: is told the stages.
 
     Raises:
@@ -146,7 +135,10 @@ def encode_file(
     if progress is not None:
         progress("reading", 1.0)
     model = (facts or SceneFacts()).applied(model)
-    result = encode_with_report(model, options, importance=weights, progress=progress)
+    if encoder is not None:
+        result = encoder(model, options, progress)
+    else:
+        result = encode_with_report(model, options, importance=weights, progress=progress)
     write_bytes(target, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
@@ -180,7 +172,7 @@ def decode_file(
     report("decoding", 0.0)
     with mapped_csplat(source) as data:
         # All bands, even if not all are wanted: the digest is that of the whole file.
-        model = decode(data, limits=_limits(max_splats))
+        model = decode(data, limits=limits_for(max_splats))
     if sh_degree is not None:
         model = without_bands(model, sh_degree)
     report("decoding", 1.0)
@@ -189,40 +181,8 @@ def decode_file(
     report("writing", 1.0)
 
 
-def verify_file(
-    path: str,
-    source: str | None = None,
-    source_index: str | None = None,
-    *,
-    max_splats: int | None = None,
-    progress: Report | None = None,
-) -> Verified:
-    """Decode a file with all checks; prove its stated errors where a source is given.
-
-    Args:
-        path: the file, or `-`.
-        source: the PLY that it was made from.
-        source_index: the .npy file that the encoder wrote.
-        max_splats: budget; the default is the decoder's.
-        progress: is told how far matching has come.
-
-    Raises:
-        CsplatError: the file is not valid; or source or index cannot be read.
-        OSError: a file cannot be read.
-    """
-    rows = None if source_index is None else read_array(source_index)
-    with mapped_csplat(path) as data:
-        scene = decode_scene(data, limits=_limits(max_splats))
-    proof = None
-    if source is not None:
-        with ply_path(source) as ply:
-            model = read_ply(ply, keep_extra=bool(scene.header.extras))
-        proof = prove(model, scene.model, scene.header, scene.stated_errors, rows, progress=progress)
-    return Verified(len(scene.model), scene.checks, proof)
-
-
-def _limits(max_splats: int | None) -> Limits:
-    """The decoder's budgets, or as many as that many splats can take."""
+def limits_for(max_splats: int | None) -> Limits:
+    """Return the decoder's budgets, or what that many splats can take."""
     if max_splats is None:
         return Limits()
     return Limits(splats=max_splats, bytes=max(Limits().bytes, max_splats * _SPLAT_BYTES_MAX))

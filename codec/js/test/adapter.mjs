@@ -1,27 +1,35 @@
-// This decoder behind the protocol of the conformance runner (conformance/README.md):
+// This decoder behind the protocol of the conformance runner (conformance/IMPLEMENTERS.md), a process for each file:
 //
-//   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
+//   csplat conformance decoder --profile base --exact --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
+//
+// and, with --serve, for any number of files: requests on standard input are a u32, the file's size, and the file;
+// each answer is a line of JSON, either {code, offset, clause} or {header, arrays: {name: [bytes, SHA-256]}}.
 
+import { createHash } from 'node:crypto';
 import { readFileSync, writeFileSync } from 'node:fs';
 import { join } from 'node:path';
-
-import { CsplatError, decode } from '../decoder.mjs';
+import { pathToFileURL } from 'node:url';
 
 const FLOATS = ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN'];
 const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 'sh3', 'tile_splats', 'exponents'];
 
-const [input, outdir] = process.argv.slice(2);
+/** Where the decoder lies: a copy of it may be tested in its place. */
+const folder = process.env.CSPLAT_JS ? pathToFileURL(`${process.env.CSPLAT_JS}/`) : new URL('../', import.meta.url);
+const { CsplatError, decode } = await import(new URL('decoder.mjs', folder).href);
 
-/** @param {string} name @param {ArrayBufferView | undefined} array */
-const write = (name, array) => {
-  if (array)
-    writeFileSync(join(outdir, `${name}.bin`), new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
-};
+/** @param {ArrayBufferView} array */
+const raw = (array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
 
-try {
-  const bytes = readFileSync(input);
-  const scene = await decode(bytes);
-  const integers = await decode(bytes, { form: 'integers' });
+/**
+ * Decode a file both ways.
+ *
+ * @param {Uint8Array} bytes
+ * @param {object} [limits] budgets
+ * @returns {Promise<{header: object, arrays: Map<string, ArrayBufferView>}>} arrays by `part.name`
+ */
+async function decoded(bytes, limits = {}) {
+  const scene = await decode(bytes, limits);
+  const integers = await decode(bytes, { ...limits, form: 'integers' });
   const { header } = scene;
   const facts = {
     profile: header.profile,
@@ -33,13 +41,67 @@ try {
     unit_metres: header.unitMetres,
     origin: header.origin,
   };
-  writeFileSync(join(outdir, 'header.json'), JSON.stringify(facts));
-  for (const name of FLOATS) write(`floats.${name}`, scene[name]);
-  for (const name of INTEGERS) write(`integers.${name}`, integers[name]);
-  for (const name in scene.extra) write(`extra.${encodeURIComponent(name)}`, scene.extra[name]);
-} catch (error) {
+  const arrays = new Map();
+  for (const name of FLOATS) if (scene[name]) arrays.set(`floats.${name}`, scene[name]);
+  for (const name of INTEGERS) if (integers[name]) arrays.set(`integers.${name}`, integers[name]);
+  for (const name of Object.keys(scene.extra)) arrays.set(`extra.${name}`, scene.extra[name]);
+  return { header: facts, arrays };
+}
+
+/** What a refusal says, by the protocol. Another error is a defect of the decoder. @param {unknown} error */
+function refusal(error) {
   if (!(error instanceof CsplatError)) throw error;
   const { code, offset, clause } = error;
-  console.log(JSON.stringify({ code, offset, clause }));
-  process.exitCode = 1;
+  return JSON.stringify({ code, offset, clause });
 }
+
+/** @param {string} input @param {string} outdir */
+async function once(input, outdir) {
+  try {
+    const { header, arrays } = await decoded(readFileSync(input));
+    writeFileSync(join(outdir, 'header.json'), JSON.stringify(header));
+    for (const [key, array] of arrays) {
+      const dot = key.indexOf('.');
+      const name = encodeURIComponent(key.slice(dot + 1));
+      writeFileSync(join(outdir, `${key.slice(0, dot)}.${name}.bin`), raw(array));
+    }
+  } catch (error) {
+    console.log(refusal(error));
+    process.exitCode = 1;
+  }
+}
+
+/** @param {Uint8Array} bytes @param {object} limits */
+async function answer(bytes, limits) {
+  try {
+    const { header, arrays } = await decoded(bytes, limits);
+    const sums = [...arrays].map(([key, array]) => [
+      key,
+      [array.byteLength, createHash('sha256').update(raw(array)).digest('hex')],
+    ]);
+    return JSON.stringify({ header, arrays: Object.fromEntries(sums) });
+  } catch (error) {
+    if (error instanceof CsplatError) return refusal(error);
+    return JSON.stringify({ defect: error instanceof Error ? (error.stack ?? error.message) : String(error) });
+  }
+}
+
+/** Answer requests until standard input ends. @param {object} limits */
+async function serve(limits) {
+  let waiting = Buffer.alloc(0);
+  for await (const part of process.stdin) {
+    waiting = waiting.length ? Buffer.concat([waiting, part]) : part;
+    while (waiting.length >= 4) {
+      const size = waiting.readUInt32LE(0);
+      if (waiting.length < 4 + size) break;
+      // A copy that begins at byte 0 of its buffer, as a file that was read does.
+      const bytes = Uint8Array.from(waiting.subarray(4, 4 + size));
+      waiting = waiting.subarray(4 + size);
+      process.stdout.write(`${await answer(bytes, limits)}\n`);
+    }
+  }
+}
+
+const [first, second] = process.argv.slice(2);
+if (first === '--serve') await serve(JSON.parse(second ?? '{}'));
+else await once(first, second);

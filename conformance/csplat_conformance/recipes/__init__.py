@@ -12,7 +12,9 @@ from csplat_conformance.recipes.invalid_index import index_recipes
 from csplat_conformance.recipes.invalid_records import record_recipes
 from csplat_conformance.recipes.invalid_streams import stream_recipes
 from csplat_conformance.recipes.invalid_tiles import tile_recipes
+from csplat_conformance.recipes.rendered import rendered_recipes
 from csplat_conformance.recipes.valid import valid_recipes
+from csplat_conformance.recipes.valid_combined import combined_recipes
 from csplat_conformance.recipes.valid_streams import valid_stream_recipes
 from csplat_conformance.samples import Recipe
 
@@ -21,7 +23,14 @@ __all__ = ["all_recipes"]
 
 def all_recipes() -> list[Recipe]:
     """Return every recipe, in the order of the manifest."""
-    valid = (valid_recipes, valid_stream_recipes, extreme_recipes, extreme_stream_recipes)
+    valid = (
+        valid_recipes,
+        valid_stream_recipes,
+        combined_recipes,
+        extreme_recipes,
+        extreme_stream_recipes,
+        rendered_recipes,
+    )
     invalid = (
         header_recipes,
         index_recipes,

@@ -3,6 +3,9 @@
 Usage:
     python -m csplat_conformance.recipes           # write what is out of date, remove what no recipe makes
     python -m csplat_conformance.recipes --check   # write nothing, exit 1 and name what is out of date
+
+Reference pictures need the packages of the extra `render`; where they are absent, the pictures are left as they are.
+A picture is out of date when it differs visibly: exponentials may round differently on another machine.
 """
 
 from __future__ import annotations
@@ -13,11 +16,17 @@ from pathlib import Path
 
 from csplat_conformance.clauses import clause_map, replaced
 from csplat_conformance.example import annex
-from csplat_conformance.manifest import VECTORS, describe, to_json
+from csplat_conformance.manifest import VECTORS, describe, picture_name, to_json
+from csplat_conformance.pictures import psnr, read_png, write_png
 from csplat_conformance.recipes import all_recipes
+from csplat_conformance.reference import expected
+from csplat_conformance.samples import Recipe
+from csplat_conformance.views import can_render, reference_picture
 
 #: The spec's text; only a checkout has it.
 FORMAT = Path(__file__).parents[3] / "spec" / "format.md"
+
+_SAME_PICTURE = 60.0  # dB: one of 16 values is off by one
 
 
 def main() -> int:
@@ -27,7 +36,10 @@ def main() -> int:
     check = parser.parse_args().check
     wanted = files()
     stale = [path for path, data in wanted.items() if not path.exists() or path.read_bytes() != data]
-    extra = [path for path in sorted(VECTORS.rglob("*.csplat")) if path not in wanted]
+    found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png")])
+    extra = [path for path in found if path not in wanted]
+    if not can_render():
+        sys.stderr.write("SKIPPED: reference pictures, which need the packages of the extra render\n")
     if not check:
         for path in stale:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +58,9 @@ def files() -> dict[Path, bytes]:
     vectors = []
     for recipe in all_recipes():
         data = recipe.data()
-        vector = describe(recipe, data)
+        pictures = _pictures(recipe)
+        vector = describe(recipe, data, list(pictures.values()))
+        result |= pictures
         path = VECTORS / vector.file
         if path in result:
             raise SystemExit(f"two recipes make {vector.file}")
@@ -58,6 +72,24 @@ def files() -> dict[Path, bytes]:
         text = replaced(text, "worked example", annex())
         text = replaced(text, "clause map", clause_map(text, vectors))
         result[FORMAT] = text.encode()
+    return result
+
+
+def _pictures(recipe: Recipe) -> dict[Path, bytes]:
+    """Return the reference pictures of a recipe: those that are there, unless they differ from the equations."""
+    result = {}
+    for number, view in enumerate(recipe.views):
+        path = VECTORS / picture_name(recipe.name, number)
+        old = path.read_bytes() if path.exists() else b""
+        if can_render() and recipe.scene is not None:
+            made = expected(recipe.scene)
+            flags = made.header["scene_flags"]
+            picture = reference_picture(made.floats, view.camera, "antialiased" in flags)
+            if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:
+                old = write_png(picture)
+        if not old:
+            raise SystemExit(f"{path.name} is missing, and the packages of the extra render to make it are too")
+        result[path] = old
     return result
 
 

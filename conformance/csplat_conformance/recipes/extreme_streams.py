@@ -58,6 +58,8 @@ def _codebooks() -> list[Recipe]:
         QUATS: book(9, (), signed([[4, 5, 6]])),
     }
     wild = Codebook(8, _spec.CODEBOOK_KIND_SH0, ({0: [[1, -2, 3], [2**30, 0, -(2**31)]]},), how=Stream(4))
+    far_sh = Codebook(8, _spec.CODEBOOK_KIND_SH, ({1: [[1, -2, 3] * 3, [2**30, 0, -(2**31)] * 3]},), (1, 1), Stream(4))
+    bands = {SH0 + 1: book(8, ((0, 2, 0),), signed([[5, -6, 7] * 3]))}
     return [
         _recipe(
             "codebook_of_65536",
@@ -100,6 +102,12 @@ def _codebooks() -> list[Recipe]:
             "entries beyond every limit that no splat uses",
             "CBK-6 LAT-5",
             replace(_with({SH0: book(8, ((0, 0, 0),))}, records={SH0: _lattice(2.0**100)}), codebooks=(wild,)),
+        ),
+        _recipe(
+            "codebook_unused_entries_sh",
+            "the same in an SH codebook, whose last entry stands where the escaped splat has none",
+            "CBK-6 LAT-5",
+            replace(_with(bands, records={SH0 + 1: _lattice(2.0**100)}), codebooks=(far_sh,), sh_degree=1),
         ),
         _recipe(
             "codebook_negative_entries",

@@ -59,6 +59,14 @@ def _chunks() -> list[Recipe]:
             at="header.file_size",
         ),
         patched("chunk_size_zero", "a size of 0", "CHK-3", "E_INDEX", one, {f"{first}.size": 0}),
+        patched(
+            "directory_size_15",
+            "a directory record's size, a byte below that of an empty chunk",
+            "CHK-3",
+            "E_INDEX",
+            base,
+            {"directory[META].size": 15},
+        ),
         patched("chunk_crc", "a tile's CRC alone is wrong", "CHK-1", "E_CRC", one, {f"{tail}crc": 7}),
         patched(
             "metadata_crc", "the CRC of the metadata alone is wrong", "CHK-1 CHK-2", "E_CRC", base, {"META/crc": 7}

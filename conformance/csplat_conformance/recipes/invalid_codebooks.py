@@ -64,6 +64,7 @@ def _codebooks() -> list[Recipe]:
         return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/quats.attribute")
 
     far = Attribute(_spec.MAPPING_LATTICE, 2.0**100)
+    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: [[1, 0, 0] * 3, [2**30, 0, 0] * 3]},), (1, 1), Stream(4))
     large = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [0, 2**28, 0]]},), how=Stream(4))
     halves = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[2**27, 0, 0]]},) * 2, how=Stream(4))
     summed = {SCALES: replace(book(2, ((0, 2, 1),), summands=(0, 2**28, 0)), how=Stream(4))}
@@ -173,6 +174,19 @@ def _codebooks() -> list[Recipe]:
             "E_RANGE",
             replace(sh0(book(1, ((0, 1),)), large), attributes=attributes() | {SH0: far}),
             "TILE.0.0/sh0.attribute",
+        ),
+        whole(
+            "codebook_sh_value_beyond_float32",
+            "the same in an SH codebook of one stage, whose values a decoder may compute once for all tiles",
+            "LAT-5 CBK-6",
+            "E_RANGE",
+            scene(
+                1,
+                [tile(degree=1, changes={sh_attribute(1): book(1, ((0, 1),))})],
+                codebooks=(large_sh,),
+                attributes=attributes(1) | {sh_attribute(1): far},
+            ),
+            "TILE.0.1/sh1.attribute",
         ),
         whole(
             "codebook_value_in_stages",

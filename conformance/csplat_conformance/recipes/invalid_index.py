@@ -57,6 +57,15 @@ def _index() -> list[Recipe]:
             at="index.splat_count",
         ),
         patched(
+            "index_tile_count_by_layers",
+            "a second tile record announced, room for which the layers of the first take",
+            "IDX-2",
+            "E_INDEX",
+            build(scene(3)),
+            {"index.tile_count": 2},
+            at="index.crc",
+        ),
+        patched(
             "index_table_count_huge",
             "65,535 table ids",
             "IDX-2",

@@ -141,10 +141,20 @@ def _codings() -> list[Recipe]:
         ),
         _recipe(
             "quats",
-            "w from the rest, not the largest component; other orders of operations round differently",
+            "w from the rest, not the largest component",
             "NUM-1 QUA-1 QUA-2",
             _changed(
                 {QUATS: signed([[0, 0, 0], [127, 127, 0], [-127, 0, 127], [1, -1, 1], [89, 89, 2]]), **_fixed_five()},
+            ),
+        ),
+        _recipe(
+            "quats_rounding",
+            "the first w differs where it is √R / M / √2, the second for √R / (M √2), √(R / 2) / M and √(R / 2M²)",
+            "NUM-1 QUA-2",
+            _changed(
+                {QUATS: signed([[32742, 19543, 7188], [-425, 29928, -18]], Stream(2))},
+                2,
+                quats=Attribute(_spec.MAPPING_UNIT_W, levels=32749),
             ),
         ),
         _recipe(
@@ -181,11 +191,20 @@ def _colours() -> list[Recipe]:
         result.append(
             _recipe(
                 f"sh_degree_{degree}_ycocg",
-                "lifting per coefficient; Co and Cg odd and negative",
+                "lifting per coefficient, Co and Cg shifted",
                 "ATT-8 ATT-9",
                 shifted,
             )
         )
+    halves = [[0, odd, other] for odd in (-3, -1, 1) for other in (-3, -1, 1)]
+    unshifted = replace(
+        scene(1, [tile(6, 9, 1, {SH0: signed(halves)})]), attributes=attributes(1, ycocg=True, chroma_shift=0)
+    )
+    result.append(
+        _recipe(
+            "sh0_ycocg_odd", "halves of odd and negative Co and Cg are rounded towards −∞", "ATT-2 NUM-1", unshifted
+        )
+    )
     by_offset = tile(7, 3, 1, {SH0 + 1: offset(rows_of(8, 3, 9, -9, 9), exponent=2)})
     result.append(_recipe("sh1_offset", "a band with offsets and an exponent", "LAT-1", scene(1, [by_offset])))
     lone = tile(8, 3, 0, {SH0 + 2: signed(rows_of(9, 3, 15, -9, 9))})

@@ -7,10 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from csplat.errors import CsplatError, FormatError
+from csplat.errors import CsplatError
+from csplat_conformance.validator import Validation
 from csplat_tools.console import FAILED, format_table, guarded, note, progress_bar, say, say_json
-from csplat_tools.convert import Verified, verify_file
 from csplat_tools.proof import MeasureProof, Proof
+from csplat_tools.verifying import Verified, validation_as_json, verify_file
 
 __all__ = ["verify"]
 
@@ -25,16 +26,19 @@ def verify(
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: prove all.")
     ] = None,
     max_splats: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Refuse a scene of more splats; 2^25 by default.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="Refuse a scene of more splats; 2^25 by default with --source."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Let the status speak.")] = False,
 ) -> None:
-    """Check a file: every checksum, the digest, every value; and its stated errors.
+    """Check a file against every clause of the format, and its stated errors.
 
-    With --source, each splat of the file must have a splat of the PLY within
-    the stated maxima. With --source-index it is known which one, and rms and
-    counts are proved as well.
+    Lists all violations, not only the first: clause, error code, byte,
+    field. The validator shares no code with the decoder. With --source, each
+    splat of the file must have a splat of the PLY within the stated maxima.
+    With --source-index it is known which one, and rms and counts are proved
+    as well.
 
     Examples:
       csplat verify scene.csplat
@@ -48,20 +52,31 @@ def verify(
             verified = verify_file(path, source, source_index, max_splats=max_splats, progress=progress)
     except CsplatError as error:
         if as_json:
-            say_json({"holds": False, "error": _error(error)})
+            say_json({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise
     if as_json:
         say_json(_as_json(verified))
     elif not quiet:
         _report(verified)
-    if verified.proof is not None and not verified.proof.holds:
-        for failure in verified.proof.failures:
-            note(f"error: {failure}")
+    if not verified.holds:
+        _say_why(verified, path, unproved=source is not None and verified.proof is None)
         raise typer.Exit(FAILED)
 
 
+def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
+    violations = verified.validation.violations
+    if violations:
+        clauses = sorted({one.clause for one in violations})
+        many = "1 violation" if len(violations) == 1 else f"{len(violations)} violations"
+        note(f"error: {path}: {many} of {', '.join(clauses)}")
+    if unproved:
+        note("error: the stated errors were not looked at")
+    for failure in verified.proof.failures if verified.proof is not None else ():
+        note(f"error: {failure}")
+
+
 def _report(verified: Verified) -> None:
-    say(f"intact: {verified.splat_count} splats; checked: {', '.join(verified.checks)}")
+    _report_validation(verified.validation)
     proof = verified.proof
     if proof is None:
         return
@@ -71,6 +86,15 @@ def _report(verified: Verified) -> None:
         say(remark)
     if proof.holds:
         say("the stated errors hold" if proof.rms_proved else "the stated maxima hold")
+
+
+def _report_validation(validation: Validation) -> None:
+    for one in (*validation.violations, *validation.unread):
+        say(str(one))
+    for remark in validation.remarks:
+        say(f"remark: {remark}")
+    if validation.conforms:
+        say(f"intact: {validation.splat_count} splats; checked: {', '.join(validation.checks)}")
 
 
 def _table(proof: Proof) -> str:
@@ -95,35 +119,29 @@ def _number(value: float | None) -> str:
 def _as_json(verified: Verified) -> dict[str, Any]:
     proof = verified.proof
     return {
-        "holds": proof is None or proof.holds,
-        "splats": verified.splat_count,
-        "checks": list(verified.checks),
-        "proof": None
-        if proof is None
-        else {
-            "rms_and_counts_proved": proof.rms_proved and proof.holds,
-            "failures": list(proof.failures),
-            "notes": list(proof.notes),
-            "measures": {
-                one.name: {
-                    "stated_max": one.stated_max,
-                    "stated_rms": one.stated_rms,
-                    "measured_max": _finite(one.measured_max),
-                    "measured_rms": _finite(one.measured_rms),
-                    "holds": one.holds,
-                }
-                for one in proof.measures
-            },
+        "holds": verified.holds,
+        **validation_as_json(verified.validation),
+        "proof": None if proof is None else _proof_as_json(proof),
+    }
+
+
+def _proof_as_json(proof: Proof) -> dict[str, Any]:
+    return {
+        "rms_and_counts_proved": proof.rms_proved and proof.holds,
+        "failures": list(proof.failures),
+        "notes": list(proof.notes),
+        "measures": {
+            one.name: {
+                "stated_max": one.stated_max,
+                "stated_rms": one.stated_rms,
+                "measured_max": _finite(one.measured_max),
+                "measured_rms": _finite(one.measured_rms),
+                "holds": one.holds,
+            }
+            for one in proof.measures
         },
     }
 
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
-
-
-def _error(error: CsplatError) -> dict[str, Any]:
-    described: dict[str, Any] = {"code": error.code, "message": str(error)}
-    if isinstance(error, FormatError):
-        described |= {"offset": error.offset, "clause": error.clause}
-    return described

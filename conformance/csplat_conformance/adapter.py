@@ -1,0 +1,124 @@
+"""csplat's Python decoder behind the protocol of the suite (`protocol`), and in this process.
+
+csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}' --exact
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.errors import CsplatError, LimitError
+from csplat_conformance.answers import Answer
+from csplat_conformance.report import Status
+
+if TYPE_CHECKING:
+    from csplat.decoder import Limits
+
+__all__ = ["answer", "main"]
+
+_FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
+    """Decode a file to floats and to integers; both ways must agree on whether it is sound.
+
+    Args:
+        data: the file.
+        limits: budgets; the registry's if left out.
+        threads: as of `csplat.decode`.
+    """
+    began = time.monotonic()
+    try:
+        header, arrays = _decoded(data, limits, threads)
+    except CsplatError as error:
+        code, clause, offset = _place(error)
+        return Answer(Status.REFUSED, str(error), {}, {}, code, clause, offset, time.monotonic() - began)
+    except _DifferError as error:
+        return Answer(Status.FAILED, str(error), seconds=time.monotonic() - began)
+    sums = {key: (len(raw), hashlib.sha256(raw).hexdigest()) for key, raw in arrays.items()}
+    return Answer(Status.PASSED, "", header, sums, seconds=time.monotonic() - began)
+
+
+class _DifferError(Exception):
+    """Two ways of decoding disagree: a defect of the decoder."""
+
+
+def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Return facts of the header, and raw values by `part.name`."""
+    from csplat import decoder  # whoever reads the manifest alone need not load it
+
+    results: list[Any] = []
+    for decode in (decoder.decode, decoder.decode_integers):
+        try:
+            results.append(decode(data, limits=limits, threads=threads))
+        except CsplatError as error:
+            results.append(error)
+    model, integers = results
+    if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
+        # A budget counts the bytes of arrays, and the two ways return other ones.
+        if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
+            words = [str(result) if isinstance(result, CsplatError) else "accepted" for result in results]
+            raise _DifferError(f"decode and decode_integers differ: {words[0]}; {words[1]}")
+        raise model if isinstance(model, CsplatError) else integers
+    arrays = {f"floats.{name}": _raw(getattr(model, name)) for name in _FLOATS}
+    arrays |= {f"integers.{name}": _raw(array) for name, array in integers.items()}
+    arrays |= {f"extra.{name}": _raw(array) for name, array in model.extra.items()}
+    return _facts(decoder.read_header(data)), arrays
+
+
+def _place(result: Any) -> tuple[str, str | None, int | None]:
+    """Return code, clause and offset of an error; of anything else what no error has."""
+    return getattr(result, "code", ""), getattr(result, "clause", None), getattr(result, "offset", None)
+
+
+def _raw(array: NDArray[Any]) -> bytes:
+    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+
+
+def _facts(header: Any) -> dict[str, Any]:
+    """Return the header's facts in the words of the manifest."""
+    flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
+    return {
+        "profile": header.profile,
+        "splat_count": header.splat_count,
+        "tile_count": len(header.tiles),
+        "sh_degree": header.sh_degree,
+        "scene_flags": [_spec.SCENE_FLAG_NAMES[bit] for bit, is_set in flags.items() if is_set],
+        "axes": "" if header.coordinate_system == "unspecified" else header.coordinate_system,
+        "unit_metres": header.unit_metres or 0.0,
+        "origin": list(header.origin),
+    }
+
+
+def main() -> int:
+    """Answer by the protocol: files and status 0, or a line of JSON and status 1."""
+    parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
+    parser.add_argument("input", type=Path)
+    parser.add_argument("outdir", type=Path)
+    args = parser.parse_args()
+    try:
+        header, arrays = _decoded(args.input.read_bytes(), None, None)
+    except CsplatError as error:
+        code, clause, offset = _place(error)
+        sys.stdout.write(json.dumps({"code": code, "offset": offset, "clause": clause}) + "\n")
+        return 1
+    (args.outdir / "header.json").write_text(json.dumps(header), encoding="utf-8")
+    for key, raw in arrays.items():
+        part, name = key.split(".", 1)
+        (args.outdir / f"{part}.{quote(name, safe='')}.bin").write_bytes(raw)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

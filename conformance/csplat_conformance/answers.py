@@ -1,0 +1,184 @@
+"""What a decoder made of a vector, and whether that is what the manifest says.
+
+| level | looks at |
+|---|---|
+| L1 | `header.json`; for broken files the refusal |
+| L2 | the integer arrays of spec 9.2 |
+| L3 | the float arrays of spec section 3 and the extra columns, bit for bit |
+
+L4, pictures, is `views`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from csplat import _spec
+from csplat_conformance.manifest import Vector
+from csplat_conformance.report import Outcome, Status
+
+__all__ = ["LEVELS", "PARTS", "Answer", "judge", "level_name"]
+
+#: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
+PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
+LEVELS = (*PARTS, 4)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of one vector.
+
+    Attributes:
+        status: PASSED where the file was decoded, REFUSED where it was refused, otherwise what went wrong.
+        message: one line about what went wrong.
+        header: facts of header and index.
+        arrays: by `part.name`, as `floats.means`: bytes and SHA-256 of the raw little-endian values.
+        code: error code of a refusal.
+        clause: clause that it names, if any.
+        offset: byte of the file that it names, if any.
+        seconds: how long it took.
+    """
+
+    status: Status
+    message: str = ""
+    header: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    code: str = ""
+    clause: str | None = None
+    offset: int | None = None
+    seconds: float = 0.0
+
+
+def level_name(level: int) -> str:
+    """Return `L3` for 3."""
+    return f"L{level}"
+
+
+def judge(
+    vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False, profile: str = "archive"
+) -> list[Outcome]:
+    """Compare an answer with the manifest: one outcome for each level that applies to the vector.
+
+    Args:
+        vector: entry of the manifest.
+        answer: what the decoder did.
+        levels: numbers of the levels that are asked for.
+        exact: of refusals demand code, clause and offset too, and optional refusals: for csplat's own decoders.
+        profile: what the decoder reads; one of `base` refuses `archive` as unsupported.
+    """
+    unsupported = profile == _spec.PROFILE_NAMES[_spec.PROFILE_BASE] and vector.profile != profile
+    if vector.error or unsupported:
+        return [_judge_refusal(vector, answer, exact, unsupported)] if 1 in levels else []
+    result = []
+    for level, parts in PARTS.items():
+        if level not in levels or not any(vector.expect[part] for part in parts):
+            continue
+        status, message = answer.status, answer.message
+        if status is Status.PASSED:
+            status, message = _compare(vector, answer, parts)
+        elif status is Status.REFUSED:
+            message = message or "refused a valid file"
+        passed = status is Status.PASSED
+        result.append(
+            Outcome(
+                vector.name,
+                level_name(level),
+                status,
+                tuple(vector.clauses),
+                "" if passed else answer.code,
+                message,
+                answer.seconds if level == min(levels) else 0.0,
+            )
+        )
+    return result
+
+
+# Refusals ------------------------------------------------------------------------------------------
+
+
+def _judge_refusal(vector: Vector, answer: Answer, exact: bool, unsupported: bool) -> Outcome:
+    wanted = vector.error
+    if unsupported:
+        at = _spec.HEADER_OFFSETS["profile"]
+        wanted = {"code": _spec.ERROR_UNSUPPORTED, "clause": "HDR-4", "offset": at, "also": [], "optional": False}
+    status, message = answer.status, answer.message
+    if status is Status.PASSED:
+        optional = wanted["optional"] and not exact
+        status = Status.PASSED if optional else Status.FAILED
+        message = "accepted, as a decoder may that does not use the chunk" if optional else "accepted"
+    elif status is Status.REFUSED:
+        status, message = _compare_refusal(answer, wanted, exact, unsupported and not vector.error)
+    clauses = tuple(vector.clauses)
+    if status not in (Status.PASSED, Status.SKIPPED):
+        clauses = (wanted["clause"], *(clause for clause in clauses if clause != wanted["clause"]))
+    return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds)
+
+
+def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool, code_matters: bool) -> tuple[Status, str]:
+    """A refusal is what counts: another order of checks may find another code first."""
+    found = _words(answer.code, answer.clause, answer.offset)
+    planted = f"planted {_words(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
+    if exact:
+        same = (answer.code, answer.clause, answer.offset) == (wanted["code"], wanted["clause"], wanted["offset"])
+        return (Status.PASSED, "") if same else (Status.FAILED, planted)
+    if answer.code in (wanted["code"], *wanted["also"]):
+        return Status.PASSED, ""
+    # A decoder that lacks a profile has to say so: its user needs another decoder, not another file.
+    return (Status.FAILED if code_matters else Status.PASSED), planted
+
+
+def _words(code: str, clause: str | None, offset: int | None) -> str:
+    where = "" if offset is None else f" at byte {offset}"
+    return f"{code}{where}" + (f" by {clause}" if clause else "")
+
+
+# Arrays --------------------------------------------------------------------------------------------
+
+
+def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...]) -> tuple[Status, str]:
+    if not answer.header and not answer.arrays:
+        return Status.NO_OUTPUT, "nothing was written"
+    if "header" in parts:
+        return _compare_header(vector.expect["header"], answer.header)
+    found: list[tuple[Status, str]] = []
+    for part in parts:
+        for name, summary in vector.expect[part].items():
+            found += _compare_array(f"{part}.{name}", summary, answer.arrays.get(f"{part}.{name}"))
+        more = [key for key in answer.arrays if key.split(".", 1)[0] == part]
+        extra = [key for key in more if key.split(".", 1)[1] not in vector.expect[part]]
+        found += [(Status.FAILED, f"{key}: not asked for") for key in extra]
+    if not found:
+        return Status.PASSED, ""
+    return max((status for status, _ in found), key=_gravity), "; ".join(text for _, text in found)
+
+
+def _gravity(status: Status) -> int:
+    """Of several things that are wrong with the arrays of one vector the first of these gives the name."""
+    return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
+
+
+def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[Status, str]:
+    if not found:
+        return Status.WRONG_ANSWER, "no header.json"
+    wrong = []
+    for key, value in expect.items():
+        have = found.get(key)
+        if key == "scene_flags" and isinstance(have, list):
+            have, value = sorted(map(str, have)), sorted(value)  # noqa: PLW2901 - a set: its order means nothing
+        if have != value:
+            wrong.append(f"header.{key}: {have!r} for {value!r}")
+    return (Status.FAILED, "; ".join(wrong)) if wrong else (Status.PASSED, "")
+
+
+def _compare_array(key: str, summary: list[Any], found: tuple[int, str] | None) -> list[tuple[Status, str]]:
+    dtype, shape, digest = summary
+    if found is None:
+        return [(Status.WRONG_ANSWER, f"{key} is missing")]
+    size = math.prod(shape) * int(dtype[1:])
+    if found[0] != size:
+        status = Status.PARTIAL_OUTPUT if found[0] < size else Status.FAILED
+        return [(status, f"{key}: {found[0]} bytes for {size}, {dtype} {shape}")]
+    return [] if found[1] == digest else [(Status.FAILED, f"{key} differs")]

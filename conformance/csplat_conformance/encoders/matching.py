@@ -1,0 +1,97 @@
+"""Which source splat a decoded one stands for: the only one that is near, since the inputs keep them apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Pairs", "pair"]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_NONE = -1
+_CELL_MAX = 2.0**40  # centres farther away than so many distances share a cell; distance decides anyway
+_MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Who belongs to whom.
+
+    Attributes:
+        source_index: [N], of each decoded splat; −1 where no source splat is near.
+        strays: decoded splats without a source.
+        surplus: decoded splats whose source splat another one has taken.
+        missing: source splats that nobody stands for.
+    """
+
+    source_index: I64
+    strays: int
+    surplus: int
+    missing: int
+
+
+def pair(source: F64, decoded: F64, apart: float) -> Pairs:
+    """Pair splats by their centres.
+
+    Args:
+        source: [M, 3]; different centres are at least `apart` from each other. Equal ones are exact duplicates, which
+            are paired one by one.
+        decoded: [N, 3].
+        apart: a decoded splat belongs to the source centre that is nearer than half of this.
+    """
+    if not len(source) or not len(decoded):
+        return Pairs(np.full(len(decoded), _NONE, np.int64), len(decoded), 0, len(source))
+    centres, member_of, counts = np.unique(source, axis=0, return_inverse=True, return_counts=True)
+    group = _nearest(centres, decoded, apart)
+    members = np.argsort(member_of.reshape(-1), kind="stable")
+    first = np.concatenate([[0], np.cumsum(counts)])
+    index = np.full(len(decoded), _NONE, np.int64)
+    near = np.flatnonzero(group != _NONE)
+    order = near[np.argsort(group[near], kind="stable")]
+    groups = group[order]
+    rank = np.arange(len(order)) - np.searchsorted(groups, groups, "left")
+    taken = rank < counts[groups]
+    index[order[taken]] = members[first[groups[taken]] + rank[taken]]
+    paired = int(taken.sum())
+    return Pairs(index, len(decoded) - len(near), len(near) - paired, len(source) - paired)
+
+
+def _nearest(centres: F64, decoded: F64, apart: float) -> I64:
+    """Return for each decoded centre the source centre that is nearer than half of `apart`, or −1."""
+    keys = _keys(_cells(centres, apart))
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    own = _cells(decoded, apart)
+    found = np.full(len(decoded), _NONE, np.int64)
+    for step in product((-1, 0, 1), repeat=3):
+        wanted = _keys(own + np.array(step, np.int64))
+        first, last = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
+        # One cell holds few centres, since its side is their distance.
+        for nth in range(int((last - first).max(initial=0))):
+            rows = np.flatnonzero(first + nth < last)
+            candidates = order[first[rows] + nth]
+            moved = decoded[rows] - centres[candidates]
+            good = np.sqrt(np.square(moved).sum(axis=1)) < apart / 2.0
+            found[rows[good]] = candidates[good]
+    return found
+
+
+def _cells(points: F64, side: float) -> I64:
+    with np.errstate(over="ignore", invalid="ignore"):
+        cells = np.clip(np.floor(points / side), -_CELL_MAX, _CELL_MAX)
+    result: I64 = np.nan_to_num(cells).astype(np.int64)
+    return result
+
+
+def _keys(cells: I64) -> NDArray[np.uint64]:
+    """Mix three numbers into one; equal keys of unequal cells cost a comparison, no more."""
+    keys = np.zeros(len(cells), np.uint64)
+    for axis, factor in enumerate(_MIX):
+        keys ^= cells[:, axis].astype(np.uint64) * factor
+        keys ^= keys >> np.uint64(29)
+    return keys

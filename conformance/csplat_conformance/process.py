@@ -1,0 +1,121 @@
+"""Start somebody else's program, once, with a limit of time, and say how it ended.
+
+    >>> places = {"input": "a b.ply", "out": "x"}
+    >>> ended = run_program("my-tool {input} {out}", places, timeout_seconds=60)  # doctest: +SKIP
+    >>> ended.status, ended.returncode                                            # doctest: +SKIP
+    (None, 0)
+
+The command line is split as a shell would, without a shell: no pipes, no variables. Names in braces are put in after
+the split, so that file names may hold spaces.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import IO
+
+from csplat.errors import InputError
+from csplat_conformance.report import Status
+
+__all__ = ["Ended", "run_program", "split_command"]
+
+_OUTPUT_MAX = 1 << 20  # bytes of each stream that are kept: a program may print for ever
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a program ended.
+
+    Attributes:
+        status: `CRASHED` by a signal, `HUNG`, `WRONG_STATUS` for anything but 0 and 1; `None` for 0 and 1.
+        returncode: exit status, minus the signal's number after a crash.
+        stdout: the end of standard output, a mebibyte at most.
+        stderr: the end of standard error, likewise.
+        seconds: how long it ran.
+        message: what `status` means here, in words; empty for `None`.
+    """
+
+    status: Status | None
+    returncode: int
+    stdout: bytes
+    stderr: bytes
+    seconds: float
+    message: str = ""
+
+
+def split_command(command: str, names: tuple[str, ...]) -> list[str]:
+    """Split a command line and see to it that it names what it must.
+
+    Raises:
+        InputError: quotes without an end, no program, a name in braces that is missing or unknown.
+    """
+    try:
+        words = shlex.split(command)
+        missing = [name for name in names if not any(f"{{{name}}}" in word for word in words)]
+        for word in words:
+            word.format(**dict.fromkeys(names, ""))
+    except (ValueError, LookupError, AttributeError) as error:
+        raise InputError(f"the command {command!r} cannot be used: {error}") from None
+    if missing or not words:
+        raise InputError(f"the command {command!r} lacks {', '.join(f'{{{name}}}' for name in missing) or 'a program'}")
+    return words
+
+
+def run_program(command: str, places: Mapping[str, str], timeout_seconds: float) -> Ended:
+    """Run a command line in a process group of its own; what is left of the group after the time is killed.
+
+    Args:
+        command: with the keys of `places` in braces.
+        places: what to put in.
+        timeout_seconds: wall-clock limit.
+
+    Raises:
+        InputError: the command line is not one, or there is no such program.
+    """
+    words = [word.format(**places) for word in split_command(command, tuple(places))]
+    start = time.perf_counter()
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        try:
+            process = subprocess.Popen(  # noqa: S603 - to run the caller's command is what this is for
+                words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
+            )
+        except OSError as error:
+            raise InputError(f"{words[0]}: {error.strerror or error}") from None
+        status: Status | None = None
+        try:
+            returncode = process.wait(timeout_seconds)
+        except subprocess.TimeoutExpired:
+            status = Status.HUNG
+            returncode = -signal.SIGKILL
+        finally:
+            _kill_group(process)
+        seconds = time.perf_counter() - start
+        message = ""
+        if status is Status.HUNG:
+            message = f"still running after {timeout_seconds:g} s"
+        elif returncode < 0:
+            status, message = Status.CRASHED, f"ended by signal {-returncode}"
+        elif returncode > 1:
+            status, message = Status.WRONG_STATUS, f"exit status {returncode}"
+        return Ended(status, returncode, _tail(out), _tail(err), seconds, message)
+
+
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
+    """End whatever the program started and left behind; that there is nothing is the usual case."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _tail(stream: IO[bytes]) -> bytes:
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(0, size - _OUTPUT_MAX))
+    return stream.read()

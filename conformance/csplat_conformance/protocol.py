@@ -1,0 +1,89 @@
+"""The protocol by which any decoder can be tested: one process for each vector.
+
+    my-decoder INPUT OUTDIR
+
+It exits with status 0 and leaves in OUTDIR `header.json` and a file of raw values for each array, little-endian, in
+C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (NAME of a column percent-encoded). Or it exits
+with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from csplat_conformance.answers import Answer
+from csplat_conformance.process import Ended, run_program
+from csplat_conformance.report import Status
+
+__all__ = ["ask", "last_words"]
+
+_WORDS_MAX = 200  # characters of a program's own message
+_PARTS = ("integers", "floats", "extra")
+
+
+def ask(command: str, path: Path, timeout: float) -> Answer:
+    """Let a decoder have one file.
+
+    Args:
+        command: command line with `{input}` and `{outdir}`.
+        path: the file.
+        timeout: seconds after which the process and its children are killed.
+    """
+    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
+        outdir = Path(folder) / "out"
+        outdir.mkdir()
+        ended = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
+        if ended.status is not None:
+            return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)
+        left = sorted(entry.name for entry in outdir.iterdir())
+        if ended.returncode == 1:
+            return _refusal(ended, left)
+        return _decoded(outdir, left, ended.seconds)
+
+
+def _refusal(ended: Ended, left: list[str]) -> Answer:
+    try:
+        facts: dict[str, Any] = dict(json.loads((ended.stdout.splitlines() or [b""])[-1]))
+        code, clause, offset = facts["code"], facts.get("clause"), facts.get("offset")
+        if not isinstance(code, str):
+            raise TypeError
+    except (ValueError, LookupError, TypeError, RecursionError):
+        text = f"exit status 1 without a line of JSON that has a code{last_words(ended)}"
+        return Answer(Status.WRONG_ANSWER, text, seconds=ended.seconds)
+    if left:
+        return Answer(Status.PARTIAL_OUTPUT, f"refused, but left {', '.join(left)}", code=code, seconds=ended.seconds)
+    return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=ended.seconds)
+
+
+def last_words(ended: Ended) -> str:
+    """Return the last line of standard error as the end of a sentence, or nothing."""
+    lines = ended.stderr.decode("utf-8", "replace").split("\n")
+    words = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return f": {words[:_WORDS_MAX]}" if words else ""
+
+
+def _decoded(outdir: Path, left: list[str], seconds: float) -> Answer:
+    header: dict[str, Any] = {}
+    arrays = {}
+    for name in left:
+        path = outdir / name
+        part, _, rest = name.partition(".")
+        if name == "header.json":
+            try:
+                header = json.loads(path.read_bytes())
+            except (ValueError, RecursionError, OSError):
+                header = {}
+            if not isinstance(header, dict) or not header:
+                return Answer(Status.WRONG_ANSWER, "header.json is not a JSON object", seconds=seconds)
+        elif part in _PARTS and rest.endswith(".bin") and path.is_file():
+            with path.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            arrays[f"{part}.{unquote(rest.removesuffix('.bin'))}"] = (path.stat().st_size, digest)
+        else:
+            return Answer(Status.WRONG_ANSWER, f"{name} is no file of the protocol", seconds=seconds)
+    return Answer(Status.PASSED, header=header, arrays=arrays, seconds=seconds)

@@ -1,0 +1,236 @@
+"""What became of a run of the suite, for people (a table), for programs (JSON) and for CI (JUnit XML).
+
+    >>> report = Report("decoder", "my-decoder {input} {outdir}", [
+    ...     Outcome("valid/rich", "L2", Status.PASSED, seconds=0.25),
+    ...     Outcome("invalid/index_crc", "L1", Status.FAILED, ("IDX-1",), "E_CRC", "accepted"),
+    ... ])
+    >>> report.passed
+    False
+    >>> print(to_table(report))
+    L1  FAILED  invalid/index_crc  accepted (IDX-1, E_CRC)
+    <BLANKLINE>
+    level  checks  passed  failed  skipped
+    L1          1       0       1        0
+    L2          1       1       0        0
+    all         2       1       1        0
+
+A runner makes one `Outcome` for each check, that is for each vector or input and level. `failed` and what a process
+can do instead of an answer (`crashed`, `hung` and so on) all count as failures; they are told apart for whoever has
+to mend something. Nothing here knows decoders or encoders.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from html import escape
+from typing import Any
+
+__all__ = ["Outcome", "Report", "Status", "to_json", "to_junit", "to_table"]
+
+#: What XML 1.0 cannot hold, not even as a reference.
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+class Status(StrEnum):
+    """What became of a check. All but `PASSED` and `SKIPPED` are failures."""
+
+    PASSED = "passed"
+    FAILED = "failed"  #: the answer is wrong
+    CRASHED = "crashed"  #: ended by a signal
+    HUNG = "hung"  #: did not end in time
+    WRONG_STATUS = "wrong status"  #: an exit status that the protocol does not have
+    WRONG_ANSWER = "wrong answer"  #: the status of the protocol, without the line or the files that go with it
+    NO_OUTPUT = "no output"  #: success is claimed, nothing was written
+    PARTIAL_OUTPUT = "partial output"  #: a file was left that is cut short, or by a run that failed
+    REFUSED = "refused"  #: what must be accepted was refused
+    SKIPPED = "skipped"  #: not looked at; the message says why
+
+
+#: What did not come to an answer: JUnit calls these errors.
+_ERRORS = frozenset((Status.CRASHED, Status.HUNG, Status.WRONG_STATUS, Status.NO_OUTPUT, Status.WRONG_ANSWER))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One check.
+
+    Attributes:
+        name: what was looked at, with its group, `invalid/index_crc`.
+        level: what was asked of it, `L1`.
+        status: what became of it.
+        clauses: ids of the spec: those that are broken, or, where nobody can tell, those that the check covers.
+        code: error code that was reported or found, `E_CRC`.
+        message: one line; of a check that passed a remark, if there is one.
+        seconds: how long it took.
+        details: JSON-compatible facts for programs, such as measured numbers.
+    """
+
+    name: str
+    level: str
+    status: Status
+    clauses: tuple[str, ...] = ()
+    code: str = ""
+    message: str = ""
+    seconds: float = 0.0
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def good(self) -> bool:
+        """Whether the check passed or was skipped."""
+        return self.status in (Status.PASSED, Status.SKIPPED)
+
+
+@dataclass(frozen=True)
+class Report:
+    """All checks of a run.
+
+    Attributes:
+        suite: `decoder` or `encoder`.
+        subject: what was tested: a command line, or words.
+        outcomes: in the order of the run.
+        notes: a line each about the run as a whole.
+    """
+
+    suite: str
+    subject: str
+    outcomes: Sequence[Outcome]
+    notes: Sequence[str] = ()
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """The checks that did not pass."""
+        return [one for one in self.outcomes if not one.good]
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was checked and nothing failed."""
+        return bool(self.outcomes) and not self.failures
+
+    def levels(self) -> dict[str, dict[str, int]]:
+        """Return by level how many checks there were, how many passed, failed and were skipped."""
+        return {level: _counts(one for one in self.outcomes if one.level == level) for level in _levels(self)}
+
+
+def _levels(report: Report) -> list[str]:
+    return sorted({one.level for one in report.outcomes})
+
+
+def _counts(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    counts = {"checks": 0, "passed": 0, "failed": 0, "skipped": 0}
+    for one in outcomes:
+        counts["checks"] += 1
+        counts[str(one.status) if one.good else "failed"] += 1
+    return counts
+
+
+def to_table(report: Report, *, verbose: bool = False) -> str:
+    """Return the failures, skips and remarks, a line each, and the counts by level.
+
+    Args:
+        report: the run.
+        verbose: a line for every check.
+    """
+    shown = [one for one in report.outcomes if verbose or one.message or not one.good]
+    lines = _aligned([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
+    lines += [""] * bool(lines)
+    lines += [*report.notes]
+    counts = [*report.levels().items(), ("all", _counts(report.outcomes))]
+    header = ("level", "checks", "passed", "failed", "skipped")
+    rows = [(level, *map(str, (count[name] for name in header[1:]))) for level, count in counts]
+    return "\n".join([*lines, *_aligned([header, *rows], right=True)])
+
+
+def _word(status: Status) -> str:
+    """Failures are in capitals, so that the eye and grep find them."""
+    return "ok" if status is Status.PASSED else "skipped" if status is Status.SKIPPED else str(status).upper()
+
+
+def _remark(one: Outcome) -> str:
+    message = " ".join(one.message.split())  # a line stays a line, whatever a foreign program printed
+    where = ", ".join([*one.clauses, *([one.code] if one.code else [])])
+    if not where or (one.good and not message):
+        return message
+    return f"{message} ({where})" if message else f"({where})"
+
+
+def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
+    """Lay out rows in columns: all but the first to the right where asked for, the last never padded."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    lines = []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if right and i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def to_json(report: Report) -> dict[str, Any]:
+    """Return the run as JSON-compatible values: `suite`, `subject`, `passed`, `levels`, `notes`, `outcomes`."""
+    return {
+        "suite": report.suite,
+        "subject": report.subject,
+        "passed": report.passed,
+        "levels": report.levels(),
+        "notes": list(report.notes),
+        "outcomes": [_outcome_json(one) for one in report.outcomes],
+    }
+
+
+def _outcome_json(one: Outcome) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "level": one.level,
+        "status": str(one.status),
+        "clauses": list(one.clauses),
+        "code": one.code,
+        "message": one.message,
+        "seconds": round(one.seconds, 4),
+        "details": one.details,
+    }
+
+
+def to_junit(report: Report) -> str:
+    """Return the run as JUnit XML: a test suite for each level, a test case for each check."""
+    suites = [_suite(report, level) for level in _levels(report)]
+    head = f'<testsuites name="csplat {_xml(report.suite)}" {_totals(report.outcomes)}>'
+    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *suites, "</testsuites>", ""])
+
+
+def _suite(report: Report, level: str) -> str:
+    outcomes = [one for one in report.outcomes if one.level == level]
+    name = f"csplat.{report.suite}.{level}"
+    cases = [_case(one, name) for one in outcomes]
+    head = f'  <testsuite name="{_xml(name)}" {_totals(outcomes)}>'
+    subject = f'    <properties><property name="subject" value="{_xml(report.subject)}"/></properties>'
+    return "\n".join([head, subject, *cases, "  </testsuite>"])
+
+
+def _totals(outcomes: Sequence[Outcome]) -> str:
+    errors = sum(one.status in _ERRORS for one in outcomes)
+    failures = sum(not one.good for one in outcomes) - errors
+    skipped = sum(one.status is Status.SKIPPED for one in outcomes)
+    seconds = sum(one.seconds for one in outcomes)
+    return f'tests="{len(outcomes)}" failures="{failures}" errors="{errors}" skipped="{skipped}" time="{seconds:.3f}"'
+
+
+def _case(one: Outcome, suite: str) -> str:
+    head = f'    <testcase classname="{_xml(suite)}" name="{_xml(one.name)}" time="{one.seconds:.3f}"'
+    if one.status is Status.PASSED:
+        return head + "/>"
+    if one.status is Status.SKIPPED:
+        return f'{head}><skipped message="{_xml(one.message)}"/></testcase>'
+    kind = "error" if one.status in _ERRORS else "failure"
+    message = f'message="{_xml(f"{one.status}: {_remark(one)}")}"'
+    return f'{head}><{kind} type="{_xml(one.code or str(one.status))}" {message}/></testcase>'
+
+
+def _xml(text: str) -> str:
+    """Quote for an attribute; what XML has no way to write becomes a question mark."""
+    return (
+        escape(_NOT_XML.sub("?", text), quote=True).replace("\n", "&#10;").replace("\t", "&#9;").replace("\r", "&#13;")
+    )

@@ -1,0 +1,126 @@
+"""Chunks of the whole file: JSON texts and stated errors (spec 5.4, 5.5)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.validator.index import Index
+from csplat_conformance.validator.jsontext import JsonError, parse
+from csplat_conformance.validator.reading import Payload
+from csplat_conformance.validator.streams import read_stream
+
+__all__ = ["read_stated_errors", "read_text"]
+
+_COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
+_ROOM = 1.0 + 2.0**-20  # SER-2
+_EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
+_CAMERA_KEYS = ("K", "viewmat", "W", "H")
+_TEXT_WIDTH = 1
+
+
+def read_text(payload: Payload, kind: bytes, profile: int, bytes_max: int) -> None:
+    """Check META, CAMS or OPTS: STR, JSN-1, JSN-2; keys that the spec names and that are missing are remarks."""
+    stream = read_stream(payload, "stream", profile, None, _TEXT_WIDTH, count_max=bytes_max)
+    payload.finish()
+    if stream.elements is None:
+        return
+    findings = payload.findings
+    try:
+        value = parse(np.asarray(stream.elements, np.uint8).tobytes())
+    except JsonError as error:
+        findings.add("JSN-1", stream.head.offset, f"{payload.name}/stream", str(error))
+        return
+    if kind == _spec.CHUNK_CAMERAS:
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            findings.add("JSN-1", stream.head.offset, f"{payload.name}/stream", "not an array of objects")
+        else:
+            _remark_cameras(findings, value)
+    elif not isinstance(value, dict):
+        findings.add("JSN-1", stream.head.offset, f"{payload.name}/stream", "not an object")
+
+
+def _remark_cameras(findings: Findings, cameras: list[dict[str, Any]]) -> None:
+    for i, camera in enumerate(cameras):
+        missing = [key for key in _CAMERA_KEYS if key not in camera]
+        if missing:
+            findings.remarks.append(f"CAMS: camera {i} has no {', '.join(missing)} (5.4)")
+            return
+
+
+def read_stated_errors(payload: Payload, index: Index) -> None:
+    """Check SERR: SER-1 to SER-4, and of SER-5 what holds whatever the source was."""
+    findings = payload.findings
+    head = payload.structure(
+        _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS, "head"
+    )
+    stated = head.record
+    unlisted = stated.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
+    if unlisted:
+        findings.of("RES-1", head, "error_flags", f"bits {unlisted:#04x} are reserved")
+    splats = index.head.record.splat_count
+    if stated.source_count - stated.pruned_count != splats:
+        message = f"{stated.source_count} splats less {stated.pruned_count} are not the {splats} of the file"
+        findings.of("SER-4", head, "source_count", message)
+    last = 0
+    for i in range(stated.record_count):
+        name = _spec.MEASURE_NAMES.get(payload.view[payload.at] if payload.left else 0, str(i))
+        record = payload.structure(
+            _spec.unpack_stated_error_record,
+            _spec.STATED_ERROR_RECORD_SIZE,
+            _spec.STATED_ERROR_RECORD_OFFSETS,
+            f"record[{name}]",
+        )
+        measure = record.record.measure
+        if measure not in _spec.MEASURE_NAMES:
+            findings.of("SER-1", record, "measure", f"{measure} is no measure of the registry")
+        elif measure <= last:
+            findings.of("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
+        last = max(last, measure)
+        if _check_pair(findings, record) and measure in _spec.MEASURE_NAMES:
+            refitted = bool(stated.error_flags & _spec.ERROR_FLAG_REFITTED)
+            if not refitted:
+                _check_possible(findings, record, index, stated.source_sh_degree)
+    payload.finish()
+
+
+def _check_pair(findings: Findings, record: Placed[_spec.StatedErrorRecord]) -> bool:
+    """SER-2. Whether both are numbers that can be compared."""
+    largest, rms = record.record.max, record.record.rms
+    wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
+    for key in wrong:
+        findings.of("SER-2", record, key, f"{getattr(record.record, key)}, wanted finite and not negative")
+    if wrong:
+        return False
+    components = _COMPONENTS.get(_spec.MEASURE_NAMES.get(record.record.measure, ""))
+    if components is not None and rms > largest * math.sqrt(components) * _ROOM:
+        message = f"{largest:.9g}, and rms {rms:.9g} is more than that allows for {components} components"
+        findings.of("SER-2", record, "max", message)
+        return False
+    return True
+
+
+def _check_possible(
+    findings: Findings, record: Placed[_spec.StatedErrorRecord], index: Index, source_degree: int
+) -> None:
+    """SER-5 without the source: no pair of scenes has these errors, or they exceed the true ones by too much.
+
+    The true maximum is at least (max − 10^−12) / (1 + 10^−4); one splat has it, so the true rms, and the stated one
+    which is no less, is at least that over √N.
+    """
+    largest, rms = record.record.max, record.record.rms
+    least = max(0.0, (largest - _EXCESS_FLOOR) / (1.0 + _EXCESS))
+    splats, measure = index.head.record.splat_count, _spec.MEASURE_NAMES[record.record.measure]
+    if splats and rms * _ROOM < least / math.sqrt(splats):
+        message = f"{rms:.9g} is too small for max {largest:.9g} over {splats} splats"
+        findings.of("SER-5", record, "rms", message)
+    if measure == "opacities" and least > 1.0:
+        findings.of("SER-5", record, "max", f"alpha differs by at most 1, not by {largest:.9g}")
+    band = record.record.measure - _spec.MEASURE_SH0
+    degree = index.degree if index.degree is not None else _spec.SH_DEGREE_MAX
+    if (band > max(degree, source_degree) or not splats) and least > 0.0:
+        findings.of("SER-5", record, "max", f"{largest:.9g} for {measure}, of which there is nothing to differ")

@@ -1,0 +1,245 @@
+"""From the first byte to the last: header, index, chunks, digest."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from mmap import mmap
+
+from csplat import _spec
+from csplat_conformance.validator.ancillary import read_stated_errors, read_text
+from csplat_conformance.validator.chunks import Chunk, check_coverage, check_frame, read_directory
+from csplat_conformance.validator.codebooks import Entries, read_codebook
+from csplat_conformance.validator.coded import read_coded
+from csplat_conformance.validator.findings import Findings, Placed, TooManyError, Validation
+from csplat_conformance.validator.index import Index, read_records
+from csplat_conformance.validator.reading import Payload, UnreadableError, place
+from csplat_conformance.validator.tile_records import Tile, read_tiles
+from csplat_conformance.validator.tiles import TileReader
+
+__all__ = ["validate"]
+
+_CRC_SIZE = 4
+_TEXTS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
+#: Which clause wants the payload to end with its last structure.
+_ENDS = {
+    _spec.CHUNK_CODEBOOK: "CDB-2",
+    _spec.CHUNK_METADATA: "JSN-2",
+    _spec.CHUNK_CAMERAS: "JSN-2",
+    _spec.CHUNK_OPTIONS: "JSN-2",
+    _spec.CHUNK_STATED_ERRORS: "SER-3",
+}
+_STAGE = "validating"
+
+Header = Placed[_spec.Header]
+
+
+def validate(
+    data: bytes | bytearray | memoryview | mmap,
+    *,
+    json_bytes_max: int = _spec.BUDGET_JSON_BYTES,
+    splats_max: int | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Validation:
+    """Look for every violation of the spec in a file.
+
+    Args:
+        data: all of it, or as much as there is.
+        json_bytes_max: budget for one JSON text (STR-8).
+        splats_max: budget of splats (LIM-1), above which the tiles are not read; `None` for none: one tile lies in
+            memory at a time.
+        progress: is told how much of the file has been looked at.
+
+    Returns:
+        What was found; never raises for what a file holds.
+    """
+    view = memoryview(data).cast("B")
+    findings = Findings()
+    counts = _Counts()
+    with suppress(TooManyError):  # the last remark says so
+        _check(view, findings, counts, json_bytes_max, splats_max, progress or (lambda _stage, _done: None))
+    return Validation(
+        tuple(sorted(findings.violations, key=lambda one: one.offset)),
+        tuple(findings.remarks),
+        tuple(findings.unread),
+        counts.splats,
+        counts.tiles,
+        tuple(findings.checks),
+    )
+
+
+class _Counts:
+    """What is known of the scene."""
+
+    splats = 0
+    tiles = 0
+
+
+def _check(
+    view: memoryview,
+    findings: Findings,
+    counts: _Counts,
+    json_bytes_max: int,
+    splats_max: int | None,
+    progress: Callable[[str, float], None],
+) -> None:
+    header = _read_header(view, findings)
+    if header is None:
+        findings.skip("everything behind the magic and the version", "this is no file of this version")
+        return
+    _check_digest(view, header, findings)
+    end = _index_end(view, header, findings)
+    if end is None:
+        findings.skip("index and chunks", "the index is not whole")
+        return
+    index = read_records(view, end - _CRC_SIZE, findings)
+    counts.splats = index.head.record.splat_count
+    directory = read_directory(view, index.end, end - _CRC_SIZE, index, findings) if index.complete else []
+    tiles: list[Tile] = []
+    if index.complete:
+        tiles = read_tiles(view, index.end, end - _CRC_SIZE, index, findings)
+        index.complete = len(tiles) == index.head.record.tile_count
+    else:
+        findings.skip("directory and tiles", "the records before them leave the index")
+    counts.tiles = len(tiles)
+    chunks = [*directory, *(chunk for tile in tiles for chunk in tile.chunks)]
+    if index.complete:
+        check_coverage(findings, chunks, end, header.record.file_size, len(view))
+    else:
+        findings.skip("the chunks", "the index does not name all of them")
+        return
+    books = _read_directory_chunks(view, directory, index, header.record.profile, json_bytes_max, findings)
+    if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
+        findings.of("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
+        findings.skip("the tiles", "there are more splats than the budget allows")
+        return
+    _read_tile_chunks(view, tiles, index, header.record.profile, books, findings, progress)
+
+
+# Header --------------------------------------------------------------------------------------------
+
+
+def _read_header(view: memoryview, findings: Findings) -> Header | None:
+    """HDR-1 to HDR-4, HDR-11; `None` where nothing more can be said."""
+    magic = bytes(view[: len(_spec.MAGIC)])
+    if len(view) < _spec.HEADER_SIZE:
+        if _spec.MAGIC.startswith(magic):
+            findings.add("HDR-11", len(view), "header", f"the data ends here, a header has {_spec.HEADER_SIZE} bytes")
+        else:
+            findings.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is no magic", _spec.ERROR_MAGIC)
+        return None
+    header = place(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
+    record = header.record
+    if magic != _spec.MAGIC:
+        findings.of("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
+        return None
+    version = (record.version_major, record.version_minor)
+    wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
+    if version != wanted:
+        message = f"{version[0]}.{version[1]}, this validator knows {wanted[0]}.{wanted[1]}"
+        findings.of("HDR-2", header, "version_major", message)
+        return None
+    end = _spec.HEADER_OFFSETS["header_crc"]
+    computed = zlib.crc32(view[:end])
+    if record.header_crc != computed:
+        findings.of("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
+    findings.checks.append("header_crc")
+    if record.profile not in _spec.PROFILE_NAMES:
+        findings.of("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
+    findings.reserved(header)
+    return header
+
+
+def _check_digest(view: memoryview, header: Header, findings: Findings) -> None:
+    """HDR-5, HDR-6, HDR-8. The digest of a file that is cut is not known."""
+    size = header.record.file_size
+    if len(view) < size:
+        findings.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
+        findings.skip("the digest", "the data ends early")
+        return
+    if len(view) > size:
+        findings.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
+    start = _spec.HEADER_OFFSETS["digest"]
+    hashed = hashlib.sha256(view[:start])
+    hashed.update(view[_spec.HEADER_SIZE : max(size, _spec.HEADER_SIZE)])
+    if hashed.digest() != header.record.digest:
+        stored = header.record.digest.hex()
+        findings.of("HDR-8", header, "digest", f"{stored[:16]}..., computed {hashed.hexdigest()[:16]}...")
+    findings.checks.append("digest")
+
+
+def _index_end(view: memoryview, header: Header, findings: Findings) -> int | None:
+    """HDR-7, IDX-1; where the index ends, `None` if it has no room for its head or leaves the data."""
+    size, file_size = header.record.index_size, header.record.file_size
+    least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
+    end = _spec.HEADER_SIZE + size
+    if size < least or end > file_size:
+        message = f"{size}, wanted {least} to {file_size - _spec.HEADER_SIZE}"
+        findings.of("HDR-7", header, "index_size", message)
+    if size < least or end > len(view):
+        return None
+    at = end - _CRC_SIZE
+    stored, computed = int.from_bytes(view[at:end], "little"), zlib.crc32(view[_spec.HEADER_SIZE : at])
+    if stored != computed:
+        findings.add("IDX-1", at, "index.crc", f"{stored:#010x}, computed {computed:#010x}")
+    findings.checks.append("index_crc")
+    return end
+
+
+# Chunks --------------------------------------------------------------------------------------------
+
+
+def _read_directory_chunks(
+    view: memoryview, directory: list[Chunk], index: Index, profile: int, json_bytes_max: int, findings: Findings
+) -> dict[tuple[int, int], Entries]:
+    """Read every chunk of the directory, used or not, known or not (CHK-2)."""
+    books: dict[tuple[int, int], Entries] = {}
+    for chunk in directory:
+        if not chunk.whole:
+            continue
+        payload = check_frame(view, chunk, _ENDS.get(chunk.kind, "CHK-3"), findings)
+        if chunk.kind in _TEXTS:
+            _told_apart(payload, findings, partial(read_text, payload, chunk.kind, profile, json_bytes_max))
+        elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
+            _told_apart(payload, findings, partial(read_stated_errors, payload, index))
+        elif chunk.kind == _spec.CHUNK_CODEBOOK:
+            book = books[chunk.identity, chunk.layer] = []
+            _told_apart(payload, findings, partial(read_codebook, payload, chunk, index, profile, book))
+    return books
+
+
+def _read_tile_chunks(
+    view: memoryview,
+    tiles: list[Tile],
+    index: Index,
+    profile: int,
+    books: dict[tuple[int, int], Entries],
+    findings: Findings,
+    progress: Callable[[str, float], None],
+) -> None:
+    for tile in tiles:
+        progress(_STAGE, tile.place / len(tiles))
+        reader = TileReader(view, index, profile, tile, books, findings, read_coded)
+        for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
+            if not chunk.whole:
+                reader.lost.add(chunk.layer)
+                continue
+            payload = check_frame(view, chunk, "TLE-3", findings)
+            if not _told_apart(payload, findings, partial(reader.read_layer, payload, chunk)):
+                reader.lost.add(chunk.layer)
+    findings.checks.append("all_chunk_crcs")
+    findings.checks.append("all_values")
+    progress(_STAGE, 1.0)
+
+
+def _told_apart(payload: Payload, findings: Findings, read: Callable[[], None]) -> bool:
+    """Read a payload; note the rest of it as not looked at where its structure is lost."""
+    try:
+        read()
+    except UnreadableError:
+        findings.skip(f"{payload.name} from byte {payload.at} on", "what it holds cannot be told")
+        return False
+    return True

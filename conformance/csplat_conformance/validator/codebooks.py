@@ -1,0 +1,79 @@
+"""Codebook chunks (spec 5.3), and which columns of them an attribute has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from csplat import _spec
+from csplat_conformance.validator.chunks import Chunk
+from csplat_conformance.validator.index import CodebookAt, Index
+from csplat_conformance.validator.reading import Payload
+from csplat_conformance.validator.streams import read_stream
+from csplat_conformance.validator.values import I64
+
+__all__ = ["Entries", "attribute_columns", "first_attribute", "read_codebook"]
+
+#: Entries of each stage, [size, C]; `None` for a stage that could not be read.
+Entries = list[I64 | None]
+
+_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
+_ATTRIBUTES = {name: value for value, name in _spec.ATTRIBUTE_NAMES.items()}
+
+
+def _attributes(book: CodebookAt) -> list[int]:
+    """The attributes that a codebook serves, in its order."""
+    if book.record.kind == _spec.CODEBOOK_KIND_SH:
+        return [_spec.ATTRIBUTE_SH0 + band for band in range(book.record.band_first, book.record.band_last + 1)]
+    return [_ATTRIBUTES[name] for name in _spec.CODEBOOK_KIND_ATTRIBUTES[book.record.kind]]
+
+
+def first_attribute(book: CodebookAt) -> int:
+    """Return the attribute whose block holds the indices."""
+    return _attributes(book)[0]
+
+
+def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
+    """Return an attribute's columns in the entries of its layer; `None` if the codebook does not serve it."""
+    first = 0
+    for served in _attributes(book):
+        columns = _spec.ATTRIBUTE_COLUMNS[served]
+        if book.record.kind == _spec.CODEBOOK_KIND_SH:
+            first = 0  # each band has a chunk of its own
+        if served == attribute:
+            return slice(first, first + columns)
+        first += columns
+    return None
+
+
+def read_codebook(payload: Payload, chunk: Chunk, index: Index, profile: int, entries: Entries) -> None:
+    """Read the payload of a CODB chunk.
+
+    Args:
+        payload: of the chunk.
+        chunk: its record.
+        index: of the file.
+        profile: of the file.
+        entries: gets the stages; none where no sound record asks for the chunk.
+
+    Raises:
+        UnreadableError: the payload ends too early.
+    """
+    findings = payload.findings
+    book = index.codebooks.get(chunk.identity)
+    layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
+    head = payload.structure(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS, "head")
+    stages = None if book is None else book.record.stage_count
+    for key, wanted in (("codebook_id", chunk.identity), ("layer", chunk.layer), ("stage_count", stages)):
+        found = getattr(head.record, key)
+        if wanted is not None and found != wanted:
+            findings.of("CDB-1", head, key, f"{found}, its records say {wanted}")
+    if book is None or chunk.layer not in layers:
+        findings.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
+        return
+    of_layer = [a for a in _attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
+    columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
+    for i, size in enumerate(book.record.sizes[: book.record.stage_count]):
+        stream = read_stream(payload, f"stage[{i}]", profile, size * columns, _WIDTH_MAX, signed=True)
+        table = None if stream.elements is None else stream.elements.astype(np.int64).reshape(columns, size).T
+        entries.append(table)
+    payload.finish()

@@ -1,0 +1,179 @@
+"""Blocks coded CODEBOOK (spec 6.4.5)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from csplat import _spec
+from csplat_conformance.validator.codebooks import attribute_columns, first_attribute
+from csplat_conformance.validator.findings import Placed
+from csplat_conformance.validator.index import CodebookAt
+from csplat_conformance.validator.reading import Payload, UnreadableError
+from csplat_conformance.validator.streams import Elements, read_stream
+from csplat_conformance.validator.tiles import (
+    First,
+    TileReader,
+    read_block_head,
+    read_columns,
+    read_exponent,
+    read_offsets,
+)
+from csplat_conformance.validator.values import I64, check_integers
+
+__all__ = ["read_coded"]
+
+_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
+_ESCAPES = {
+    _spec.ATTRIBUTE_OPACITIES: (_spec.CODING_LEVELS,),
+    _spec.ATTRIBUTE_QUATS: (_spec.CODING_SIGNED,),
+}
+_LATTICE_ESCAPES = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
+
+Params = Placed[_spec.CodebookParams]
+
+
+def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, at: int) -> None:
+    """Read what follows a block head.
+
+    Args:
+        reader: the tile.
+        payload: stands behind the block head.
+        name: of the block.
+        attribute: registry value.
+        at: where the block head begins.
+
+    Raises:
+        UnreadableError: how many streams follow is not known.
+    """
+    params = payload.structure(
+        _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"
+    )
+    identity = params.record.codebook_id
+    book, columns = _find_book(reader, params, attribute)
+    if first_attribute(book) == attribute:
+        first = reader.first[identity] = _read_indices(reader, payload, name, book, params)
+    else:
+        first = _find_first(reader, book, params)
+    summands = None
+    has_summand = book.record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES
+    if has_summand:
+        summands = _read_summands(reader, payload, name, attribute)
+    escapes = _read_escapes(reader, payload, name, attribute, params) if params.record.escape_count else None
+    entries = reader.books.get((identity, _spec.ATTRIBUTE_LAYER[attribute]))
+    known = None if entries is None else [None if table is None else table[:, columns] for table in entries]
+    rows = _sums(first, known)
+    if rows is None or (has_summand and summands is None) or first.escaped is None:
+        return
+    if summands is not None:
+        rows += summands[~first.escaped]
+    sound = check_integers(reader.findings, reader.index, attribute, rows, 0, (at, f"{payload.name}/{name}"))
+    if sound and attribute == _spec.ATTRIBUTE_SCALES and (escapes is not None or not first.escaped.any()):
+        parts = [part for part in (rows, escapes) if part is not None and part.size]
+        reader.check_scales(max(int(part.max()) for part in parts), 0)
+
+
+def _find_book(reader: TileReader, params: Params, attribute: int) -> tuple[CodebookAt, slice]:
+    """CBK-1."""
+    identity = params.record.codebook_id
+    book = reader.index.codebooks.get(identity)
+    columns = None if book is None else attribute_columns(book, attribute)
+    name = _spec.ATTRIBUTE_NAMES[attribute]
+    if identity not in reader.tile.tables:
+        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
+    elif identity not in reader.index.codebook_ids:
+        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
+    elif book is not None and columns is None:
+        reader.findings.of("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
+    if book is None or columns is None:
+        raise UnreadableError
+    return book, columns
+
+
+def _read_indices(reader: TileReader, payload: Payload, name: str, book: CodebookAt, params: Params) -> First:
+    """CBK-2, CBK-3."""
+    findings, stages = reader.findings, list[Elements | None]()
+    for stage, size in enumerate(book.record.sizes[: book.record.stage_count]):
+        what = f"{name}.indices[{stage}]"
+        stream = read_stream(payload, what, reader.profile, reader.tile.count, _WIDTH_MAX)
+        indices = stream.elements
+        most = size if stage == 0 else size - 1
+        if indices is not None and int(indices.max()) > most:
+            message = f"an index of {int(indices.max())} into {size} entries, wanted {most} at most"
+            findings.add("CBK-2", stream.head.offset, f"{payload.name}/{what}", message)
+            indices = None
+        stages.append(indices)
+    escaped = None if stages[0] is None else np.asarray(stages[0] == book.record.sizes[0])
+    count = params.record.escape_count
+    if escaped is not None and int(escaped.sum()) != count:
+        findings.of("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
+        escaped = None
+    elif escaped is None and count > reader.tile.count:
+        findings.of("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
+    if escaped is not None and any(indices is not None and indices[escaped].any() for indices in stages[1:]):
+        text = f"{payload.name}/{name}: escaped splats have indices of later stages that are not 0 (6.4.5)"
+        findings.remarks.append(text)
+    return First(stages, escaped, count)
+
+
+def _find_first(reader: TileReader, book: CodebookAt, params: Params) -> First:
+    """CBK-4. An unknown one is returned where there is none, or where its block could not be read."""
+    identity, count = params.record.codebook_id, params.record.escape_count
+    first = reader.first.get(identity)
+    opener = first_attribute(book)
+    name = _spec.ATTRIBUTE_NAMES[opener]
+    if first is None:
+        if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
+            message = f"codebook {identity}, and no block of {name} before it is coded with it"
+            reader.findings.of("CBK-4", params, "codebook_id", message)
+        return First([], None, count)
+    if first.escape_count != count:
+        message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
+        reader.findings.of("CBK-4", params, "codebook_id", message)
+        return First(first.stages, None, count)
+    return first
+
+
+def _read_summands(reader: TileReader, payload: Payload, name: str, attribute: int) -> I64 | None:
+    """The common summand of the kind SHAPE: LAT-2, LAT-3; [n]."""
+    _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
+    offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
+    stream = read_stream(payload, f"{name}.summand.stream", reader.profile, reader.tile.count, _WIDTH_MAX)
+    if stream.elements is None or not (sound and sane):
+        return None
+    summands: I64 = stream.elements.astype(np.int64) + offsets[0]
+    return summands
+
+
+def _read_escapes(reader: TileReader, payload: Payload, name: str, attribute: int, params: Params) -> I64 | None:
+    """CBK-5, and what the block's coding asks for; [C, escape_count]."""
+    what = f"{name}.escape"
+    head = read_block_head(payload, what)
+    if head.record.attribute != attribute:
+        message = f"{head.record.attribute}, wanted that of its block, {attribute}"
+        reader.findings.of("CBK-5", head, "attribute", message)
+    coding = head.record.coding
+    legal = _ESCAPES.get(attribute, _LATTICE_ESCAPES)
+    if coding not in _spec.CODING_NAMES:
+        message = f"{coding} is no coding that this version uses"
+        reader.findings.of("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
+        raise UnreadableError
+    if coding not in legal:
+        names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
+        reader.findings.of("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
+        raise UnreadableError
+    rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
+    return rows
+
+
+def _sums(first: First, entries: list[I64 | None] | None) -> I64 | None:
+    """Sums of the entries of the splats that are not escaped, [C, n]; `None` where something is not known."""
+    if entries is None or first.escaped is None or len(first.stages) != len(entries):
+        return None
+    kept = ~first.escaped
+    total: I64 | None = None
+    for indices, table in zip(first.stages, entries, strict=True):
+        if indices is None or table is None:
+            return None
+        part: I64 = table[indices[kept].astype(np.intp)]
+        total = part.copy() if total is None else total + part
+    return None if total is None else total.T

@@ -1,0 +1,259 @@
+"""Index: head, attribute, codebook and extra column records (spec 4.3 to 4.3.3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from csplat import _spec
+from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.validator.reading import place
+
+__all__ = ["Index", "read_records", "scaled"]
+
+_CRC_SIZE = 4
+_STEP_MIN = Fraction(1, 2**1022)
+_STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
+_LINES = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
+
+Head = Placed[_spec.IndexHead]
+AttributeAt = Placed[_spec.AttributeRecord]
+CodebookAt = Placed[_spec.CodebookRecord]
+
+
+@dataclass
+class Index:
+    """What the index says, as far as it could be read.
+
+    Attributes:
+        head: the index head.
+        degree: `sh_degree`, `None` where it is none that this version has.
+        attributes: by registry value.
+        steps: steps that obey ATT-6, by registry value.
+        levels: levels that obey ATT-3 or ATT-4, by registry value.
+        codebooks: by id; those whose kind and sizes are sound.
+        codebook_ids: of all records.
+        extras: bytes of each extra column's values, `None` where the type is unknown.
+        complete: whether all records before the directory fit into the index.
+        end: where the last of them ends.
+    """
+
+    head: Head
+    degree: int | None
+    attributes: dict[int, AttributeAt] = field(default_factory=dict)
+    steps: dict[int, float] = field(default_factory=dict)
+    levels: dict[int, int] = field(default_factory=dict)
+    codebooks: dict[int, CodebookAt] = field(default_factory=dict)
+    codebook_ids: set[int] = field(default_factory=set)
+    extras: list[int | None] = field(default_factory=list)
+    complete: bool = True
+    end: int = 0
+
+
+def scaled(step: float, exponent: int) -> float | None:
+    """Return step × 2^exponent, `None` where it is not finite or below 2^−1022 (TIL-9, LAT-1). Exact."""
+    if abs(exponent) > 4096:  # beyond any pair of binary64 values, and not worth such an integer
+        return None
+    product = Fraction(step) * Fraction(2) ** exponent
+    return float(product) if _STEP_MIN <= product <= _STEP_MAX else None
+
+
+def read_records(view: memoryview, end: int, findings: Findings) -> Index:
+    """Read everything of the index before the directory.
+
+    Args:
+        view: the file.
+        end: where the index's CRC begins, as the header says; no more than the data's end.
+        findings: what is told.
+    """
+    start = _spec.HEADER_SIZE
+    head = place(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
+    record = head.record
+    counts = (
+        (record.attribute_count, _spec.ATTRIBUTE_RECORD_SIZE),
+        (record.codebook_count, _spec.CODEBOOK_RECORD_SIZE),
+        (record.extra_count, _spec.EXTRA_RECORD_SIZE),
+        (record.directory_count, _spec.DIRECTORY_RECORD_SIZE),
+        (record.tile_count, _spec.TILE_RECORD_SIZE),
+    )
+    needed = _spec.INDEX_HEAD_SIZE + sum(count * size for count, size in counts)
+    if start + needed > end:
+        findings.add("IDX-2", start, "index", f"its counts ask for {needed} bytes at least, it has {end - start}")
+    index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
+    _check_head(findings, head)
+    at = start + _spec.INDEX_HEAD_SIZE
+    at = _read_attributes(view, at, end, index, findings)
+    at = _read_codebooks(view, at, end, index, findings)
+    index.end = _read_extras(view, at, end, index, findings)
+    return index
+
+
+def _fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
+    """How many records of a kind lie within the index; after the first kind that does not fit none do."""
+    fitting = min(count, max(0, (end - at) // size)) if index.complete else 0
+    index.complete &= fitting == count
+    return fitting
+
+
+def _check_head(findings: Findings, head: Head) -> None:
+    record = head.record
+    if record.sh_degree > _spec.SH_DEGREE_MAX:
+        findings.of("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
+    unlisted = record.scene_flags & ~sum(_spec.SCENE_FLAG_NAMES)
+    if unlisted:
+        findings.of("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
+    letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
+    if any(record.axes) and {_LINES.get(letter or "") for letter in letters} != {0, 1, 2}:
+        findings.of("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
+    if not 0.0 <= record.unit_metres < math.inf:
+        findings.of("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
+    for axis, value in enumerate(record.origin):
+        if not math.isfinite(value):
+            findings.of(
+                "IDX-6", head, "origin", f"component {axis} is {value}, wanted a finite number", within=8 * axis
+            )
+
+
+# Attribute records ---------------------------------------------------------------------------------
+
+
+def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+    count = index.head.record.attribute_count
+    bands = 0 if index.degree is None else index.degree
+    wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
+    if index.degree is not None and count != len(wanted):
+        findings.of("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
+    for i in range(_fitting(index, at, end, count, _spec.ATTRIBUTE_RECORD_SIZE)):
+        attribute = view[at]
+        name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
+        placed = place(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
+        findings.reserved(placed)
+        if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
+            findings.of("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
+        if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
+            index.attributes[attribute] = placed
+            _check_attribute(findings, placed, index)
+        at += _spec.ATTRIBUTE_RECORD_SIZE
+    return at
+
+
+def _check_attribute(findings: Findings, placed: AttributeAt, index: Index) -> None:
+    record = placed.record
+    legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
+    if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
+        findings.of("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
+    if record.chroma_shift > _spec.CHROMA_SHIFT_MAX:
+        findings.of("ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, wanted {_spec.CHROMA_SHIFT_MAX} at most")
+    if record.chroma_shift and record.mapping != _spec.MAPPING_YCOCG:
+        findings.of("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
+    kind = _spec.ATTRIBUTE_KIND[record.attribute]
+    if kind == "lattice":
+        _check_lattice(findings, placed, index)
+    elif kind == "levels":
+        _check_levels(findings, placed, index)
+
+
+def _check_levels(findings: Findings, placed: AttributeAt, index: Index) -> None:
+    record = placed.record
+    clause, low, high = "ATT-4", _spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX
+    if record.attribute == _spec.ATTRIBUTE_OPACITIES:
+        clause, low, high = "ATT-3", 1, _spec.OPACITY_LEVELS_MAX
+    if low <= record.levels <= high:
+        index.levels[record.attribute] = record.levels
+    else:
+        findings.of(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
+    if record.step != 0.0 or math.copysign(1.0, record.step) < 0.0:
+        findings.of("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
+
+
+def _check_lattice(findings: Findings, placed: AttributeAt, index: Index) -> None:
+    record = placed.record
+    if record.levels:
+        findings.of("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
+    if 2.0**-1022 <= record.step < math.inf:
+        index.steps[record.attribute] = record.step
+    else:
+        findings.of("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
+
+
+# Codebook records ----------------------------------------------------------------------------------
+
+
+def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+    last = -1
+    for _ in range(_fitting(index, at, end, index.head.record.codebook_count, _spec.CODEBOOK_RECORD_SIZE)):
+        identity = int.from_bytes(view[at : at + 2], "little")
+        name = f"codebook[{identity}]"
+        placed = place(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
+        findings.reserved(placed)
+        if identity <= last:
+            findings.of("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
+        last = identity
+        index.codebook_ids.add(identity)
+        if _is_sound_codebook(findings, placed, index):
+            index.codebooks.setdefault(identity, placed)
+        at += _spec.CODEBOOK_RECORD_SIZE
+    return at
+
+
+def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> bool:
+    record = placed.record
+    before = len(findings.violations)
+    first, last = record.band_first, record.band_last
+    if record.kind not in _spec.CODEBOOK_KIND_NAMES:
+        findings.of("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
+    elif record.kind == _spec.CODEBOOK_KIND_SH:
+        highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
+        if not 1 <= first <= last <= highest:
+            findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
+    elif first or last:
+        findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
+    stages = record.stage_count
+    if not 1 <= stages <= _spec.STAGES_MAX:
+        findings.of("CBR-3", placed, "stage_count", f"{stages}, wanted 1 to {_spec.STAGES_MAX}")
+        return False
+    for stage, size in enumerate(record.sizes):
+        high = _spec.CODEBOOK_ENTRIES_MAX if stage < stages else 0
+        if not min(1, high) <= size <= high:
+            wanted = f"1 to {high}" if high else "0"
+            findings.of(
+                "CBR-4", placed, "sizes", f"stage {stage} has {size} entries, wanted {wanted}", within=4 * stage
+            )
+    return len(findings.violations) == before
+
+
+# Extra column records ------------------------------------------------------------------------------
+
+
+def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+    names: set[str] = set()
+    for i in range(_fitting(index, at, end, index.head.record.extra_count, _spec.EXTRA_RECORD_SIZE)):
+        placed = place(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
+        record = placed.record
+        if record.dtype not in _spec.EXTRA_DTYPE_NAMES:
+            findings.of("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
+        if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
+            findings.of("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
+        else:
+            _check_name(findings, placed, names)
+        index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
+        at += _spec.EXTRA_RECORD_SIZE
+    return at
+
+
+def _check_name(findings: Findings, placed: Placed[_spec.ExtraRecord], names: set[str]) -> None:
+    raw = placed.record.name[: placed.record.name_size]
+    rest = placed.record.name[placed.record.name_size :]
+    if any(rest):
+        findings.of("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
+    try:
+        name = raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        findings.of("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
+        return
+    if any(ord(character) < 0x20 or ord(character) == 0x7F for character in name):
+        findings.of("EXR-2", placed, "name", f"a control character in {name!r}")
+    if name in names:
+        findings.of("EXR-2", placed, "name", f"a second column is called {name!r}")
+    names.add(name)

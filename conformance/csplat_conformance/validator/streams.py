@@ -1,0 +1,194 @@
+"""Streams (spec 6.1 to 6.3): the head, the coder, the transforms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat_conformance.validator.coders import CodedError, uncoded
+from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.validator.reading import Payload, UnreadableError
+
+__all__ = ["Elements", "Stream", "read_stream"]
+
+#: Elements of a stream: int64, or uint64 for RAW, which alone may be eight bytes wide.
+Elements = NDArray[Any]
+
+#: No stream of a sound file has more: the columns of the highest band for a full tile or a full codebook.
+_ELEMENTS_MAX = max(_spec.ATTRIBUTE_COLUMNS.values()) * max(_spec.TILE_SPLATS_MAX, _spec.CODEBOOK_ENTRIES_MAX)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A stream that has been stepped over.
+
+    Attributes:
+        head: where it lies, and its fields.
+        elements: [count], `None` where a violation keeps them from being known.
+    """
+
+    head: Placed[_spec.StreamHead]
+    elements: Elements | None
+
+
+def read_stream(
+    payload: Payload,
+    what: str,
+    profile: int,
+    count: int | None,
+    width_max: int,
+    *,
+    signed: bool = False,
+    count_max: int = 0,
+) -> Stream:
+    """Read the next stream.
+
+    Args:
+        payload: stands at the stream's head.
+        what: name of the stream within its chunk, `sh0.stream`.
+        profile: of the file, a registry value.
+        count: elements that its place requires; `None` for texts, which say themselves.
+        width_max: bytes of an element at most.
+        signed: two's complement of `width` bytes.
+        count_max: budget of elements where `count` is `None`.
+
+    Raises:
+        UnreadableError: the payload ends before the stream does.
+    """
+    findings = payload.findings
+    head = payload.structure(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS, what)
+    sound = _check_counts(findings, head, count, width_max)
+    sound &= _check_transforms(findings, head)
+    sound &= _check_packed(findings, head, sound)
+    if count is None and head.record.count > count_max:
+        findings.of("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
+        sound = False
+    coder_known = _check_coder(findings, head, profile)
+    size = head.record.coded_size
+    if size > payload.left:
+        findings.of("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
+        raise UnreadableError
+    at = payload.take(size, f"{what}.coded")
+    if not coder_known:
+        return Stream(head, None)
+    # Even where the head is wrong the coder can be tried, as long as it has a sane size to fill.
+    most = count_max if count is None else _ELEMENTS_MAX
+    if count is not None and count > most:
+        sound = False  # what asks for so many has been refused
+    if not sound and head.record.packed_size > 3 * width_max * most:
+        return Stream(head, None)
+    try:
+        packed, spare_bits = uncoded(payload.view[at : at + size], head.record.coder, head.record.packed_size)
+    except CodedError as error:
+        findings.add(error.clause, at + error.within, f"{payload.name}/{what}.coded", str(error))
+        return Stream(head, None)
+    if spare_bits:
+        findings.remarks.append(f"{payload.name}/{what}.coded: the unused bits after the final block are not 0 (6.2)")
+    return Stream(head, _elements(findings, head, packed, at, signed) if sound else None)
+
+
+def _check_counts(findings: Findings, head: Placed[_spec.StreamHead], count: int | None, width_max: int) -> bool:
+    """STR-1, STR-2."""
+    sound = True
+    found, width = head.record.count, head.record.width
+    if found != (max(1, found) if count is None else count):
+        wanted = "1 or more" if count is None else f"{count}, as its place requires"
+        findings.of("STR-1", head, "count", f"{found} elements, wanted {wanted}")
+        sound = False
+    if not 1 <= width <= width_max:
+        findings.of("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
+        sound = False
+    return sound
+
+
+def _check_transforms(findings: Findings, head: Placed[_spec.StreamHead]) -> bool:
+    """STR-3, RES-2."""
+    listed = head.record.transforms
+    used = listed.rstrip(b"\0")
+    unknown = [value for value in used if value not in _spec.TRANSFORM_NAMES]
+    if unknown:
+        findings.of("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
+    if any(a >= b for a, b in pairwise(used)) or 0 in used:
+        findings.of("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
+        return False
+    return not unknown
+
+
+def _check_packed(findings: Findings, head: Placed[_spec.StreamHead], sound: bool) -> bool:
+    """STR-4, STR-5; they say something only where count, width and transforms are known."""
+    if not sound:
+        return False
+    size, packed = head.record.count * head.record.width, head.record.packed_size
+    if _spec.TRANSFORM_RUN_LENGTH not in head.record.transforms:
+        if packed != size:
+            findings.of("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
+            return False
+    elif packed % 3 or not 3 <= packed <= 3 * size:
+        findings.of(
+            "STR-5", head, "packed_size", f"{packed} bytes of runs, wanted a multiple of 3 from 3 to {3 * size}"
+        )
+        return False
+    return True
+
+
+def _check_coder(findings: Findings, head: Placed[_spec.StreamHead], profile: int) -> bool:
+    """STR-7, RES-2."""
+    coder = head.record.coder
+    if coder not in _spec.CODER_NAMES:
+        findings.of("RES-2", head, "coder", f"{coder} is no coder that this version uses")
+        return False
+    # The profiles of the registry are ordered: each has the coders of those before it.
+    needed = next(value for value, name in _spec.PROFILE_NAMES.items() if name == _spec.CODER_PROFILE[coder])
+    if profile in _spec.PROFILE_NAMES and profile < needed:
+        findings.of(
+            "STR-7",
+            head,
+            "coder",
+            f"{_spec.CODER_NAMES[coder]} is not allowed in the profile {_spec.PROFILE_NAMES[profile]}",
+        )
+    return True
+
+
+# Transforms, undone last to first ------------------------------------------------------------------
+
+
+def _elements(
+    findings: Findings, head: Placed[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
+) -> Elements | None:
+    record = head.record
+    data = np.frombuffer(packed, np.uint8)
+    if _spec.TRANSFORM_RUN_LENGTH in record.transforms:
+        runs = data.reshape(3, -1)
+        lengths = runs[1].astype(np.int64) + 256 * runs[2].astype(np.int64) + 1
+        total = int(lengths.sum())
+        wanted = record.count * record.width
+        if total != wanted:
+            findings.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, wanted {wanted}")
+            return None
+        data = np.repeat(runs[0], lengths)
+    width, count = record.width, record.count
+    if width == 1 and not signed and not {_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG} & set(record.transforms):
+        return data  # texts and plain bytes: nothing to undo
+    planes = data.reshape(width, count) if _spec.TRANSFORM_BYTE_PLANES in record.transforms else _columns(data, width)
+    values = np.zeros(count, np.uint64)
+    for i in range(width):
+        values |= planes[i].astype(np.uint64) << np.uint64(8 * i)
+    mask = np.uint64((1 << 8 * width) - 1)
+    if _spec.TRANSFORM_ZIGZAG in record.transforms:
+        half = values >> np.uint64(1)
+        values = np.where(values & np.uint64(1), mask - half, half)
+    if _spec.TRANSFORM_DELTA in record.transforms:
+        values = np.cumsum(values, dtype=np.uint64) & mask
+    if signed:
+        spare = np.int64(64 - 8 * width)
+        return (values.view(np.int64) << spare) >> spare
+    return values if width == 8 else values.view(np.int64)
+
+
+def _columns(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    return data.reshape(-1, width).T

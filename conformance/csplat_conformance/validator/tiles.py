@@ -1,0 +1,255 @@
+"""TILE chunks (spec 5.2) and the codings of their blocks but CODEBOOK (6.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from csplat import _spec
+from csplat_conformance.validator.chunks import Chunk
+from csplat_conformance.validator.codebooks import Entries
+from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.validator.index import Index, scaled
+from csplat_conformance.validator.reading import Payload, UnreadableError
+from csplat_conformance.validator.streams import Elements, read_stream
+from csplat_conformance.validator.tile_records import Tile
+from csplat_conformance.validator.values import I64, check_box, check_integers, check_max_scale
+
+__all__ = ["BlockHead", "First", "TileReader", "read_block_head", "read_columns", "read_exponent", "read_offsets"]
+
+BlockHead = Placed[_spec.BlockHead]
+
+_MORTON_AXES = 3
+
+
+@dataclass
+class First:
+    """The tile's first block of a codebook, which holds the indices for all.
+
+    Attributes:
+        stages: [n] indices of each stage, `None` where they could not be read or name no entry.
+        escaped: [n] bool, `None` likewise.
+        escape_count: as the block says.
+    """
+
+    stages: list[Elements | None]
+    escaped: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None
+    escape_count: int
+
+
+@dataclass
+class TileReader:
+    """One tile while its layers are read, from the lowest to the highest.
+
+    Attributes:
+        view: the file.
+        index: of the file.
+        profile: of the file.
+        tile: its record.
+        books: entries by codebook id and layer.
+        findings: what is told.
+        read_coded: reads what follows the head of a block coded CODEBOOK.
+        first: by codebook id.
+        lost: layers of which blocks are missing, because they could not be told apart.
+    """
+
+    view: memoryview
+    index: Index
+    profile: int
+    tile: Tile
+    books: Mapping[tuple[int, int], Entries]
+    findings: Findings
+    read_coded: Callable[[TileReader, Payload, str, int, int], None]
+    first: dict[int, First] = field(default_factory=dict)
+    lost: set[int] = field(default_factory=set)
+
+    def read_layer(self, payload: Payload, chunk: Chunk) -> None:
+        """Read the payload of one of the tile's chunks.
+
+        Raises:
+            UnreadableError: the rest of the payload cannot be told apart.
+        """
+        findings = self.findings
+        head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
+        for key, wanted in (("tile_index", self.tile.place), ("layer", chunk.layer)):
+            found = getattr(head.record, key)
+            if found != wanted:
+                findings.of("TLE-1", head, key, f"{found}, its record says {wanted}")
+        if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
+            findings.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
+            return
+        blocks = self._wanted(chunk.layer)
+        announced = head.record.block_count
+        if announced != len(blocks):
+            findings.of("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
+        for number, attribute in enumerate(blocks):
+            if number >= announced and not payload.left:
+                return
+            self._read_block(payload, attribute, number)
+        if announced == len(blocks):
+            payload.finish()
+
+    def _wanted(self, layer: int) -> list[int]:
+        if layer == _spec.LAYER_EXTRA:
+            return [_spec.ATTRIBUTE_EXTRA] * self.index.head.record.extra_count
+        return [attribute for attribute, place in _spec.ATTRIBUTE_LAYER.items() if place == layer]
+
+    def _read_block(self, payload: Payload, wanted: int, number: int) -> None:
+        at = payload.at
+        attribute = payload.view[at] if payload.left else wanted
+        name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
+        head = read_block_head(payload, name)
+        if attribute != wanted:
+            message = f"{attribute}, wanted {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
+            self.findings.of("TLE-2", head, "attribute", message)
+            if attribute not in _spec.ATTRIBUTE_NAMES:
+                raise UnreadableError
+        coding = head.record.coding
+        if _spec.CODING_NAMES.get(coding) not in _spec.ATTRIBUTE_CODINGS[attribute]:
+            code = "" if coding in _spec.CODING_NAMES else _spec.ERROR_UNSUPPORTED
+            message = f"{coding}, wanted {' or '.join(_spec.ATTRIBUTE_CODINGS[attribute])}"
+            self.findings.of("BLK-1", head, "coding", message, code)
+            raise UnreadableError
+        if coding == _spec.CODING_CODEBOOK:
+            self.read_coded(self, payload, name, attribute, at)
+        elif coding == _spec.CODING_RAW:
+            self._read_raw(payload, name, number)
+        elif attribute == _spec.ATTRIBUTE_MEANS:
+            self._read_means(payload, name, coding)
+        else:
+            self._read_plain(payload, name, attribute, coding)
+
+    def _read_plain(self, payload: Payload, name: str, attribute: int, coding: int) -> None:
+        rows, exponent = read_columns(self, payload, name, attribute, coding, self.tile.count)
+        if rows is not None and attribute == _spec.ATTRIBUTE_SCALES:
+            self.check_scales(int(rows.max()), exponent)
+
+    def check_scales(self, largest: int, exponent: int) -> None:
+        """TIL-11, once the largest lattice integer of the scales is known."""
+        record = self.tile.record
+        at = record.at("max_scale")
+        stored = bytes(self.view[at : at + 4])
+        where = (at, record.path("max_scale"))
+        check_max_scale(self.findings, self.index, largest, exponent, stored, where)
+
+    def _read_means(self, payload: Payload, name: str, coding: int) -> None:
+        count, width_max = self.tile.count, _spec.CODING_WIDTH_MAX[coding]
+        rows: I64 | None
+        if coding == _spec.CODING_MORTON:
+            params = payload.structure(
+                _spec.unpack_morton_params,
+                _spec.MORTON_PARAMS_SIZE,
+                _spec.MORTON_PARAMS_OFFSETS,
+                f"{name}.params",
+            )
+            bits = params.record.bits
+            if not 1 <= bits <= _spec.MORTON_BITS_MAX:
+                self.findings.of("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
+            stream = read_stream(payload, f"{name}.stream", self.profile, count, width_max)
+            rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
+            largest = 0 if stream.elements is None else int(stream.elements.max())
+            if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _MORTON_AXES * bits:
+                message = f"a code of {largest}, wanted less than 2^{_MORTON_AXES * bits}"
+                self.findings.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
+                rows = None
+        else:
+            stream = read_stream(payload, f"{name}.stream", self.profile, _MORTON_AXES * count, width_max)
+            rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_MORTON_AXES, count)
+            if rows is not None and int(rows.max()) >> _spec.AXIS_BITS_MAX:
+                message = f"an integer of {int(rows.max())}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
+                self.findings.add("AXI-1", stream.head.offset, f"{payload.name}/{name}.stream", message)
+                rows = None
+        if rows is not None:
+            record = self.tile.record
+            check_box(
+                self.findings,
+                self.index,
+                record.record,
+                rows,
+                (record.at("corner"), record.path("corner")),
+                (stream.head.offset, f"{payload.name}/{name}.stream"),
+                sound=self.tile.box_sound,
+            )
+
+    def _read_raw(self, payload: Payload, name: str, number: int) -> None:
+        params = payload.structure(
+            _spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS, f"{name}.params"
+        )
+        if params.record.column != number:
+            self.findings.of("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
+        width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
+        stream = read_stream(payload, f"{name}.stream", self.profile, self.tile.count, width_max)
+        size = self.index.extras[number] if number < len(self.index.extras) else None
+        if size is not None and stream.head.record.width != size:
+            self.findings.of("RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes")
+
+
+def read_block_head(payload: Payload, name: str) -> BlockHead:
+    """Read a block head, also that of an escape block."""
+    return payload.structure(_spec.unpack_block_head, _spec.BLOCK_HEAD_SIZE, _spec.BLOCK_HEAD_OFFSETS, name)
+
+
+def read_columns(
+    reader: TileReader, payload: Payload, name: str, attribute: int, coding: int, count: int, *, escape: bool = False
+) -> tuple[I64 | None, int]:
+    """Read and check a block coded LEVELS, OFFSET or SIGNED.
+
+    Returns:
+        [C, count] integers, `None` where a violation keeps them from being known or in range; and the exponent.
+    """
+    columns = _spec.ATTRIBUTE_COLUMNS[attribute]
+    exponent, offsets, sound = 0, [0] * columns, True
+    if coding != _spec.CODING_LEVELS:
+        fixed = escape or attribute == _spec.ATTRIBUTE_QUATS
+        exponent, sound = read_exponent(reader, payload, f"{name}.params", attribute, fixed=fixed)
+    if coding == _spec.CODING_OFFSET:
+        offsets, sane = read_offsets(payload, f"{name}.offsets", columns)
+        sound &= sane
+    width_max, signed = _spec.CODING_WIDTH_MAX[coding], coding == _spec.CODING_SIGNED
+    stream = read_stream(payload, f"{name}.stream", reader.profile, columns * count, width_max, signed=signed)
+    if stream.elements is None or not sound:
+        return None, exponent
+    rows = stream.elements.astype(np.int64).reshape(columns, count) + np.array(offsets, np.int64)[:, None]
+    where = (stream.head.offset, f"{payload.name}/{name}.stream")
+    good = check_integers(reader.findings, reader.index, attribute, rows, exponent, where)
+    return (rows if good else None), exponent
+
+
+def read_exponent(reader: TileReader, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
+    """Read lattice parameters: the exponent, and whether LAT-1, or LAT-2 where it is fixed, holds."""
+    params = payload.structure(
+        _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
+    )
+    exponent = params.record.exponent
+    step = reader.index.steps.get(attribute)
+    if fixed and exponent:
+        reader.findings.of("LAT-2", params, "exponent", f"{exponent}, wanted 0")
+    elif not fixed and step is not None and scaled(step, exponent) is None:
+        reader.findings.of("LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite and at least 2^-1022")
+    else:
+        return exponent, True
+    return exponent, False
+
+
+def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:
+    """Read the offsets, and whether LAT-3 holds."""
+    at = payload.take(8 * columns, name)
+    offsets = [int(value) for value in np.frombuffer(payload.view, "<i8", columns, at)]
+    sound = True
+    for i, offset in enumerate(offsets):
+        if abs(offset) > _spec.COLUMN_MAX:
+            message = f"offset {i} is {offset}, wanted {_spec.COLUMN_MAX} in magnitude at most"
+            payload.findings.add("LAT-3", at + 8 * i, f"{payload.name}/{name}", message)
+            sound = False
+    return offsets, sound
+
+
+def _axes(codes: I64) -> I64:
+    """Bit 3·b + a of a code is bit b of axis a (6.4.2)."""
+    rows = np.zeros((_MORTON_AXES, len(codes)), np.int64)
+    for axis in range(_MORTON_AXES):
+        for bit in range(_spec.MORTON_BITS_MAX):
+            rows[axis] |= (codes >> _MORTON_AXES * bit + axis & 1) << bit
+    return rows

@@ -1,0 +1,150 @@
+"""Ranges of integers and of the values that they stand for (spec 6.4, 7)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat_conformance.validator.findings import Findings
+from csplat_conformance.validator.index import Index, scaled
+
+__all__ = ["I64", "Place", "check_box", "check_integers", "check_max_scale", "is_finite", "value_bits"]
+
+I64 = NDArray[np.int64]
+
+#: Byte of the file and name of what a message is about.
+Place = tuple[int, str]
+
+
+def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, exponent: int, where: Place) -> bool:
+    """Check the integers of a block, or of the part of it that one stream or one codebook gives.
+
+    Args:
+        findings: what is told.
+        index: of the file.
+        attribute: registry value; not means.
+        rows: [C, n] integers, before the lifting of 7.1.
+        exponent: of the block.
+        where: what is to blame.
+
+    Returns:
+        Whether all clauses hold that could be looked at.
+    """
+    before = len(findings.violations)
+    placed, levels = index.attributes.get(attribute), index.levels.get(attribute)
+    if placed is None or not rows.size:
+        return placed is not None
+    if _spec.ATTRIBUTE_KIND[attribute] == "lattice":
+        _check_lattice(findings, index, placed.record, rows, exponent, where)
+    elif levels is not None:
+        check = _check_quats if attribute == _spec.ATTRIBUTE_QUATS else _check_levels
+        check(findings, rows, levels, where)
+    return len(findings.violations) == before
+
+
+def _check_levels(findings: Findings, rows: I64, levels: int, where: Place) -> None:
+    low, high = int(rows.min()), int(rows.max())
+    if low < 0 or high > levels:
+        findings.add("LEV-1", *where, f"levels from {low} to {high}, wanted 0 to {levels}")
+
+
+def _check_quats(findings: Findings, rows: I64, levels: int, where: Place) -> None:
+    largest = max(abs(int(rows.min())), abs(int(rows.max())))
+    if largest > levels:
+        findings.add("QUA-1", *where, f"a component of magnitude {largest}, wanted {levels} at most")
+        if largest > _spec.QUAT_LEVELS_MAX:
+            return  # squares could leave 64 bits
+    radicands = 2 * levels * levels - np.square(rows).sum(axis=0)
+    lowest = int(radicands.min())
+    if lowest < 0 and largest <= levels:
+        message = f"R is {lowest} for splat {int(radicands.argmin())}, wanted 0 or more"
+        findings.add("QUA-2", *where, message)
+
+
+def _check_lattice(
+    findings: Findings, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
+) -> None:
+    third = len(rows) // 3
+    for column, row in enumerate(rows):
+        shift = record.chroma_shift if column >= third and record.mapping == _spec.MAPPING_YCOCG else 0
+        largest = max(abs(int(row.min())), abs(int(row.max()))) << shift
+        if largest > _spec.COLUMN_MAX:
+            message = f"column {column} has an integer of magnitude {largest}, wanted {_spec.COLUMN_MAX} at most"
+            findings.add("LAT-4", *where, message)
+            return
+    step = index.steps.get(record.attribute)
+    scale = None if step is None else scaled(step, exponent)
+    if scale is None:
+        return
+    if record.mapping == _spec.MAPPING_YCOCG:
+        rows = _lifted(rows, record.chroma_shift)
+    for extreme in (int(rows.min()), int(rows.max())):
+        if not is_finite(extreme, scale):
+            findings.add("LAT-5", *where, f"{extreme} x {scale} is not finite in binary32")
+            return
+
+
+def _lifted(rows: I64, chroma_shift: int) -> I64:
+    """R, G, B of Y, Co, Cg (7.1); LAT-4 keeps all of it within 2^53."""
+    y, co, cg = np.split(rows, 3)
+    co, cg = co << chroma_shift, cg << chroma_shift
+    t = y - (cg >> 1)
+    blue = t - (co >> 1)
+    return np.concatenate((blue + co, cg + t, blue))
+
+
+def value_bits(n: int, scale: float) -> bytes:
+    """Return float32(float64(n) × s), little-endian (7.2)."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.array(float(n) * scale, np.float64).astype("<f4").tobytes()
+
+
+def is_finite(n: int, scale: float) -> bool:
+    """LAT-5, MEA-1: whether the value of a lattice integer is finite in binary32."""
+    return math.isfinite(float(np.frombuffer(value_bits(n, scale), "<f4")[0]))
+
+
+def check_box(
+    findings: Findings, index: Index, record: Any, rows: I64, box: Place, stream: Place, *, sound: bool
+) -> None:
+    """TIL-10 and MEA-1.
+
+    Args:
+        findings: what is told.
+        index: of the file.
+        record: the tile record.
+        rows: [3, n], the integers q.
+        box: the record's `corner`.
+        stream: that of the means.
+        sound: TIL-7 to TIL-9 hold.
+    """
+    lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()
+    for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
+        if low != 0 or high != extent:
+            message = f"axis {axis}: q reaches from {low} to {high}, wanted 0 to the extent {extent}"
+            findings.add("TIL-10", *box, message)
+    step = index.steps.get(_spec.ATTRIBUTE_MEANS)
+    scale = None if step is None or not sound else scaled(step, record.exponent)
+    if scale is None:
+        return
+    for corner, low, high in zip(record.corner, lows, highs, strict=True):
+        for n in (corner + low, corner + high):
+            if not is_finite(n, scale):
+                findings.add("MEA-1", *stream, f"{n} x {scale} is not finite in binary32")
+                return
+
+
+def check_max_scale(findings: Findings, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
+    """TIL-11, bit for bit: NaN differs from everything, and +0 from −0."""
+    step = index.steps.get(_spec.ATTRIBUTE_SCALES)
+    scale = None if step is None else scaled(step, exponent)
+    if scale is None:
+        return
+    wanted = value_bits(largest, scale)
+    if wanted != stored:
+        found, value = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, wanted))
+        findings.add("TIL-11", *where, f"{found!r}, the largest scale is {value!r} ({largest} x {scale})")

@@ -1,0 +1,136 @@
+"""Decoders that are wrong on purpose, one mistake each: the suite has to notice every one of them.
+
+Usage:
+    python -m csplat_conformance.wrong             # the table: mistake, vectors failed, clauses
+    python -m csplat_conformance.wrong --only python --vectors
+
+The mistakes of the Python decoder replace one of its functions, those of the JavaScript decoder a piece of its text.
+Of refusals the code does not count, as of any decoder that is not ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from csplat.errors import InputError
+from csplat_conformance.adapter import answer
+from csplat_conformance.answers import PARTS, Answer, judge
+from csplat_conformance.manifest import Vector, load
+from csplat_conformance.report import Outcome, Status
+
+__all__ = ["Caught", "Mistake", "catch", "main", "table"]
+
+_SHOWN_CLAUSES = 4
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One thing that a decoder does wrong.
+
+    Attributes:
+        name: short.
+        what: what a hurried implementer might do.
+        clause: of the spec, that it breaks.
+        apply: makes the decoder wrong until the stack is closed.
+    """
+
+    name: str
+    what: str
+    clause: str
+    apply: Callable[[ExitStack], None]
+
+
+@dataclass(frozen=True)
+class Caught:
+    """What the suite says of a wrong decoder.
+
+    Attributes:
+        language: of the decoder.
+        mistake: what is wrong with it.
+        failed: the checks that failed.
+    """
+
+    language: str
+    mistake: Mistake
+    failed: Sequence[Outcome]
+
+    @property
+    def vectors(self) -> list[str]:
+        """Names of the vectors that failed."""
+        return list(dict.fromkeys(outcome.name for outcome in self.failed))
+
+    @property
+    def clauses(self) -> list[str]:
+        """Clauses that the failed vectors name, the most frequent first."""
+        by_vector = {outcome.name: outcome.clauses for outcome in self.failed}
+        counts = Counter(clause for clauses in by_vector.values() for clause in clauses)
+        return [clause for clause, _ in counts.most_common()]
+
+
+def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
+    """Run a wrong Python decoder over the vectors."""
+    failed = []
+    with ExitStack() as stack:
+        mistake.apply(stack)
+        for vector in load() if vectors is None else vectors:
+            failed += [one for one in judge(vector, _asked(vector.data), tuple(PARTS)) if not one.good]
+    return Caught("Python", mistake, failed)
+
+
+def _asked(data: bytes) -> Answer:
+    try:
+        return answer(data)
+    except Exception as error:  # noqa: BLE001 - a wrong decoder may fail in any way
+        return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def table(caught: Sequence[Caught]) -> str:
+    """Return the mistakes as a table in Markdown."""
+    lines = [
+        "| decoder | mistake | what it does | vectors failed | for example | clauses |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in caught:
+        clauses = one.clauses
+        named = [one.mistake.clause, *(clause for clause in clauses if clause != one.mistake.clause)]
+        more = f" and {len(named) - _SHOWN_CLAUSES} more" if len(named) > _SHOWN_CLAUSES else ""
+        example = next((o.name for o in one.failed if one.mistake.clause in o.clauses), "none")
+        cells = (one.language, one.mistake.name, one.mistake.what, str(len(one.vectors)), f"`{example}`")
+        lines.append(f"| {' | '.join(cells)} | {', '.join(named[:_SHOWN_CLAUSES])}{more} |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print the table; the exit status is 1 when a mistake goes unnoticed."""
+    from csplat_conformance.wrong_js import catch_all
+    from csplat_conformance.wrong_python import MISTAKES
+
+    parser = argparse.ArgumentParser(
+        prog="csplat_conformance.wrong", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", choices=("python", "javascript"), help="one of the two decoders")
+    parser.add_argument("--vectors", action="store_true", help="list the vectors that each mistake fails")
+    args = parser.parse_args()
+    caught = [] if args.only == "javascript" else [catch(mistake) for mistake in MISTAKES]
+    if args.only != "python":
+        try:
+            caught += catch_all()
+        except InputError as error:
+            sys.stderr.write(f"SKIPPED: the JavaScript decoder: {error}\n")
+    sys.stdout.write(table(caught) + "\n")
+    if args.vectors:
+        for one in caught:
+            sys.stdout.write(f"\n{one.language}, {one.mistake.name}: {', '.join(one.vectors)}\n")
+    missed = [one for one in caught if one.mistake.clause not in one.clauses]
+    for one in missed:
+        sys.stderr.write(f"unnoticed: {one.language}, {one.mistake.name} ({one.mistake.clause})\n")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""Mistakes of the JavaScript decoder: each replaces a piece of its text in a copy."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from csplat_conformance.answers import PARTS, judge
+from csplat_conformance.manifest import Vector, load
+from csplat_conformance.node import JsDecoder, js_folder
+from csplat_conformance.wrong import Caught, Mistake
+
+__all__ = ["EDITS", "Edit", "catch_all", "catch_edit", "edited"]
+
+_PROFILE = "base"
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One mistake.
+
+    Attributes:
+        name: short.
+        what: what a hurried implementer might do.
+        clause: of the spec, that it breaks.
+        file: module of the decoder.
+        old: a piece of its text that occurs once.
+        new: what stands there instead.
+    """
+
+    name: str
+    what: str
+    clause: str
+    file: str
+    old: str
+    new: str
+
+
+EDITS: Final = (
+    Edit("CRC ignored", "of chunks", "CHK-1", "container.mjs", "checkCrc(chunk, offset, 'CHK-1');", ""),
+    Edit(
+        "tails of payloads", "a payload may go on", "TLE-3", "payload.mjs", "if (this.left) throw", "if (false) throw"
+    ),
+    Edit(
+        "lenient inflate",
+        "as Node's inflateRaw by default",
+        "COD-2",
+        "inflate.mjs",
+        "if (used !== coded.length) throw",
+        "if (false) throw",
+    ),
+    Edit(
+        "zigzag",
+        "the sign is lost",
+        "STR-3",
+        "transforms.mjs",
+        "x[i] = ((x[i] >>> 1) ^ -(x[i] & 1)) & mask",
+        "x[i] >>>= 1",
+    ),
+    Edit("carry", "from the lower half of wide elements", "STR-2", "transforms.mjs", "(sum > 0xffffffff ? 1 : 0)", "0"),
+    Edit(
+        "escapes",
+        "escaped splats take what index 0 gives",
+        "CBK-3",
+        "codebooks.mjs",
+        "block.columns[Math.floor(i / n) * stride + escaped[i % n]] = escapes.columns[i];",
+        "",
+    ),
+    Edit(
+        "stages",
+        "stages after the first are dropped",
+        "CBR-3",
+        "codebooks.mjs",
+        "else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];",
+        "",
+    ),
+    Edit("quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("),
+    Edit(
+        "opacities",
+        "the square is forgotten",
+        "LEV-1",
+        "arrays.mjs",
+        "if (mapping === spec.MAPPING_NAMES[spec.MAPPING_SQUARE]) {",
+        "if (false) {",
+    ),
+    Edit("lifting", "halves rounded towards zero", "ATT-2", "lattice.mjs", "Math.floor(co / 2)", "Math.trunc(co / 2)"),
+    Edit(
+        "power",
+        "step × 2^exponent by way of 2^exponent, which may overflow",
+        "LAT-1",
+        "lattice.mjs",
+        "return view.getFloat64(0);",
+        "return x * 2 ** exponent;",
+    ),
+)
+
+
+def edited(edit: Edit, text: str) -> str:
+    """Return a module's text with the mistake in it."""
+    if text.count(edit.old) != 1:
+        raise ValueError(f"{edit.file} has {edit.old!r} {text.count(edit.old)} times, wanted once: mend the edit")
+    return text.replace(edit.old, edit.new)
+
+
+def catch_all() -> list[Caught]:
+    """Run each wrong decoder over the vectors.
+
+    Raises:
+        InputError: Node or the decoder is not here.
+    """
+    return [catch_edit(edit) for edit in EDITS]
+
+
+def catch_edit(edit: Edit, vectors: Sequence[Vector] | None = None) -> Caught:
+    """Run one wrong decoder over the vectors, or over some of them."""
+    mistake = Mistake(edit.name, edit.what, edit.clause, lambda _: None)
+    with tempfile.TemporaryDirectory(prefix="csplat-wrong-") as name:
+        folder = Path(name)
+        for path in js_folder().glob("*.mjs"):
+            shutil.copy(path, folder)
+        target = folder / edit.file
+        target.write_text(edited(edit, target.read_text(encoding="utf-8")), encoding="utf-8")
+        failed = []
+        with JsDecoder(folder) as decoder:
+            for vector in load() if vectors is None else vectors:
+                outcomes = judge(vector, decoder.ask(vector.data), tuple(PARTS), profile=_PROFILE)
+                failed += [one for one in outcomes if not one.good]
+    return Caught("JavaScript", mistake, failed)

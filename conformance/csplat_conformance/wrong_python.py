@@ -1,0 +1,241 @@
+"""Mistakes of the Python decoder: each replaces one of its functions."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import SimpleNamespace
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+
+from csplat import _spec, decoder
+from csplat.decoder import blocks, container, reconstruct, streams
+from csplat.errors import UnsupportedError
+from csplat_conformance.wrong import Mistake
+
+__all__ = ["MISTAKES"]
+
+Wrong = Callable[..., Any]
+
+
+def _replaced(name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
+    """Return what replaces a function of the decoder wherever it was imported; `wrong` gets the right one first."""
+
+    def apply(stack: ExitStack) -> None:
+        prefix = decoder.__name__ + "."
+        modules = [module for key, module in list(sys.modules.items()) if key.startswith(prefix)]
+        owners = [module for module in modules if hasattr(module, name)]
+        assert owners, f"the decoder has no {name}"
+        for owner in owners:
+            right = getattr(owner, name)
+            stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
+
+    return apply
+
+
+def _method(owner: type, name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
+    """Return what replaces a method."""
+
+    def apply(stack: ExitStack) -> None:
+        right = getattr(owner, name)
+        stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
+
+    return apply
+
+
+def _bound(wrong: Wrong, right: Wrong) -> Wrong:
+    def replacement(*args: Any, **options: Any) -> Any:
+        return wrong(right, *args, **options)
+
+    return replacement
+
+
+def _nothing(_right: Wrong, *_args: Any, **_options: Any) -> None:
+    return None
+
+
+# What is checked -----------------------------------------------------------------------------------
+
+
+def _cut_to_size(right: Wrong, data: Any) -> memoryview:
+    """Read as many bytes as the header announces, and no more."""
+    view: memoryview = right(data)
+    if len(view) < _spec.HEADER_SIZE:
+        return view
+    return view[: max(_spec.HEADER_SIZE, _spec.unpack_header(view).file_size)]
+
+
+def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - as the right one
+    import zlib
+
+    return zlib.decompressobj(-zlib.MAX_WBITS).decompress(coded, size).ljust(size, b"\0")
+
+
+def _skip_critical(right: Wrong, record: _spec.DirectoryRecord, at: int) -> None:
+    try:
+        right(record, at)
+    except UnsupportedError:
+        return
+
+
+def _no_limits(stack: ExitStack) -> None:
+    for name in ("CHROMA_SHIFT_MAX", "QUAT_LEVELS_MAX", "OPACITY_LEVELS_MAX", "COLUMN_MAX", "JSON_DEPTH_MAX"):
+        stack.enter_context(mock.patch.object(_spec, name, 2**60))
+
+
+# Streams -------------------------------------------------------------------------------------------
+
+
+def _zigzag(right: Wrong, elements: Any, width: int) -> Any:
+    result = right(elements, width)
+    return streams._wrap(np.where(elements & 1, result + elements.dtype.type(1), result), width)  # noqa: SLF001 - to break it
+
+
+def _no_wrap(_right: Wrong, elements: Any, _width: int) -> Any:
+    return elements
+
+
+def _as_unsigned(_right: Wrong, elements: Any, _width: int) -> Any:
+    return elements
+
+
+# Codebooks -----------------------------------------------------------------------------------------
+
+
+def _no_escapes(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
+    object.__setattr__(block, "escapes", None)
+    return right(block, *args)
+
+
+def _one_stage(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
+    object.__setattr__(block, "entries", block.entries[:1])
+    first = SimpleNamespace(**{**vars(block.indices), "stages": block.indices.stages[:1]})
+    object.__setattr__(block, "indices", first)
+    return right(block, *args)
+
+
+def _no_summand(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
+    object.__setattr__(block, "summand", None)
+    return right(block, *args)
+
+
+# Numbers -------------------------------------------------------------------------------------------
+
+
+def _binary32_product(_right: Wrong, integers: Any, step: float, out: Any) -> None:
+    out[...] = integers.astype(np.float32) * np.float32(step)
+
+
+def _loose_quats(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> None:
+    """Compute q / (M √2) in another order of operations."""
+    right(block, record, out)
+    for start, stop, q, r in reconstruct.quat_rows(block, record, len(out)):
+        out[start:stop, 0] = np.sqrt(r / 2.0) / record.levels
+        out[start:stop, 1:] = (q / record.levels / np.sqrt(2.0)).T
+
+
+def _minus_w(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> None:
+    right(block, record, out)
+    out[:, 0] *= -1.0
+
+
+def _w_last(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> None:
+    right(block, record, out)
+    out[:] = np.roll(out, -1, axis=1)
+
+
+def _linear(right: Wrong, record: _spec.AttributeRecord) -> Any:
+    return right(record._replace(mapping=_spec.MAPPING_LINEAR))
+
+
+def _bands_swapped(right: Wrong, parts: Any, records: Any, out: Any) -> None:
+    right(parts, records, out)
+    if len(records) > 1:
+        out[:, :8] = np.concatenate([out[:, 3:8], out[:, :3]], axis=1)
+
+
+def _channels_innermost(_right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any, **_: Any) -> None:
+    step = math.ldexp(record.step, block.exponent)
+    for start, stop, parts in reconstruct.lattice_rows(block, record, len(out), check=False):
+        columns = np.concatenate(parts)
+        for channel in range(3):
+            for coefficient, row in enumerate(columns[channel::3]):
+                reconstruct._scale(row, step, out[start:stop, coefficient, channel])  # noqa: SLF001 - as the right one
+
+
+def _without_corner(right: Wrong, block: Any, record: _spec.AttributeRecord, count: int, **options: Any) -> Any:
+    for start, stop, parts in right(block, record, count, **options):
+        if record.attribute == _spec.ATTRIBUTE_MEANS:
+            parts = tuple(part - offset for part, offset in zip(parts, block.offsets, strict=True))  # noqa: PLW2901 - the mistake
+        yield start, stop, parts
+
+
+def _added_as_floats(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> int:
+    """Add the tile's corner after rounding both parts to binary32."""
+    largest: int = right(block, record, out)
+    if record.attribute == _spec.ATTRIBUTE_MEANS:
+        step = math.ldexp(record.step, block.exponent)
+        for axis, offset in enumerate(block.offsets):
+            out[:, axis] = np.float32(offset * step) + (block.elements[axis] * step).astype(np.float32)
+    return largest
+
+
+def _no_chroma_shift(right: Wrong, y: Any, co: Any, cg: Any, _chroma_shift: int) -> Any:
+    return right(y, co, cg, 0)
+
+
+def _lift_towards_zero(_right: Wrong, y: Any, co: Any, cg: Any, chroma_shift: int) -> Any:
+    co, cg = co << chroma_shift, cg << chroma_shift
+    t = y - np.trunc(cg / 2).astype(cg.dtype)
+    green = cg + t
+    blue = t - np.trunc(co / 2).astype(co.dtype)
+    return blue + co, green, blue
+
+
+def _no_exponents(stack: ExitStack) -> None:
+    flat = SimpleNamespace(ldexp=lambda step, _exponent: step, inf=float("inf"))
+    stack.enter_context(mock.patch.object(reconstruct, "math", flat))
+
+
+def _sorted_codes(right: Wrong, codes: Any) -> Any:
+    return right(np.sort(codes))
+
+
+MISTAKES: Final = (
+    Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", _replaced("_check_crc", _nothing)),
+    Mistake("digest ignored", "the SHA-256 is not compared", "HDR-8", _replaced("check_digest", _nothing)),
+    Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", _replaced("view_of", _cut_to_size)),
+    Mistake("tails of payloads", "a payload may go on", "TLE-3", _method(container.Cursor, "finish", _nothing)),
+    Mistake("lenient inflate", "as most libraries do by default", "COD-2", _replaced("_inflate", _tail_of_inflate)),
+    Mistake("reserved bits", "reserved fields are not looked at", "RES-1", _replaced("check_reserved", _nothing)),
+    Mistake(
+        "critical chunks", "whatever is unknown is skipped", "DIR-2", _replaced("_check_chunk_type", _skip_critical)
+    ),
+    Mistake("limits", "levels, shifts, columns, nesting without bound", "LAT-4", _no_limits),
+    Mistake("box", "max_scale is believed", "TIL-11", _replaced("check_max_scale", _nothing)),
+    Mistake("zigzag", "odd values are one too large", "STR-3", _replaced("_undo_zigzag", _zigzag)),
+    Mistake("modulus", "DELTA and ZIGZAG not modulo 2^(8w)", "STR-2", _replaced("_wrap", _no_wrap)),
+    Mistake("sign", "elements of SIGNED read as unsigned", "LAT-4", _replaced("_as_signed", _as_unsigned)),
+    Mistake("order", "Morton codes taken for sorted", "ORD-1", _replaced("morton_axes", _sorted_codes)),
+    Mistake("escapes", "escaped splats take the last entry", "CBK-3", _method(blocks.Coded, "rows", _no_escapes)),
+    Mistake("stages", "stages after the first are dropped", "CBR-3", _method(blocks.Coded, "rows", _one_stage)),
+    Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", _method(blocks.Coded, "rows", _no_summand)),
+    Mistake("rounding", "products in binary32", "NUM-1", _replaced("_scale", _binary32_product)),
+    Mistake("quats, order of operations", "q / M / √2", "NUM-1", _replaced("write_quats", _loose_quats)),
+    Mistake("quats, sign of w", "w is negative", "QUA-2", _replaced("write_quats", _minus_w)),
+    Mistake("quats, place of w", "x, y, z, w", "QUA-2", _replaced("write_quats", _w_last)),
+    Mistake("opacities", "the square is forgotten", "LEV-1", _replaced("opacity_table", _linear)),
+    Mistake("layers swapped", "band 2 before band 1", "ATT-1", _replaced("write_bands", _bands_swapped)),
+    Mistake("SH columns", "coefficient by coefficient", "ATT-1", _replaced("write_colour", _channels_innermost)),
+    Mistake("tile offset", "the tile's corner is not added", "TIL-7", _replaced("lattice_rows", _without_corner)),
+    Mistake(
+        "tile offset as float", "corner and rest rounded apart", "TIL-7", _replaced("write_lattice", _added_as_floats)
+    ),
+    Mistake("exponents", "2^exponent is forgotten", "LAT-1", _no_exponents),
+    Mistake("chroma shift", "Co and Cg are not shifted", "ATT-8", _replaced("lift", _no_chroma_shift)),
+    Mistake("lifting", "halves rounded towards zero", "ATT-2", _replaced("lift", _lift_towards_zero)),
+)

@@ -1,0 +1,381 @@
+"""The encoder suite: its inputs, ours through it at every preset, and sloppy encoders that it must catch."""
+
+import doctest
+import json
+import os
+import shlex
+import sys
+import xml.etree.ElementTree as ET
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_conformance.report as report_module
+from csplat.encoder import PRESETS
+from csplat.errors import InputError
+from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
+from csplat_conformance.encoders.errors import contradictions, measured
+from csplat_conformance.encoders.judge import judge_stream
+from csplat_conformance.encoders.matching import pair
+from csplat_conformance.process import run_program
+from csplat_conformance.report import Status
+from csplat_tools.app import app
+from csplat_tools.pairs import measure_pairs
+
+ROOT = Path(__file__).resolve().parent.parent
+INPUTS = {one.name: one for one in all_inputs()}
+ENCODABLE = {name: one for name, one in INPUTS.items() if one.scene is not None}
+OURS = f"{shlex.quote(sys.executable)} -m csplat_tools encode {{ply}} {{out}} --quiet"
+INTEGRITY = ("L1", "L2", "L3")
+HAS_RENDERER = find_spec("numba") is not None
+
+
+def load_sloppy():
+    spec = spec_from_file_location("sloppy_encoder", ROOT / "tests" / "sloppy_encoder.py")
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+sloppy = load_sloppy()
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["conformance", "encoder", *map(str, words)])
+
+
+def program(code):
+    """A command line that runs some Python on {ply} and {out}."""
+    return f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} {{ply}} {{out}}"
+
+
+# Inputs --------------------------------------------------------------------------------------------
+
+
+def test_inputs_have_names_of_their_own_and_say_why():
+    assert len(all_inputs()) == len(INPUTS)
+    assert {"ordinary", "nasty", "broken"} == {name.split("/")[0] for name in INPUTS}
+    assert all(one.why for one in INPUTS.values())
+
+
+def test_ordinary_inputs_must_be_taken_and_broken_ones_refused():
+    for name, one in INPUTS.items():
+        assert name.startswith("broken/") == one.must_refuse
+        assert name.startswith("nasty/") == one.may_refuse
+
+
+@pytest.mark.parametrize("name", ENCODABLE)
+def test_an_input_is_the_scene_that_it_says(tmp_path, name):
+    # Written by hand there, read by our reader here: the two know nothing of each other.
+    one = ENCODABLE[name]
+    (tmp_path / "in.ply").write_bytes(one.make())
+    found, wanted = csplat.read_ply(tmp_path / "in.ply", keep_extra=True), one.scene()
+
+    for array in ("means", "scales", "opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(found, array), getattr(wanted, array), array)
+    np.testing.assert_allclose(found.quats, wanted.quats, atol=1e-7)
+    assert {key: column.tobytes() for key, column in wanted.extra.items()} == {
+        key: column.tobytes() for key, column in found.extra.items()
+    }
+
+
+@pytest.mark.parametrize("name", [name for name in ENCODABLE if name != "ordinary/two_tiles"])
+def test_different_splats_keep_their_distance(name):
+    one = ENCODABLE[name]
+    means = np.unique(one.scene().means.astype(np.float64), axis=0)
+    distances = np.sqrt(np.square(means[:, None] - means[None]).sum(axis=2))
+    np.fill_diagonal(distances, np.inf)
+
+    assert distances.min(initial=np.inf) >= one.apart * (1 - 1e-5)  # the lattice of float32
+
+
+@pytest.mark.parametrize("name", ["ordinary/degree_3", "nasty/duplicates", "broken/cut"])
+def test_an_input_is_the_same_every_time(name):
+    assert INPUTS[name].make() == {one.name: one for one in all_inputs()}[name].make()
+
+
+@pytest.mark.parametrize("name", [name for name, one in INPUTS.items() if one.must_refuse])
+def test_broken_inputs_are_broken(tmp_path, name):
+    path = written(tmp_path, name)
+
+    with pytest.raises(InputError):
+        csplat.read_ply(path)
+
+
+# Pairs and errors ----------------------------------------------------------------------------------
+
+
+def test_pairs_are_found_however_the_file_is_ordered():
+    source = ENCODABLE["ordinary/two_tiles"].scene().means.astype(np.float64)
+    order = np.random.default_rng(1).permutation(len(source))[:60_000]
+    moved = source[order] + np.random.default_rng(2).uniform(-0.01, 0.01, (60_000, 3))
+    found = pair(source, moved, 0.06)
+
+    np.testing.assert_array_equal(order, found.source_index)
+    assert (0, 0, len(source) - 60_000) == (found.strays, found.surplus, found.missing)
+
+
+def test_strays_and_surplus_are_told_apart():
+    source = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
+    decoded = np.array([[0.1, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [3, 0, 0]])
+    found = pair(source, decoded, 1.0)
+
+    assert (1, 1, 1) == (found.strays, found.surplus, found.missing)
+
+
+def test_duplicates_are_paired_one_by_one():
+    source = np.zeros((3, 3))
+    assert {0, 1, 2} == set(pair(source, source + 0.01, 1.0).source_index)
+    assert 1 == pair(source, np.zeros((4, 3)), 1.0).surplus
+    assert 2 == pair(source, np.zeros((1, 3)), 1.0).missing
+
+
+def test_any_centre_can_be_paired():
+    wild = np.array([[np.inf, 0, 0], [-1e300, 1e300, 0], [0, 0, 0]])
+
+    assert 2 == pair(np.zeros((1, 3)), wild, 1e-6).strays
+    assert 3 == pair(np.zeros((0, 3)), wild, 1.0).strays
+    assert 5 == pair(np.zeros((5, 3)), np.zeros((0, 3)), 1.0).missing
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_errors_agree_with_those_of_verify(make_model, degree):
+    # Two programs that know nothing of each other
+    source, decoded = make_model(40, 2, seed=1), make_model(30, degree, seed=2)
+    index = np.random.default_rng(3).permutation(40)[:30]
+    theirs = measure_pairs(source, decoded, index)
+    found = measured(source, decoded, index)
+
+    assert set(theirs) == set(found)
+    for name, values in theirs.items():
+        assert values == pytest.approx(found[name], rel=1e-9), name
+
+
+def test_statements_are_held_to_both_sides():
+    found = {"means": (0.5, 0.25), "sh0": (0.5, 0.25)}
+
+    assert [] == contradictions(found, {"means": (0.5, 0.25)})
+    assert [] == contradictions(found, {"means": (0.5, 0.25 * 1.00009)})
+    assert ["means: max is 0.5, stated 0.49"] == contradictions(found, {"means": (0.49, 0.25)})
+    assert ["sh0: rms is 0.25, stated 0.26, which is too much"] == contradictions(found, {"sh0": (0.5, 0.26)})
+
+
+# Ours ----------------------------------------------------------------------------------------------
+
+
+#: Of the presets that are not the default a choice, to save time: degrees, tiles, duplicates, and what is huge or tiny.
+SOME = "*/[dthz]*"
+
+
+@pytest.mark.parametrize(("preset", "pattern"), [(name, None if name == "balanced" else SOME) for name in PRESETS])
+def test_our_encoder_passes_at_every_preset(preset, pattern):
+    # CNF-5, CNF-6
+    report = run_encoder(f"{OURS} --preset {preset}", EncoderChoice(pattern, INTEGRITY))
+
+    assert [] == report.failures
+    assert len(report.outcomes) >= 30
+    assert all(one.status is Status.PASSED for one in report.outcomes)  # ours refuses nothing that it can encode
+
+
+@pytest.mark.skipif(not HAS_RENDERER, reason="pictures want the extra [render]")
+@pytest.mark.parametrize(("preset", "decibels"), [("fast", 34), ("balanced", 34), ("small", 32)])
+def test_our_encoder_keeps_the_picture(preset, decibels):
+    command = f"{OURS} --preset {preset}"
+    choice = EncoderChoice("ordinary/*_[3d]*", ("L4",), psnr_min=decibels)
+    report = run_encoder(command, choice, pictures=sloppy.psnr)
+
+    assert ["ordinary/degree_3", "ordinary/needles_and_discs"] == [one.name for one in report.outcomes]
+    assert [] == report.failures
+
+
+# Sloppy encoders -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def reports():
+    """What the suite says of each mistake; processes side by side, since most of their time is starting."""
+    names = [name for name, mistake in sloppy.MISTAKES.items() if mistake.caught[0] != "L4"]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(names, pool.map(sloppy.find, names), strict=True))
+
+
+@pytest.mark.parametrize("name", [name for name, one in sloppy.MISTAKES.items() if one.caught[0] != "L4"])
+def test_a_sloppy_encoder_is_caught(reports, name):
+    level, clause = sloppy.MISTAKES[name].caught
+    failures = reports[name].failures
+
+    assert not reports[name].passed
+    assert level == failures[0].level
+    assert clause in failures[0].clauses if clause else failures[0].clauses == ()
+
+
+@pytest.mark.skipif(not HAS_RENDERER, reason="pictures want the extra [render]")
+@pytest.mark.parametrize("name", [name for name, one in sloppy.MISTAKES.items() if one.caught[0] == "L4"])
+def test_what_only_pictures_show_is_caught(name):
+    failures = sloppy.find(name).failures
+
+    assert ["L4"] == [one.level for one in failures]
+    assert "dB, wanted 30 at least" in failures[0].message
+
+
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [
+        ("half_a_file", Status.PARTIAL_OUTPUT),
+        ("leaves_half", Status.PARTIAL_OUTPUT),
+        ("writes_nothing", Status.NO_OUTPUT),
+        ("crashes", Status.CRASHED),
+        ("hangs", Status.HUNG),
+        ("status_3", Status.WRONG_STATUS),
+        ("silent_refusal", Status.WRONG_ANSWER),
+        ("max_halved", Status.FAILED),
+    ],
+)
+def test_ends_are_told_apart(reports, name, status):
+    assert status is reports[name].failures[0].status
+
+
+def test_our_encoder_without_a_mistake_passes_what_catches_them(tmp_path):
+    # The mistakes are what fails, not the way of making them.
+    data = csplat.encode(csplat.read_ply(written(tmp_path, "ordinary/degree_1")))
+    for change in (sloppy.stated(lambda record: record), sloppy.counts(0, 0)):
+        assert data == change(data)
+
+
+def written(folder, name):
+    path = folder / "in.ply"
+    path.write_bytes(INPUTS[name].make())
+    return path
+
+
+# Refusals ------------------------------------------------------------------------------------------
+
+
+def test_who_refuses_everything_passes_only_where_that_is_allowed():
+    refuses = program("import sys; sys.exit('error: not today')")
+    report = run_encoder(refuses, EncoderChoice("[nb][ar]*/[ncdo]*"))
+    ordinary = run_encoder(refuses, EncoderChoice("ordinary/one_splat"))
+
+    assert report.passed
+    assert "refused: error: not today" in {one.message for one in report.outcomes}
+    assert [Status.REFUSED] == [one.status for one in ordinary.failures]
+
+
+def test_a_traceback_is_a_crash():
+    report = run_encoder(program("raise ValueError('oh')"), EncoderChoice("nasty/empty"))
+
+    assert [(Status.CRASHED, "a traceback; its last line: ValueError: oh")] == [
+        (one.status, one.message) for one in report.failures
+    ]
+
+
+def test_broken_inputs_must_not_be_taken(tmp_path):
+    sound = tmp_path / "sound.csplat"
+    sound.write_bytes(csplat.encode(ENCODABLE["ordinary/one_splat"].scene()))
+    copies = program(f"import shutil, sys; shutil.copy({str(sound)!r}, sys.argv[2])")
+    report = run_encoder(copies, EncoderChoice("broken/*"))
+
+    assert ["accepted, though there are no splats in it"] * 4 == [one.message for one in report.failures]
+
+
+def test_a_child_that_is_left_behind_is_ended():
+    lingering = program("import subprocess, sys; subprocess.Popen(['sleep', '600']); sys.exit('no')")
+    ended = run_program(lingering, {"ply": "a", "out": "b"}, 30.0)
+
+    assert (None, 1) == (ended.status, ended.returncode)
+    assert ended.seconds < 20
+
+
+def test_a_file_that_the_validator_passes_and_the_decoder_refuses_is_a_failure(monkeypatch):
+    def refuse(_data):
+        raise InputError("no")
+
+    monkeypatch.setattr("csplat_conformance.encoders.judge.decode_scene", refuse)
+    verdict, scene = judge_stream(csplat.encode(ENCODABLE["ordinary/one_splat"].scene()))
+
+    assert (Status.FAILED, None) == (verdict.status, scene)
+    assert "csplat's decoder refuses it" in verdict.message
+
+
+# The command ---------------------------------------------------------------------------------------
+
+
+def test_reports_are_written_for_people_programs_and_ci(tmp_path):
+    result = invoke(
+        "--filter", "*/one_splat", "--level", 3, "--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml",
+        "--keep", tmp_path / "kept",
+    )  # fmt: skip
+
+    assert 0 == result.exit_code, result.output
+    assert "all         3       3       0        0" in result.stdout
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert ("encoder", True) == (report["suite"], report["passed"])
+    assert ["L1", "L2", "L3"] == [one["level"] for one in report["outcomes"]]
+    assert report["outcomes"][2]["details"]["means"]["stated"]
+    root = ET.fromstring((tmp_path / "r.xml").read_text())  # noqa: S314 - our own file
+    assert {"tests": "3", "failures": "0"}.items() <= root.attrib.items()
+    assert ["ordinary-one_splat.csplat", "ordinary-one_splat.ply"] == sorted(
+        path.name for path in (tmp_path / "kept").iterdir()
+    )
+    assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--json", tmp_path / "r.json").exit_code
+    assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--keep", tmp_path / "kept").exit_code
+
+
+def test_failures_are_shown_with_their_clause():
+    command = f"{shlex.quote(sys.executable)} {ROOT / 'tests' / 'sloppy_encoder.py'} max_scale_linear {{ply}} {{out}}"
+    result = invoke("--cmd", command, "--filter", "ordinary/degree_1", "--level", "1", "--junit", "-")
+
+    assert 1 == result.exit_code
+    (case,) = ET.fromstring(result.stdout).iter("testcase")  # noqa: S314 - our own text
+    assert "TIL-11 E_BOX" in case[0].attrib["message"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--filter", "nothing"), "no input has such a name"),
+        (("--cmd", "true {ply}"), "lacks {out}"),
+        (("--cmd", "true '{ply} {out}"), "cannot be used"),
+        (("--cmd", "true {ply} {out} {what}"), "cannot be used"),
+        (("--cmd", "/no/such/encoder {ply} {out}", "--filter", "broken/cut"), "No such file"),
+        (("--level", "5"), "level '5'"),
+    ],
+)
+def test_wrong_words_are_one_line(words, message):
+    result = invoke(*words)
+
+    assert 1 == result.exit_code
+    assert message in result.stderr
+    assert 1 == len(result.stderr.strip().splitlines())
+
+
+def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
+    def absent(**_):
+        raise InputError("this needs numba: pip install 'csplat[render]'")
+
+    monkeypatch.setattr("csplat_tools.commands.conformance_encoder.prepare_renderer", absent)
+    result = invoke("--filter", "*/degree_0")
+
+    assert 0 == result.exit_code
+    assert "L4 SKIPPED: this needs numba" in result.stdout
+    assert "L4  skipped  ordinary/degree_0  this needs numba" in result.stdout
+
+
+def test_the_report_explains_itself():
+    assert 0 == doctest.testmod(report_module).failed
+
+
+def test_the_encoder_suite_loads_neither_encoder_nor_renderer():
+    code = "import sys, csplat_conformance.encoders; print(*sorted(sys.modules))"
+    ended = run_program(f"{shlex.quote(sys.executable)} -c {shlex.quote(code)}", {}, 60.0)
+    loaded = ended.stdout.decode().split()
+
+    assert not [
+        name for name in loaded if name.startswith(("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch"))
+    ]

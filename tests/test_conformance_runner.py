@@ -1,0 +1,260 @@
+"""The runner against decoders that behave, and against some that do not."""
+
+import json
+import shutil
+import sys
+import xml.etree.ElementTree as ET  # what is parsed is our own
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from csplat.errors import InputError
+from csplat_conformance.manifest import load
+from csplat_conformance.report import Status
+from csplat_conformance.runner import Choice, parse_levels, run_builtin, run_command
+from csplat_tools.app import app
+
+ROOT = Path(__file__).resolve().parent.parent
+ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
+JS_ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
+
+# Our decoder by the protocol, with a fault to order.
+FAULTY = """
+import json, os, pathlib, signal, sys, time
+from csplat_conformance import adapter
+
+fault, source, outdir = sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3])
+if fault == "crash":
+    os.kill(os.getpid(), signal.SIGSEGV)
+if fault == "hang":
+    time.sleep(60)
+if fault == "status":
+    sys.exit(77)
+if fault == "traceback":
+    raise KeyError("tile")
+if fault == "silent":
+    sys.exit(0)
+if fault == "no code":
+    print("it is broken")
+    sys.exit(1)
+if fault == "refusal":
+    print(json.dumps({"code": "E_MAGIC"}))
+    sys.exit(1)
+sys.argv = ["adapter", source, str(outdir)]
+status = adapter.main()
+means = outdir / "floats.means.bin"
+if fault == "leftovers":
+    (outdir / "floats.means.bin").write_bytes(b"part")
+if fault == "no header":
+    (outdir / "header.json").unlink()
+if fault == "header":
+    (outdir / "header.json").write_text("[]")
+if fault == "fact":
+    facts = json.loads((outdir / "header.json").read_text())
+    (outdir / "header.json").write_text(json.dumps(facts | {"splat_count": 3}))
+if fault == "missing":
+    (outdir / "integers.means.bin").unlink()
+if fault == "extra":
+    (outdir / "floats.colours.bin").write_bytes(b"")
+if fault == "unknown file":
+    (outdir / "log.txt").write_text("done")
+if fault == "partial":
+    means.write_bytes(means.read_bytes()[:-1])
+if fault == "longer":
+    means.write_bytes(means.read_bytes() + b"0")
+if fault == "rounding":
+    raw = bytearray(means.read_bytes())
+    raw[0] ^= 1
+    means.write_bytes(raw)
+sys.exit(status)
+"""
+
+
+@pytest.fixture
+def faulty(tmp_path):
+    script = tmp_path / "decoder.py"
+    script.write_text(FAULTY)
+    return lambda fault: f"{sys.executable} {script} '{fault}' {{input}} {{outdir}}"
+
+
+def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets():
+    report = run_command(ADAPTER, Choice(pattern="*/*ra[wtn]*", exact=True))
+
+    assert [] == report.failures
+    assert {"L1", "L2", "L3"} == set(report.levels())
+    assert {"valid", "invalid"} <= {outcome.name.split("/")[0] for outcome in report.outcomes}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+@pytest.mark.skipif(not JS_ADAPTER.exists(), reason="only a checkout has the JavaScript decoder's tests")
+def test_the_javascript_decoder_passes_by_the_protocol():
+    choice = Choice(pattern="*/*ra[wtn]*", exact=True, profile="base")
+    report = run_command(f"node {JS_ADAPTER} {{input}} {{outdir}}", choice)
+
+    assert [] == report.failures
+    assert report.levels()["L3"]["checks"] > 2
+
+
+VALID_FAULTS = {
+    "crash": (Status.CRASHED, ("L1", "L2", "L3"), "signal 11"),
+    "hang": (Status.HUNG, ("L1", "L2", "L3"), "still running after 1.5 s"),
+    "status": (Status.WRONG_STATUS, ("L1", "L2", "L3"), "exit status 77"),
+    "traceback": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "KeyError: 'tile'"),
+    "silent": (Status.NO_OUTPUT, ("L1", "L2", "L3"), "nothing was written"),
+    "no code": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "without a line of JSON"),
+    "refusal": (Status.REFUSED, ("L1", "L2", "L3"), "refused"),
+    "no header": (Status.WRONG_ANSWER, ("L1",), "no header.json"),
+    "header": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "header.json is not a JSON object"),
+    "fact": (Status.FAILED, ("L1",), "header.splat_count: 3 for 5"),
+    "missing": (Status.WRONG_ANSWER, ("L2",), "integers.means is missing"),
+    "extra": (Status.FAILED, ("L3",), "floats.colours: not asked for"),
+    "unknown file": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "log.txt is no file of the protocol"),
+    "partial": (Status.PARTIAL_OUTPUT, ("L3",), "floats.means: 59 bytes for 60"),
+    "longer": (Status.FAILED, ("L3",), "floats.means: 61 bytes for 60"),
+    "rounding": (Status.FAILED, ("L3",), "floats.means differs"),
+}
+
+
+@pytest.mark.parametrize("fault", VALID_FAULTS)
+def test_a_fault_on_a_valid_file_has_an_outcome_of_its_own(faulty, fault):
+    status, levels, message = VALID_FAULTS[fault]
+    timeout = 1.5 if fault == "hang" else 60
+    report = run_command(faulty(fault), Choice(pattern="valid/quats", timeout=timeout))
+
+    assert levels == tuple(outcome.level for outcome in report.failures)
+    assert {status} == {outcome.status for outcome in report.failures}
+    assert all(message in outcome.message for outcome in report.failures)
+    assert all("QUA-1" in outcome.clauses for outcome in report.failures)
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "message"),
+    [
+        ("none", Status.PASSED, ""),
+        ("refusal", Status.PASSED, "planted E_RANGE at byte 384 by QUA-2, reported E_MAGIC"),
+        ("leftovers", Status.PARTIAL_OUTPUT, "refused, but left floats.means.bin"),
+        ("silent", Status.FAILED, "accepted"),
+        ("crash", Status.CRASHED, "signal 11"),
+        ("status", Status.WRONG_STATUS, "exit status 77"),
+        ("no code", Status.WRONG_ANSWER, "without a line of JSON"),
+    ],
+)
+def test_what_becomes_of_a_broken_file(faulty, fault, status, message):
+    (outcome,) = run_command(faulty(fault), Choice(pattern="invalid/quat_radicand")).outcomes
+
+    assert (status, "L1") == (outcome.status, outcome.level)
+    assert message in outcome.message
+    assert "QUA-2" == outcome.clauses[0]
+
+
+def test_another_code_fails_where_exactness_is_asked_for(faulty):
+    report = run_command(faulty("refusal"), Choice(pattern="invalid/quat_radicand", exact=True))
+
+    assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
+
+
+def test_a_broken_text_may_be_accepted_by_decoders_that_do_not_read_it(faulty):
+    report = run_command(faulty("silent"), Choice(pattern="invalid/json_open"))
+
+    assert report.passed
+    assert "as a decoder may" in report.outcomes[0].message
+    assert not run_command(faulty("silent"), Choice(pattern="invalid/json_open", exact=True)).passed
+
+
+def test_a_decoder_of_the_profile_base_has_to_refuse_archive_as_unsupported(faulty):
+    choice = Choice(pattern="valid/coder_zstd_raw", profile="base")
+
+    assert "accepted" == run_command(ADAPTER, choice).failures[0].message
+    (wrong_code,) = run_command(faulty("refusal"), choice).failures
+    assert "planted E_UNSUPPORTED at byte 12 by HDR-4, reported E_MAGIC" == wrong_code.message
+    assert run_command(ADAPTER, Choice(pattern="valid/coder_zstd_raw")).passed
+
+
+def test_names_of_extra_columns_are_percent_encoded():
+    report = run_command(ADAPTER, Choice(pattern="extreme/extra_names", levels=(3,)))
+
+    assert report.passed
+
+
+@pytest.mark.parametrize(
+    ("text", "levels"), [("1", (1,)), ("3", (1, 2, 3)), ("1,3", (1, 3)), ("L4", (1, 2, 3, 4)), ("3,1", (1, 3))]
+)
+def test_levels_are_all_up_to_one_or_those_named(text, levels):
+    assert levels == parse_levels(text)
+
+
+@pytest.mark.parametrize("text", ["0", "5", "x", "1,9", ""])
+def test_other_levels_are_refused(text):
+    with pytest.raises(InputError):
+        parse_levels(text)
+
+
+@pytest.mark.parametrize(
+    "command", ["my-decoder-that-is-not-there {input} {outdir}", "decoder {input}", "", "'decoder {input} {outdir}"]
+)
+def test_a_command_that_cannot_be_run_is_refused_at_once(command):
+    with pytest.raises(InputError):
+        run_command(command, Choice(pattern="valid/quats"))
+
+
+@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"profile": "main"}, {"timeout": 0}, {"jobs": 0}])
+def test_a_choice_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(InputError):
+        Choice(**wrong)
+
+
+def test_levels_decide_what_is_looked_at(faulty):
+    at_1 = run_command(faulty("rounding"), Choice(pattern="valid/quats", levels=(1,)))
+    at_3 = run_command(faulty("rounding"), Choice(pattern="valid/quats", levels=(3,)))
+
+    assert (True, False) == (at_1.passed, at_3.passed)
+
+
+def test_the_built_in_run_looks_at_every_vector_once_per_level():
+    names = [outcome.name for outcome in run_builtin(Choice(levels=(1,))).outcomes]
+
+    assert [vector.name for vector in load()] == names
+
+
+def test_vectors_are_chosen_by_clause():
+    names = {outcome.name for outcome in run_builtin(Choice(clause="MOR-*", levels=(1,))).outcomes}
+
+    assert {vector.name for vector in load() if any(clause.startswith("MOR-") for clause in vector.clauses)} == names
+
+
+# The command ---------------------------------------------------------------------------------------
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["conformance", "decoder", *map(str, words)])
+
+
+def test_the_command_writes_table_json_and_junit(faulty, tmp_path):
+    reports = ("--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
+    result = invoke("--cmd", faulty("rounding"), "--filter", "valid/quats", *reports)
+
+    assert 1 == result.exit_code
+    assert "L3  FAILED  valid/quats  floats.means differs" in result.stdout
+    found = json.loads((tmp_path / "r.json").read_text())
+    assert (False, 1) == (found["passed"], found["levels"]["L3"]["failed"])
+    suites = ET.parse(tmp_path / "r.xml").getroot()  # noqa: S314 - ours
+    assert ("3", "1") == (suites.get("tests"), suites.get("failures"))
+    assert "exists" in invoke("--filter", "valid/quats", *reports).stderr
+    assert 0 == invoke("--filter", "valid/quats", *reports, "--force").exit_code
+
+
+def test_one_report_may_go_to_standard_output():
+    assert json.loads(invoke("--filter", "valid/quats", "--json", "-").stdout)["passed"]
+    assert invoke("--filter", "valid/quats", "--junit", "-").stdout.startswith("<?xml")
+    assert 1 == invoke("--filter", "valid/quats", "--json", "-", "--junit", "-").exit_code
+
+
+def test_the_command_lists_every_check_when_asked():
+    assert "L2  ok  valid/quats" in invoke("--filter", "valid/quats", "--verbose").stdout
+
+
+def test_a_level_that_is_none_is_one_line():
+    result = invoke("--level", "9")
+
+    assert (1, 1) == (result.exit_code, len(result.stderr.splitlines()))

@@ -1,0 +1,202 @@
+"""L4: reference pictures, and renderers that come near enough or do not."""
+
+import json
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat_conformance import views
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.pictures import PSNR_CAP, psnr, read_png, write_png
+from csplat_conformance.recipes import __main__ as recipes
+from csplat_conformance.recipes.rendered import rendered_recipes
+from csplat_conformance.reference import expected
+from csplat_conformance.report import Status
+from csplat_conformance.runner import Choice, run_builtin, run_command
+
+RENDERED = [vector for vector in load() if vector.views]
+
+# Copies a picture, with a fault to order.
+COPIER = """
+import json, os, pathlib, sys, time
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.pictures import read_png, write_png
+
+fault, source, camera, out = sys.argv[1:]
+(wanted,) = json.loads(pathlib.Path(camera).read_text())
+views = [view for vector in load() for view in vector.views if vector.file.split("/")[1] == pathlib.Path(source).name]
+(view,) = [view for view in views if view["camera"] == wanted]
+picture = read_png((VECTORS / view["picture"]).read_bytes())
+if fault == "status":
+    sys.exit(1)
+if fault == "shifted":
+    picture = picture[:, list(range(1, picture.shape[1])) + [0]]
+if fault == "small":
+    picture = picture[1:]
+if fault == "text":
+    pathlib.Path(out).write_text("P3")
+elif fault != "nothing":
+    pathlib.Path(out).write_bytes(write_png(picture))
+"""
+
+
+@pytest.fixture
+def copier(tmp_path):
+    script = tmp_path / "renderer.py"
+    script.write_text(COPIER)
+    return lambda fault: f"{sys.executable} {script} {fault} {{input}} {{camera}} {{out}}"
+
+
+@pytest.mark.parametrize("vector", RENDERED, ids=lambda vector: vector.name)
+def test_a_scene_is_seen_by_two_cameras_and_not_dark(vector):
+    assert 2 == len(vector.views)
+    for view in vector.views:
+        picture = read_png((VECTORS / view["picture"]).read_bytes())
+        assert (view["camera"]["H"], view["camera"]["W"], 3) == picture.shape
+        assert psnr(picture, np.zeros_like(picture)) < 25
+
+
+def test_our_renderer_comes_near_enough():
+    report = run_builtin(Choice(pattern="render/*", levels=(4,)))
+
+    assert report.passed
+    assert 6 == len(report.outcomes)
+    assert min(outcome.details["psnr"] for outcome in report.outcomes) > 60
+
+
+MISTAKES = {
+    "no harmonics": ("render/harmonics", lambda floats: floats | {"shN": floats["shN"][:, :0]}),
+    "x, y, z, w": ("render/ellipsoids", lambda floats: floats | {"quats": np.roll(floats["quats"], 1, axis=1)}),
+    "w negative": ("render/ellipsoids", lambda floats: floats | {"quats": floats["quats"] * np.float32([-1, 1, 1, 1])}),
+    "scales too large": (
+        "render/ellipsoids",
+        lambda floats: floats | {"scales": floats["scales"] + 0.05},
+    ),
+    "no low-pass filter": ("render/antialiased", None),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
+    name, change = MISTAKES[mistake]
+    recipe = next(recipe for recipe in rendered_recipes() if recipe.name == name)
+    made = expected(recipe.scene)
+    floats = change(made.floats) if change else made.floats
+    antialiased = bool(made.header["scene_flags"]) and change is not None
+    scores = []
+    for number, view in enumerate(recipe.views):
+        reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
+        scores.append(psnr(reference, views.reference_picture(floats, view.camera, antialiased)) - view.psnr)
+
+    assert min(scores) < 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "message"),
+    [
+        ("none", Status.PASSED, ""),
+        ("shifted", Status.FAILED, "wanted 45"),
+        ("small", Status.WRONG_ANSWER, "128x127 pixels, wanted 128x128"),
+        ("text", Status.WRONG_ANSWER, "not a PNG"),
+        ("nothing", Status.NO_OUTPUT, "0 PNG files"),
+        ("status", Status.REFUSED, "exit status 1"),
+    ],
+)
+def test_what_becomes_of_a_renderer(copier, fault, status, message):
+    report = run_command(None, Choice(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
+
+    assert {status} == {outcome.status for outcome in report.outcomes}
+    assert all(message in outcome.message for outcome in report.outcomes)
+
+
+def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
+    monkeypatch.setattr(views, "can_render", lambda: False)
+    (outcome, _) = run_builtin(Choice(pattern="render/ellipsoids", levels=(4,))).outcomes
+
+    assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
+
+
+def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
+    monkeypatch.setattr(recipes, "can_render", lambda: False)
+    monkeypatch.setattr(sys, "argv", ["recipes", "--check"])
+
+    assert 0 == recipes.main()
+    assert "SKIPPED: reference pictures" in capsys.readouterr().err
+
+
+def test_a_picture_that_looks_different_is_out_of_date(monkeypatch, capsys):
+    right = recipes.reference_picture
+    monkeypatch.setattr(recipes, "reference_picture", lambda *args: 255 - right(*args))
+    monkeypatch.setattr(sys, "argv", ["recipes", "--check"])
+
+    assert 1 == recipes.main()
+    assert "ellipsoids.0.png" in capsys.readouterr().err
+
+
+# PNG -----------------------------------------------------------------------------------------------
+
+
+def test_pictures_survive_writing_and_reading():
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+
+    assert np.array_equal(picture, read_png(write_png(picture)))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
+def test_pictures_of_other_writers_are_read(tmp_path, mode):
+    image = pytest.importorskip("PIL.Image")
+    noise = np.random.default_rng(1).integers(0, 256, (40, 30, 3), np.uint8)
+    noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # so that the writer chooses every filter
+    picture = image.fromarray(noise).convert(mode)
+    picture.save(tmp_path / "a.png")
+
+    assert np.array_equal(np.asarray(picture.convert("RGB")), read_png((tmp_path / "a.png").read_bytes()))
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 3, 4])
+def test_every_filter_is_undone(kind):
+    rng = np.random.default_rng(kind)
+    rows = rng.integers(0, 256, (3, 1 + 4 * 3), np.uint8)
+    rows[:, 0] = kind
+    data = bytearray(write_png(np.zeros((3, 4, 3), np.uint8)))
+    coded = zlib.compress(rows.tobytes())
+    at = data.index(b"IDAT") - 4
+    patched = bytes(data[:at]) + len(coded).to_bytes(4, "big") + b"IDAT" + coded + bytes(4) + bytes(data[-12:])
+    previous = np.zeros(12, int)
+    expected_rows = []
+    for row in rows[:, 1:].astype(int):
+        line = np.zeros(12, int)
+        for i, value in enumerate(row):
+            a, b, c = (line[i - 3] if i > 2 else 0), previous[i], (previous[i - 3] if i > 2 else 0)
+            p = a + b - c
+            paeth = a if abs(p - a) <= min(abs(p - b), abs(p - c)) else b if abs(p - b) <= abs(p - c) else c
+            line[i] = (value + (0, a, b, (a + b) // 2, paeth)[kind]) % 256
+        expected_rows.append(previous := line)
+
+    assert np.array_equal(np.array(expected_rows, np.uint8).reshape(3, 4, 3), read_png(patched))
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a", write_png(np.zeros((2, 2, 3), np.uint8))[:40]])
+def test_other_data_is_no_picture(data):
+    with pytest.raises(InputError):
+        read_png(data)
+
+
+def test_equal_pictures_score_the_cap_and_other_sizes_are_refused():
+    picture = np.zeros((2, 2, 3), np.uint8)
+
+    assert PSNR_CAP == psnr(picture, picture)
+    assert 0.0 == psnr(picture, picture + np.uint8(255))
+    with pytest.raises(InputError):
+        psnr(picture, picture[:1])
+
+
+def test_cameras_of_the_manifest_are_a_camera_file():
+    from csplat_render.camera import Camera
+
+    for vector in RENDERED:
+        for view in vector.views:
+            assert view["camera"] == json.loads(json.dumps(Camera.from_json(view["camera"]).to_json()))

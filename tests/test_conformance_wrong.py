@@ -1,0 +1,63 @@
+"""Decoders that are wrong on purpose: the suite notices each, and names the clause."""
+
+import pytest
+
+from csplat_conformance import adapter, wrong
+from csplat_conformance.manifest import load
+from csplat_conformance.node import missing_javascript
+from csplat_conformance.report import Status
+from csplat_conformance.wrong_js import EDITS, catch_edit, edited
+from csplat_conformance.wrong_python import MISTAKES
+
+needs_javascript = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_wrong_decoder_fails_a_vector_that_names_the_clause(mistake):
+    vectors = [vector for vector in load() if mistake.clause in vector.clauses]
+    caught = wrong.catch(mistake, vectors)
+
+    assert caught.vectors
+    assert mistake.clause in caught.clauses
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_the_decoder_is_right_again_afterwards(mistake):
+    vector = next(vector for vector in load() if vector.name == "valid/rich")
+    before = adapter.answer(vector.data)
+    wrong.catch(mistake, [vector])
+
+    assert Status.PASSED == before.status
+    assert before.arrays == adapter.answer(vector.data).arrays
+
+
+def test_a_right_decoder_is_not_caught():
+    nothing = wrong.Mistake("none", "", "CHK-1", lambda _: None)
+
+    assert [] == list(wrong.catch(nothing).failed)
+
+
+@needs_javascript
+@pytest.mark.parametrize("edit", EDITS, ids=lambda edit: edit.name)
+def test_a_wrong_javascript_decoder_fails_a_vector_that_names_the_clause(edit):
+    vectors = [vector for vector in load() if edit.clause in vector.clauses]
+
+    assert edit.clause in catch_edit(edit, vectors).clauses
+
+
+def test_an_edit_that_finds_nothing_to_change_is_an_error():
+    with pytest.raises(ValueError, match="wanted once"):
+        edited(EDITS[0], "another text")
+
+
+def test_there_are_ten_mistakes_and_more():
+    assert len(MISTAKES) >= 20
+    assert len({mistake.name for mistake in MISTAKES}) == len(MISTAKES)
+
+
+def test_the_table_names_mistake_vectors_and_clauses():
+    mistake = next(mistake for mistake in MISTAKES if mistake.clause == "HDR-6")
+    vectors = [vector for vector in load() if vector.name == "invalid/trailing"]
+
+    row = wrong.table([wrong.catch(mistake, vectors)]).splitlines()[-1]
+    assert "| Python | trailing bytes | bytes behind the file are accepted | 1 | `invalid/trailing` | HDR-6 |" == row

@@ -1,0 +1,398 @@
+"""The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects."""
+
+import random
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import zstandard
+
+import csplat
+from csplat import _spec
+from csplat_conformance.builder import build
+from csplat_conformance.damage import flip, flips, prefixes
+from csplat_conformance.manifest import load
+from csplat_conformance.mutate import mutant
+from csplat_conformance.recipes import all_recipes
+from csplat_conformance.repair import repair
+from csplat_conformance.samples import OPACITIES, attributes, levels, rich_scene, scene, tile
+from csplat_conformance.scene import Attribute, Chunk, StatedErrors, Stream
+from csplat_conformance.validator import validate
+from csplat_conformance.validator.findings import VIOLATIONS_MAX
+from csplat_conformance.validator.jsontext import JsonError, parse
+from csplat_conformance.validator.rules import CODES
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+VECTOR_LIST = load()
+VALID = [vector for vector in VECTOR_LIST if not vector.error]
+INVALID = [vector for vector in VECTOR_LIST if vector.error]
+RICH = build(rich_scene())
+SMALL = build(scene())
+
+#: Vectors whose defect the validator finds at a better place than the manifest's: rms itself, not the max beside it.
+ELSEWHERE = {"invalid/error_negative": ("SERR/record[means].rms", "SERR/record[means].max")}
+
+#: Clauses that no file can break, and why.
+UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which hold no more than 24 bits"}
+
+#: Clauses of sections 2 to 8 that are not about a file's bytes: decoders, readers of parts, editors, permissions; and
+#: CBK-6, which says where other clauses hold.
+NOT_ABOUT_FILES = {
+    "NUM-1", "ORD-1", "HDR-9", "HDR-10", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5", "JSN-3", "COD-4", "CBK-6",
+}  # fmt: skip
+
+
+def clauses_of(data, **options):
+    return {one.clause for one in validate(data, **options).violations}
+
+
+def by_name(vectors):
+    return pytest.mark.parametrize("vector", vectors, ids=lambda vector: vector.name)
+
+
+# Vectors -------------------------------------------------------------------------------------------
+
+
+@by_name(VALID)
+def test_valid_vectors_break_nothing(vector):
+    found = validate(vector.data)
+
+    assert () == found.violations
+    assert () == found.unread
+    assert vector.expect["header"]["splat_count"] == found.splat_count
+    assert vector.expect["header"]["tile_count"] == found.tile_count
+
+
+@by_name(INVALID)
+def test_invalid_vectors_break_their_clause_at_their_byte(vector):
+    found = {(one.clause, one.code, one.offset) for one in validate(vector.data).violations}
+    offset = vector.error["offset"]
+    if vector.name in ELSEWHERE:
+        better, stated = ELSEWHERE[vector.name]
+        offset += RICH.fields[better].offset - RICH.fields[stated].offset
+
+    assert (vector.error["clause"], vector.error["code"], offset) in found
+
+
+@by_name(INVALID)
+def test_one_defect_is_few_violations(vector):
+    # What follows from a defect is named too, but a file with one defect must not drown it.
+    assert len(validate(vector.data).violations) <= 9
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("valid/chunks_reversed", "order that is recommended"),
+        ("extreme/codebook_unused_indices", "later stages that are not 0"),
+        ("extreme/deflate_unused_bits", "unused bits after the final block"),
+    ],
+)
+def test_what_a_writer_should_not_do_is_remarked(name, part):
+    (vector,) = (vector for vector in VALID if vector.name == name)
+
+    (remark,) = validate(vector.data).remarks
+    assert part in remark
+
+
+def test_sound_files_get_no_remark():
+    remarked = [vector.name for vector in VALID if validate(vector.data).remarks]
+
+    assert len(remarked) < len(VALID) / 10
+
+
+# Clauses -------------------------------------------------------------------------------------------
+
+
+def requirements():
+    """Clause to sentence, of the sections on streams."""
+    body = TEXT.split("## 2 Conventions")[1].split("## 9 Conformance")[0]
+    body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
+    return {
+        clause: text
+        for text, clause in re.findall(r"([^\[\]]*(?:\[[^A-Z\]][^\]]*\][^\[\]]*)*)\[([A-Z]{3}-\d+)\]", body)
+    }
+
+
+def test_every_clause_about_files_has_its_code():
+    assert set(requirements()) - NOT_ABOUT_FILES == set(CODES)
+
+
+@pytest.mark.parametrize("clause", [clause for clause, code in CODES.items() if code])
+def test_codes_are_those_of_the_text(clause):
+    assert CODES[clause] in re.findall(r"E_[A-Z]+", requirements()[clause])
+
+
+def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file():
+    reached = {clause for vector in INVALID for clause in clauses_of(vector.data)}
+    here = Path(__file__).read_text(encoding="utf-8")
+    tested = {clause for clause in CODES if f'"{clause}" in clauses_of' in here}
+
+    assert set(UNBREAKABLE) == set(CODES) - reached - tested
+
+
+# More than one defect ------------------------------------------------------------------------------
+
+
+def test_all_defects_of_a_file_are_named():
+    changes = {
+        "header.profile": 9,
+        "header.reserved_0": 1,
+        "index.scene_flags": 0x80,
+        "index.unit_metres": -1.0,
+        "attribute[means].levels": 3,
+        "attribute[sh1].chroma_shift": 17,
+        "codebook[2].reserved_0": 1,
+        "directory[META].reserved_0": 1,
+        "tile[0].level": 1,
+        "tile[0].max_scale": 7.5,
+        "tile[1].extent": (1, 2, 3),
+        "META/header.reserved_0": 1,
+        "SERR/head.error_flags": 0x40,
+        "CODB.7.2/head.stage_count": 1,
+        "TILE.0.0/head.layer": 1,
+        "TILE.0.0/opacities.stream.reserved_0": 1,
+        "TILE.0.0/sh0.params.reserved_0": 1,
+        "TILE.1.0/crc": 99,
+    }
+    found = {one.field for one in validate(RICH.patched(changes)).violations}
+
+    wanted = set(changes) - {"tile[1].extent", "attribute[sh1].chroma_shift"}
+    assert set() == wanted - found
+    assert "tile[1].corner" in found  # TIL-10 names the box by its first field
+
+
+def test_offsets_are_those_of_the_fields():
+    changes = {"index.unit_metres": -1.0, "tile[1].level": 3, "TILE.0.2/sh2.reserved_0": 1, "SERR/head.error_flags": 8}
+    found = {one.field: one.offset for one in validate(RICH.patched(changes)).violations}
+
+    assert {name: RICH.fields[name].offset for name in changes} == found
+
+
+def test_a_damaged_stream_does_not_hide_the_next():
+    data = RICH.patched({"TILE.0.0/opacities.stream.count": 8, "TILE.0.0/means.stream.count": 8})
+
+    assert ["TILE.0.0/opacities.stream.count", "TILE.0.0/means.stream.count"] == [
+        one.field for one in validate(data).violations if one.clause == "STR-1"
+    ]
+
+
+def test_what_cannot_be_told_apart_is_listed():
+    found = validate(RICH.patched({"TILE.0.0/scales.coding": 99}))
+
+    assert ["BLK-1"] == [one.clause for one in found.violations]
+    assert [f"TILE.0.0 from byte {RICH.fields['TILE.0.0/scales.coding'].offset + 3} on"] == [
+        one.field for one in found.unread
+    ]
+
+
+def test_violations_are_ordered_by_offset():
+    for vector in INVALID:
+        offsets = [one.offset for one in validate(vector.data).violations]
+        assert offsets == sorted(offsets)
+
+
+def test_a_violation_is_one_line():
+    for vector in INVALID:
+        for one in validate(vector.data).violations:
+            assert "\n" not in str(one)
+            assert one.message
+
+
+def test_a_file_of_nothing_but_violations_ends():
+    names = [Chunk(b"prv%c" % (65 + i % 26), payload=b"", flags=0xFF00) for i in range(60)]
+    data = bytearray(build(scene(chunks=names)).data)
+    header = _spec.unpack_header(data)
+    count = 60_000
+    record = _spec.pack_directory_record(_spec.DirectoryRecord(b"bad!", 0xFF00, 1, 1, 1, 1, 0, 0))
+    index = bytearray(data[64 : 64 + header.index_size - 4])
+    index[12:14] = count.to_bytes(2, "little")
+    data[16:20] = (len(index) + count * len(record) + 4).to_bytes(4, "little")
+    found = validate(bytes(data[:64]) + bytes(index) + record * count + bytes(4))
+
+    assert VIOLATIONS_MAX == len(found.violations)
+    assert "more than" in found.remarks[-1]
+
+
+# Clauses that no decoder looks at, or no vector shows -----------------------------------------------
+
+
+def stated(*records, pruned=0, degree=0):
+    errors = StatedErrors(2 + pruned, pruned, degree, 0, records)
+    return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))).data
+
+
+def test_stated_errors_that_no_scene_can_have_are_found():
+    means, opacities, sh2 = _spec.MEASURE_MEANS, _spec.MEASURE_OPACITIES, _spec.MEASURE_SH2
+    assert set() == clauses_of(stated((means, 0.5, 0.5 / 2**0.5), (opacities, 1.0, 1.0)))
+    assert "SER-5" in clauses_of(stated((means, 0.5, 0.3)))  # one of two splats alone gives 0.35
+    assert "SER-5" in clauses_of(stated((opacities, 1.5, 1.5)))
+    assert "SER-5" in clauses_of(stated((sh2, 0.5, 0.5)))  # neither has such a band
+    assert set() == clauses_of(stated((sh2, 0.5, 0.5), degree=2))
+
+
+def test_what_exceeds_the_budget_of_splats_is_not_read():
+    assert "LIM-1" in clauses_of(RICH.data, splats_max=4)
+    assert set() == clauses_of(RICH.data, splats_max=5)
+
+
+def test_a_text_beyond_the_budget_is_not_read():
+    assert "STR-8" in clauses_of(RICH.data, json_bytes_max=3)
+
+
+# Coders --------------------------------------------------------------------------------------------
+
+
+def coded_opacities(coder, coded, packed, profile=_spec.PROFILE_ARCHIVE):
+    how = Stream(1, (), coder, packed=packed, coded=coded)
+    return build(
+        scene(profile=profile, tiles=[tile(n=len(packed), changes={OPACITIES: levels(list(packed), how)})])
+    ).data
+
+
+@pytest.mark.parametrize("checksum", [False, True])
+@pytest.mark.parametrize("size", [3, 200, 70_000])
+def test_frames_of_the_library_are_walked_to_their_end(checksum, size):
+    packed = bytes(i * i % 251 for i in range(min(size, 60_000)))
+    squeezed = zstandard.ZstdCompressor(write_checksum=checksum).compress(packed)
+
+    assert set() == clauses_of(coded_opacities("zstd", squeezed, packed))
+    if checksum:
+        assert {"COD-3"} == clauses_of(coded_opacities("zstd", squeezed[:-1] + bytes([squeezed[-1] ^ 1]), packed))
+    assert {"COD-3"} == clauses_of(coded_opacities("zstd", squeezed + b"\0", packed))
+
+
+# JSON ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        (b' {"a" : [1, -0.5e+2, true, null, "\\u00e9\\n\xc3\xa9"]}\r\n', {"a": [1.0, -50.0, True, None, "é\né"]}),
+        (b'{"\\ud83d\\ude00":"\xf0\x9f\x98\x80"}', {"😀": "😀"}),
+        (b"[" * 64 + b"]" * 64, None),
+        (b"0", 0.0),
+        (b'""', ""),
+    ],
+)
+def test_texts_are_parsed(text, value):
+    found = parse(text)
+
+    assert value is None or value == found
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"", b"{", b'{"a"}', b"{a:1}", b"[1,]", b"[1 2]", b"+1", b".5", b"1.", b"0x1", b"tru", b"truefalse", b'"\\x"',
+        b'"\\u12"', b"'a'", b"1e400", b"[" * 65 + b"]" * 65, b"\xff", b"\xc0\x80", b"{}\0", b'"\x7f\x1f"', b"\xc2\xa01",
+        b'"\\udc00\\ud800"', b'{"a":1,"\\u0061":2}',
+    ],
+)  # fmt: skip
+def test_texts_that_are_no_json_are_refused(text):
+    with pytest.raises(JsonError):
+        parse(text)
+
+
+# Damage --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("built", [SMALL, RICH], ids=["small", "rich"])
+def test_every_prefix_is_found(built):
+    found = prefixes(built.data, len(built.data))
+
+    assert (len(built.data), []) == (found.count, found.missed)
+    assert {"HDR-5", "HDR-11"} == set(found.clauses)
+
+
+def test_every_flipped_bit_of_a_small_file_is_found():
+    for bit in range(0, 8 * len(SMALL.data), 3):
+        assert validate(flip(SMALL.data, bit)).violations
+
+
+def test_flipped_bits_of_a_real_file_are_found(sample_path):
+    # `python -m csplat_conformance.damage FILE` flips 250, and takes any file.
+    data = csplat.encode(csplat.read_ply(sample_path))
+    plain, sealed, repaired = flips(data, 24, seed=5)
+
+    assert [] == plain.missed
+    assert [] == sealed.missed
+    assert (24, 24) == (plain.found, sealed.found)
+    assert repaired.found < repaired.count  # the checksums are what finds the rest
+
+
+def test_flipped_bits_of_a_trained_scene_are_found(data_dir):
+    data = csplat.encode(csplat.read_ply(data_dir / "ply" / "train1000.ply"))
+    plain, sealed, _ = flips(data, 40, seed=6)
+
+    assert [] == plain.missed + sealed.missed
+    assert [] == prefixes(data, 40).missed
+
+
+def test_the_validator_agrees_with_the_decoder_on_mutants():
+    bases = [one for one in (build(recipe.scene) for recipe in all_recipes() if recipe.scene) if len(one.data) < 3000]
+    for number in range(400):
+        data, _ = mutant(random.Random(f"validator {number}"), bases)  # noqa: S311 - repeatable, no secret
+        found = {(one.clause, one.code) for one in validate(data).violations if one.clause != "SER-5"}
+        error = error_of(data)
+        if error is None or error[0] == "LIM-1":
+            assert error or set() == found, number
+        else:
+            assert error in found, number
+
+
+def error_of(data):
+    """Clause and code with which the decoder refuses a file, None if it does not."""
+    try:
+        csplat.decode(data, threads=1)
+    except csplat.CsplatError as error:
+        return error.clause, error.code
+    return None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_nothing_that_a_file_holds_raises(seed):
+    rng = random.Random(seed)  # noqa: S311 - repeatable, no secret
+    data = bytearray(RICH.data)
+    for _ in range(30):
+        at = rng.randrange(64, len(data))
+        data[at : at + 8] = rng.randbytes(8)
+    validate(repair(bytes(data)))
+    validate(_spec.MAGIC + rng.randbytes(300))
+    validate(rng.randbytes(seed))
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_any_buffer_is_validated(kind):
+    assert validate(kind(SMALL.data)).conforms
+
+
+def test_levels_that_are_none_do_not_overflow():
+    # A count of levels beyond ATT-4 whose square leaves 64 bits
+    made = attributes() | {3: Attribute(_spec.MAPPING_UNIT_W, levels=2**32 - 1)}
+
+    assert {"ATT-4"} == clauses_of(build(scene(attributes=made)).data)
+
+
+def test_overlapping_chunks_are_read_once():
+    # Or an index could make a validator read the same megabytes a million times.
+    twins = build(scene(tiles=[tile(1), tile(2)]))
+    found = validate(twins.patched({"tile[1].layer[0].offset": twins.spans["TILE.0.0"][0]}))
+
+    assert ["TILE.1.0"] == [one.field for one in found.unread]
+
+
+def test_the_validator_shares_nothing_with_the_decoder():
+    code = "import sys, csplat_conformance.validator; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = [name for name in done.stdout.split() if name.startswith("csplat")]
+
+    assert {"csplat", "csplat._spec", "csplat_conformance"} == {
+        name for name in loaded if not name.startswith("csplat_conformance.")
+    }
+    assert {"csplat_conformance.validator"} == {
+        ".".join(name.split(".")[:2]) for name in loaded if name.startswith("csplat_conformance.")
+    }
