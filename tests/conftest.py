@@ -10,6 +10,8 @@ from csplat.model import SplatModel, normalise_quats
 
 ROOT = Path(__file__).resolve().parent.parent
 
+pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
+
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:

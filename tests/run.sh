@@ -17,8 +17,9 @@ main() {
     step "vectors and annexes" "$DEV/python" -m csplat_conformance.recipes --check
     if have node "pyright and the JavaScript tests"; then
         step "types (pyright)" "$DEV/pyright"
-        if have npm "the types of the JavaScript decoder"; then
-            step "types (tsc)" npm run --silent --prefix codec/js types
+        if have npm "the types of the JavaScript"; then
+            step "types of the decoder (tsc)" npm run --silent --prefix codec/js types
+            step "types of the viewer (tsc)" npm run --silent --prefix codec/js types -- --project ../../tools/viewer
         fi
         step "JavaScript" javascript_tests
         if have chromium "the decoder in a browser"; then
@@ -27,6 +28,7 @@ main() {
     fi
     step "wheel" build_and_install_wheel
     step "conformance of the decoder" "$WHEEL/csplat" conformance decoder
+    step "conformance of the encoder" "$WHEEL/csplat" conformance encoder --level 3
     step "fuzzing" "$WHEEL/python" tests/fuzz.py --seconds 30
     step "Python tests" "$WHEEL/pytest" "$@"
 }
@@ -52,7 +54,7 @@ have() {
 javascript_tests() {
     local log=out/javascript.log
     # shellcheck disable=SC2046  # one word per file; no name holds a space
-    if ! node --test --test-reporter=spec $(find codec/js/test -name '*.test.mjs' | sort) >"$log" 2>&1; then
+    if ! node --test --test-reporter=spec $(find codec/js/test tools/viewer/test -name '*.test.mjs' | sort) >"$log" 2>&1; then
         sed -n '/failing tests/,$p' "$log"
         return 1
     fi
@@ -69,7 +71,7 @@ build_and_install_wheel() {
     local pip=("$WHEEL/python" -m pip install --quiet --disable-pip-version-check)
     local wheel
     wheel=$(echo out/dist/csplat-*.whl)
-    "${pip[@]}" "${wheel}[render,torch-tests]" pytest hypothesis
+    "${pip[@]}" "${wheel}[render,torch-tests,browser-tests]" pytest hypothesis
     "${pip[@]}" --force-reinstall --no-deps "$wheel"
     "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
 }

@@ -1,5 +1,6 @@
 // The arrays that a decoder returns: floats (spec sections 3 and 7) or integers (9.2), filled tile by tile.
 
+import { tableValues } from './codebooks.mjs';
 import { columnCount, radicand } from './codings.mjs';
 import { copyRows, ldexp, putRows, putWide, scatterRows } from './lattice.mjs';
 import * as spec from './spec.mjs';
@@ -120,7 +121,7 @@ function putQuats(out, { attribute: { levels }, columns }, n) {
 function putColour(out, stride, start, first, { attribute, columns, lookup }, n, s) {
   const width = columnCount(attribute);
   if (lookup === undefined) return putRows(out, stride, start, first, columns, width / 3, n, s);
-  copyRows(out, stride, start, first, lookup.values, width, lookup.index);
+  copyRows(out, stride, start, first, tableValues(lookup.table, attribute), width, lookup.index);
   scatterRows(out, stride, start, first, columns, width / 3, lookup.escaped, s);
 }
 

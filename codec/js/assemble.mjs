@@ -57,7 +57,7 @@ export class Assembly {
  * @param {number} bytes of arrays and tables
  * @param {Required<Limits>} limits
  */
-function checkBudget(count, bytes, limits) {
+export function checkBudget(count, bytes, limits) {
   const at = spec.HEADER_SIZE; // splat_count
   if (count > limits.splats)
     throw fault(spec.ERROR_LIMIT, at, 'LIM-1', `${count} splats, the budget is ${limits.splats}`);

@@ -25,7 +25,8 @@ const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
  * index in stage 0), and what none of them exceeds in magnitude.
  *
  * @typedef {{size: number, entries: Int32Array, bound: number}} Stage
- * @typedef {{stages: Stage[], values?: Float32Array}} Table with the values of its entries once they are needed
+ * @typedef {{stages: Stage[], values?: Float32Array, packed?: PackedColumns}} Table with the values of its entries, or
+ *   their final integers, once they are needed
  *
  * What a tile's blocks of one codebook have in common.
  *
@@ -34,6 +35,7 @@ const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
+ * @typedef {import('./decoder.d.ts').PackedColumns} PackedColumns
  * @typedef {import('./tile.mjs').TileContext} TileContext
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
@@ -140,10 +142,9 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
     : await knownIndices(tile, codebook, escapeCount, at);
   const isSh = codebook.bandFirst > 0;
   const table = await tile.table(id, isSh ? attribute.id - spec.ATTRIBUTE_SH0 : 0);
-  const values = integers ? null : tableValues(table, attribute);
   const offset = at - spec.BLOCK_HEAD_SIZE;
-  if (values) {
-    const lookup = { values, index: shared.indices[0], escaped: shared.escaped };
+  if (!integers && isPlain(table, attribute)) {
+    const lookup = { id, table, index: shared.indices[0], escaped: shared.escaped };
     if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
     return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
   }
@@ -219,26 +220,44 @@ async function knownIndices(tile, codebook, escapeCount, at) {
 }
 
 /**
- * Values of a colour table's entries by rows, where no entry can break LAT-4 or LAT-5 and there is one stage.
+ * Whether splats may stay indices: a colour table of one stage, no entry of which can break LAT-4 or LAT-5.
  *
  * @param {Table} table
  * @param {AttributeRecord} attribute
- * @returns {Float32Array | null}
  */
-function tableValues(table, attribute) {
-  const { id, mapping, chromaShift, step } = attribute;
-  const [{ size, entries, bound }] = table.stages;
-  const coarse = bound * 2 ** chromaShift;
-  if (id < spec.ATTRIBUTE_SH0 || table.stages.length > 1 || coarse > spec.COLUMN_MAX) return null;
-  if (!Number.isFinite(Math.fround(4 * coarse * step))) return null; // colour lifting at most triples
+function isPlain({ stages }, { id, chromaShift, step }) {
+  const coarse = stages[0].bound * 2 ** chromaShift;
+  if (id < spec.ATTRIBUTE_SH0 || stages.length > 1 || coarse > spec.COLUMN_MAX) return false;
+  return Number.isFinite(Math.fround(4 * coarse * step)); // colour lifting at most triples
+}
+
+/**
+ * Values of the entries of such a table, by rows.
+ *
+ * @param {Table} table
+ * @param {AttributeRecord} attribute
+ * @returns {Float32Array}
+ */
+export function tableValues(table, attribute) {
   if (table.values === undefined) {
-    const columns = new Float64Array(entries);
-    if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) rgbFromYcocg(columns, columns.length / 3, chromaShift);
+    const columns = entryColumns(table, attribute);
     table.values = new Float32Array(columns.length);
     const width = columnCount(attribute);
-    putRows(table.values, width, 0, 0, columns, width / 3, size + 1, step);
+    putRows(table.values, width, 0, 0, columns, width / 3, columns.length / width, attribute.step);
   }
   return table.values;
+}
+
+/**
+ * Final integers of the entries of such a table, column after column: R, G, B.
+ *
+ * @param {Table} table
+ * @param {AttributeRecord} attribute
+ */
+export function entryColumns(table, { mapping, chromaShift }) {
+  const columns = new Float64Array(table.stages[0].entries);
+  if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) rgbFromYcocg(columns, columns.length / 3, chromaShift);
+  return columns;
 }
 
 /**

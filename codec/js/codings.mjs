@@ -14,12 +14,13 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
  * @typedef {object} Block
  * @property {AttributeRecord} attribute
  * @property {Float64Array} columns [C × n], or with `lookup` those of the escaped splats alone
- * @property {{values: Float32Array, index: Uint32Array, escaped: Uint32Array}} [lookup] values of a codebook's entries
- *   by rows, the entry of each splat, and the splats that have none
+ * @property {{id: number, table: Table, index: Uint32Array, escaped: Uint32Array}} [lookup] a codebook of colours, the
+ *   entry of each splat, and the splats that have none
  * @property {number} exponent of the tile's lattice of this attribute
  * @property {number} bound what no integer exceeds in magnitude
  * @property {number} offset in the file of the stream, or block, to blame for what the integers are
  *
+ * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('./payload.mjs').Payload} Payload
  * @typedef {import('./tile.mjs').TileContext} TileContext

@@ -14,6 +14,8 @@ export interface Limits {
 export type Inflate = (coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>;
 
 export type Form = 'floats' | 'integers';
+/** Of a reader's layers. */
+export type LayerForm = Form | 'packed';
 
 export interface DecodeOptions {
   limits?: Limits;
@@ -197,6 +199,48 @@ export interface IntegerSplats {
   extra: Record<string, ExtraArray>;
 }
 
+/** Integers of one attribute in one tile, as narrow as they can be. */
+export interface PackedColumns {
+  /** Column after column, each as long as the list of splats: an integer is `offsets[column]` + element. */
+  columns: Uint8Array | Uint16Array | Uint32Array | Float64Array;
+  offsets: number[];
+  /** A value is `Math.fround(integer * step)`; 0 for opacities and quats, see `levels` of their attribute record. */
+  step: number;
+}
+
+/** Colours may stay in their codebook: then `columns` holds the escaped splats alone, which have no entry. */
+export interface Packed extends PackedColumns {
+  lookup?: {
+    /** Id of the codebook. */
+    codebook: number;
+    /** Its entries, and one row of zeros behind them. The same object for every tile of a reader. */
+    table: PackedColumns;
+    /** [count], a row of the table; the last one for escaped splats. */
+    index: Uint8Array | Uint16Array | Uint32Array;
+    /** The escaped splats in the order of `columns`. */
+    escaped: Uint32Array;
+  };
+}
+
+/** Layer 0 of a tile. Colours are R, G, B, as after the spec's 7.1. */
+export interface PackedGeometry {
+  count: number;
+  /** Levels, one column. */
+  opacities: Packed;
+  /** Three columns. */
+  scales: Packed;
+  /** x, y, z; w follows (spec 7.5). */
+  quats: Packed;
+  means: Packed;
+  sh0: Packed;
+}
+
+/** An SH band of a tile; column channel · (2l + 1) + m holds coefficient m. */
+export interface PackedBand {
+  count: number;
+  sh: Packed;
+}
+
 export interface Whole extends Description {
   header: Header;
   checks: Checks;
@@ -254,6 +298,8 @@ export class CsplatReader {
   static open(from: string | URL | Blob | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
   readonly header: Header;
   readonly checks: Checks;
+  /** Milliseconds that reads have waited for bytes so far, each for itself. */
+  readonly waitedMs: number;
   /** A tile with its SH bands up to a degree, and its extra columns if they are asked for. */
   readTile(
     index: number,
@@ -277,6 +323,13 @@ export class CsplatReader {
     layer: number,
     options?: ReadOptions & { form?: 'floats' },
   ): Promise<{ sh: Float32Array; count: number } | null>;
+  /** Integers as narrow as the tile allows, codebooks as tables: to be drawn or kept as they are. */
+  readLayer(index: number, layer: 0, options: { form: 'packed'; signal?: AbortSignal }): Promise<PackedGeometry>;
+  readLayer(
+    index: number,
+    layer: number,
+    options: { form: 'packed'; signal?: AbortSignal },
+  ): Promise<PackedBand | null>;
   describe(options?: { signal?: AbortSignal }): Promise<Description>;
   /** Begin to fetch layers that will be read soon, neighbours with one request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;

@@ -1,14 +1,15 @@
 // Tiles and layers of a file, one by one and in any order, over HTTP Range or from a Blob.
 
 import { describe, emptyDescription } from './ancillary.mjs';
-import { bandArray } from './arrays.mjs';
-import { Assembly, codebooksById } from './assemble.mjs';
+import { arrayBytes, bandArray } from './arrays.mjs';
+import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
 import { checkDigest, checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
+import { packLayer } from './packed.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
@@ -22,6 +23,7 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').LayerForm} LayerForm
  * @typedef {import('./decoder.d.ts').LayerRequest} LayerRequest
  * @typedef {import('./decoder.d.ts').ReaderOptions} ReaderOptions
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
@@ -74,6 +76,8 @@ export class CsplatReader {
     this.inflate = inflate;
     /** What has been checked so far; `chunks` counts. */
     this.checks = { header: true, index: true, chunks: 0, digest: false };
+    /** How long reads have waited for bytes so far, each for itself. */
+    this.waitedMs = 0;
     this.codebooks = codebooksById(header.codebooks);
     this.tableBytes = tableBytes(header.directory, this.codebooks);
     /** @type {Map<string, DirectoryRecord>} */
@@ -115,23 +119,29 @@ export class CsplatReader {
    *
    * @param {number} index
    * @param {number} layer
-   * @param {ReadOptions} [options]
+   * @param {{form?: LayerForm, signal?: AbortSignal}} [options] packed: integers, see decoder.d.ts
    * @returns {Promise<any>} the arrays by name, an SH band as `sh` [count, 2l + 1, 3]; null where the tile leaves the
    *   band out: its coefficients are 0
    */
   async readLayer(index, layer, { form, signal } = {}) {
     const record = checkedTile(index, this.header);
-    const integers = checkedForm(form);
-    if (layer === spec.LAYER_GEOMETRY) return this.readTile(index, { shDegree: 0, form, signal });
+    const packed = form === 'packed';
+    const integers = !packed && checkedForm(form);
+    if (layer === spec.LAYER_GEOMETRY && !packed) return this.readTile(index, { shDegree: 0, form, signal });
     if (layer === spec.LAYER_EXTRA || !Object.hasOwn(spec.LAYER_NAMES, layer)) {
       throw new InputError(`layer ${layer}: the layers of colour are 0 to ${spec.SH_DEGREE_MAX}`);
     }
     const place = record.layers.find((one) => one.layer === layer);
     if (place === undefined) return null;
+    if (packed) {
+      const bytes = arrayBytes(record.splatCount, layer, [], true);
+      checkBudget(record.splatCount, bytes + this.tableBytes, this.limits);
+    }
     const payload = await this.readChunk(place, signal);
     const tile = this.tileOf(record);
     const { blocks } = await tile.readLayer(payload, place, integers);
     this.release(tile);
+    if (packed) return packLayer(blocks, layer, record.splatCount);
     return { sh: bandArray(blocks[0], record.splatCount, integers), count: record.splatCount };
   }
 
@@ -180,7 +190,10 @@ export class CsplatReader {
    */
   async readChunk(place, signal) {
     signal?.throwIfAborted();
-    const payload = openChunk(await this.source.read(place.offset, place.size, signal), place);
+    const before = performance.now();
+    const bytes = await this.source.read(place.offset, place.size, signal);
+    this.waitedMs += performance.now() - before;
+    const payload = openChunk(bytes, place);
     this.checks.chunks++;
     return payload;
   }

@@ -136,11 +136,27 @@ export class HttpSource {
     const end = offset + size;
     if (this.whole) return this.whole.read(offset, size);
     if (end <= this.head.length) return this.head.subarray(offset, end);
-    const range = this.fetched.find((one) => one.start <= offset && end <= one.end);
-    if (range === undefined) return this.fetch(offset, end, signal);
+    const start = Math.max(offset, this.head.length);
+    const bytes = await this.readBehindHead(start, end, signal);
+    if (start === offset) return bytes;
+    const joined = new Uint8Array(size);
+    joined.set(this.head.subarray(offset));
+    joined.set(bytes, start - offset);
+    return joined;
+  }
+
+  /**
+   * @param {number} start
+   * @param {number} end
+   * @param {AbortSignal} [signal]
+   * @returns {Promise<Bytes>}
+   */
+  async readBehindHead(start, end, signal) {
+    const range = this.fetched.find((one) => one.start <= start && end <= one.end);
+    if (range === undefined) return this.fetch(start, end, signal);
     const bytes = await range.bytes;
     if (--range.due <= 0) this.fetched = this.fetched.filter((one) => one !== range);
-    return bytes.subarray(offset - range.start, end - range.start);
+    return bytes.subarray(start - range.start, end - range.start);
   }
 
   /**
@@ -152,6 +168,10 @@ export class HttpSource {
   prefetch(wanted, signal) {
     const missing = wanted
       .filter(({ offset, size }) => offset + size > this.head.length)
+      .map(({ offset, size }) => {
+        const start = Math.max(offset, this.head.length);
+        return { offset: start, size: offset + size - start };
+      })
       .filter(({ offset, size }) => !this.fetched.some(({ start, end }) => start <= offset && offset + size <= end))
       .sort((a, b) => a.offset - b.offset);
     /** @type {{start: number, end: number, due: number}[]} */

@@ -17,6 +17,7 @@ from csplat_tools.commands.lint import lint
 from csplat_tools.commands.render import render
 from csplat_tools.commands.train import train
 from csplat_tools.commands.verify import verify
+from csplat_tools.commands.view import export_html, view
 from csplat_tools.console import say
 
 __all__ = ["app"]
@@ -63,4 +64,6 @@ app.command()(lint)
 app.command()(compare)
 app.command()(render)
 app.command()(train)
+app.command()(view)
+app.command("export-html")(export_html)
 app.add_typer(conformance, name="conformance")

@@ -101,6 +101,22 @@ test('prefetch joins neighbours to one request and reads nothing twice', async (
   assert.equal(reader.source.fetched.length, 0);
 });
 
+test('of a part that begins in the first request only the rest is fetched', async (t) => {
+  const whole = await decode(rich);
+  const { offset, size } = whole.header.tiles[0].layers[0];
+  for (const isPrefetched of [false, true]) {
+    const { url, requests } = await serve(t, rich);
+    const received = [];
+    const firstBytes = offset + (size >> 1);
+    const reader = await CsplatReader.open(url, { firstBytes, onProgress: (bytes) => received.push(bytes) });
+    if (isPrefetched) reader.prefetch([{ tile: 0, layer: 0 }]);
+    const { means } = await reader.readLayer(0, 0);
+    assert.equal(hash(means), hash(whole.means.slice(0, means.length)));
+    assert.equal(requests.at(-1), `bytes=${firstBytes}-${offset + size - 1}`);
+    assert.equal(received.at(-1), offset + size);
+  }
+});
+
 test('a server without ranges sends the whole file, whose digest is then checked', async (t) => {
   const { url, requests } = await serve(t, seeded, { ranges: false });
   const received = [];

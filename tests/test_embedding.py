@@ -1,0 +1,203 @@
+"""The samples of codec/EMBEDDING.md, as they stand there: each runs, and gives what the text says."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import absent
+
+from csplat import EncodeOptions, decode, encode, read_ply
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
+
+# What `points.mjs` uses of three.js. Types of the arguments are checked; how three.js draws is its own affair.
+THREE = """
+const typed = (value, kind) => { if (!(value instanceof kind)) throw new TypeError(`${value} is no ${kind.name}`); };
+export const SRGBColorSpace = 'srgb';
+const linear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
+export class Color {
+  setRGB(r, g, b, space) {
+    if (space !== SRGBColorSpace) throw new TypeError('no colour space');
+    return Object.assign(this, { r: linear(r), g: linear(g), b: linear(b) });
+  }
+  toArray(array, at) { array.set([this.r, this.g, this.b], at); }
+}
+export class BufferAttribute {
+  constructor(array, itemSize) { typed(array, Float32Array); Object.assign(this, { array, itemSize }); }
+}
+export class BufferGeometry {
+  attributes = {};
+  setAttribute(name, attribute) { typed(attribute, BufferAttribute); this.attributes[name] = attribute; }
+}
+export class PointsMaterial { constructor(options) { Object.assign(this, options); } }
+export class Points {
+  constructor(geometry, material) {
+    typed(geometry, BufferGeometry);
+    typed(material, PointsMaterial);
+    Object.assign(this, { geometry, material });
+  }
+}
+"""
+
+RUN = """
+import { decode } from 'csplat-decoder';
+import { toThree } from './axes.mjs';
+import { colour } from './colour.mjs';
+import { covariances } from './covariances.mjs';
+import { loadPoints } from './points.mjs';
+import { stream } from './stream.mjs';
+
+const [url, directions] = JSON.parse(process.argv[2]);
+const scene = await decode(await (await fetch(url)).arrayBuffer());
+const points = await loadPoints(url);
+const tiles = [];
+const bands = [];
+await stream(url, {
+  addTile: (first, part) => tiles.push([first, part.count, Array.from(part.means)]),
+  addBand: (first, layer, sh) => bands.push([first, layer, sh.length]),
+});
+console.log(JSON.stringify({
+  position: Array.from(points.geometry.attributes.position.array),
+  colour: Array.from(points.geometry.attributes.color.array),
+  sizes: Object.values(points.geometry.attributes).map(({ itemSize }) => itemSize),
+  covariances: Array.from(covariances(scene)),
+  colours: directions.map((direction, i) => colour(scene, i, direction)),
+  axes: ['', 'RDF', 'RUB', 'RFU'].map(toThree),
+  tiles,
+  bands,
+}));
+"""
+
+
+def samples(language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def model(request):
+    return decode(encode(read_ply(request.getfixturevalue("sample_path"))))
+
+
+@pytest.fixture
+def results(site, tmp_path, model):
+    node = shutil.which("node")
+    if node is None:
+        absent("the samples in JavaScript need Node.js, which is not installed")
+    for text in samples("js"):
+        name = re.match(r"// (\w+\.mjs)\n", text)[1]
+        (tmp_path / name).write_text(text, "utf-8")
+    modules = tmp_path / "node_modules"
+    (modules / "three").mkdir(parents=True)
+    (modules / "three" / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
+    (modules / "three" / "three.mjs").write_text(THREE)
+    (modules / "csplat-decoder").symlink_to(ROOT / "codec" / "js")
+    (tmp_path / "run.mjs").write_text(RUN)
+    site.add("/scene.csplat", encode(model, EncodeOptions(preset="fast", tile_splats=4000)))
+    words = json.dumps([site.url("/scene.csplat"), directions(20).tolist()])
+    done = subprocess.run([node, "run.mjs", words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 0 == done.returncode, done.stderr
+    assert {200, 206} == set(site.statuses("/scene.csplat"))
+    return json.loads(done.stdout), decode(site._files["/scene.csplat"])
+
+
+def directions(count):
+    values = np.random.default_rng(5).standard_normal((count, 3))
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def test_the_samples_in_javascript(results):
+    given, scene = results
+    count = len(scene)
+    assert [3, 4] == given["sizes"]
+    np.testing.assert_array_equal(scene.means.ravel(), np.array(given["position"], np.float32))
+    colours = np.array(given["colour"]).reshape(count, 4)
+    np.testing.assert_array_equal(scene.opacities, colours[:, 3].astype(np.float32))
+    shown = np.maximum(0.0, 0.5 + 0.28209479 * scene.sh0.astype(np.float64))
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(linear, colours[:, :3], rtol=1e-4, atol=1e-6)
+    check_covariances(np.array(given["covariances"]).reshape(count, 6), scene)
+    check_colours(np.array(given["colours"]), scene)
+    assert [[1, 0, 0], [0, -1, 0], [0, 0, -1]] == given["axes"][0] == given["axes"][1]
+    assert [[1, 0, 0], [0, 1, 0], [0, 0, 1]] == given["axes"][2]
+    assert [[1, 0, 0], [0, 0, 1], [0, -1, 0]] == given["axes"][3]
+    check_stream(given, scene)
+
+
+def check_covariances(found, scene):
+    w, x, y, z = scene.quats.astype(np.float64).T
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    variances = np.exp(2.0 * scene.scales.astype(np.float64)).T
+    full = np.einsum("ikn,kn,jkn->nij", R, variances, R)
+    wanted = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    largest = variances.max(axis=0)[:, None]
+    np.testing.assert_allclose(found / largest, wanted / largest, atol=1e-6)
+
+
+def check_colours(found, scene):
+    harmonics = pytest.importorskip("csplat_render.harmonics", reason="the renderer wants the extra [render]")
+    ways = directions(len(found))
+    basis = np.zeros((16, len(ways)))
+    harmonics.sh_basis(3, *ways.T, basis)
+    count = len(ways)
+    coefficients = np.concatenate([scene.sh0[:count, None], scene.shN[:count]], axis=1).astype(np.float64)
+    wanted = np.maximum(0.0, 0.5 + np.einsum("kn,nkc->nc", basis, coefficients))
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+def check_stream(given, scene):
+    assert len(given["tiles"]) > 1
+    for first, count, means in given["tiles"]:
+        np.testing.assert_array_equal(scene.means[first : first + count].ravel(), np.array(means, np.float32))
+    assert len(scene) == sum(count for _, count, _ in given["tiles"])
+    assert {1, 2, 3} == {layer for _, layer, _ in given["bands"]}
+    counts = {first: count for first, count, _ in given["tiles"]}
+    assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
+
+
+def test_the_sample_in_python(tmp_path, model):
+    (tmp_path / "scene.csplat").write_bytes(encode(model))
+    (program,) = samples("python")
+    assert len([line for line in program.splitlines() if line.strip()]) <= 5
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"{len(model)} float32 3 {model.coordinate_system}\n" == done.stdout
+
+
+def test_the_engine_without_a_page(tab, site, model):
+    (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
+    site.add("/show.mjs", sample.encode())
+    site.add("/scene.csplat", encode(model))
+    page = b"<!doctype html><title>x</title><link rel=icon href=data:,><canvas width=160 height=120></canvas>"
+    tab.page.goto(site.add("/page.html", page))
+    pixels = tab.page.evaluate(
+        "import('/show.mjs').then(async ({ show }) => {"
+        " const engine = await show(document.querySelector('canvas'), '/scene.csplat');"
+        " return Array.from(await engine.readPixels()); })"
+    )
+    shown = np.array(pixels).reshape(120, 160, 4)[..., :3].max(axis=2) > 40
+    assert 0.1 < shown.mean() < 0.9
+
+
+def test_the_table_of_sizes_adds_up():
+    rows = re.findall(r"^\| (\d) \|((?: \d+ \|){7}) (\d+) MB \|$", TEXT, re.MULTILINE)
+    assert ["0", "1", "2", "3"] == [degree for degree, _, _ in rows]
+    for degree, cells, megabytes in rows:
+        *parts, together = (int(cell) for cell in cells.replace("|", " ").split())
+        assert [12, 16, 12, 4, 12, 12 * ((int(degree) + 1) ** 2 - 1)] == parts
+        assert sum(parts) == together == int(megabytes)
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXT):
+        assert (ROOT / "codec" / target).exists(), target

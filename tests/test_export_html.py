@@ -1,0 +1,203 @@
+"""`csplat export-html`: one page that opens from a disk without a network and shows what the served one shows."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import encode, read_ply
+from csplat.errors import CsplatError
+from csplat_tools.app import app
+from csplat_tools.selfcontained import export_page, module_graph
+from csplat_tools.webroot import PAGE, web_files
+
+SIZE = (200, 160)
+
+
+@pytest.fixture(scope="module")
+def sample(request):
+    return encode(read_ply(request.getfixturevalue("sample_path")))
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["export-html", *map(str, words)])
+
+
+def picture(page):
+    """The settled picture, [H, W, 4] uint8."""
+    page.evaluate("csplatViewer.ready")
+    pixels = page.evaluate("csplatViewer.engine.readPixels().then((pixels) => Array.from(pixels))")
+    return np.array(pixels, np.uint8).reshape(SIZE[1], SIZE[0], 4)
+
+
+def test_the_page_opens_from_a_file_without_a_network(tab, site, sample, tmp_path):
+    (tmp_path / "scene.csplat").write_bytes(sample)
+    done = invoke(tmp_path / "scene.csplat", tmp_path / "page.html")
+    assert 0 == done.exit_code, done.output
+    page = tab.page
+    query = f"?size={SIZE[0]}x{SIZE[1]}"
+    site.add("/scene.csplat", sample)
+    page.goto(site.url(f"/{PAGE}{query}&scene=/scene.csplat"))
+    served = picture(page)
+
+    requests = []
+    page.context.set_offline(True)
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto((tmp_path / "page.html").as_uri() + query)
+    tab.until("'csplatViewer' in window")
+    exported = picture(page)
+
+    assert served[..., :3].max() > 100
+    np.testing.assert_array_equal(served, exported)
+    assert page.locator("#error").is_hidden()
+    assert "scene.csplat" == page.inner_text("#title")
+    assert {"file", "blob"} == {re.match(r"\w+", url)[0] for url in requests}
+    assert 1 == len([url for url in requests if url.startswith("file:")])
+
+
+def test_the_page_is_forbidden_the_network(tab, site, make_model):
+    exported = export_page(encode(make_model(50, 0)), "small.csplat")
+    page = tab.page
+    url = site.add("/page.html", exported.page)
+    page.goto(url)
+    tab.until("'csplatViewer' in window")
+    page.evaluate("csplatViewer.ready")
+    before = len(site.requests)
+    blocked = page.evaluate("fetch('/other').then(() => 'came', (error) => String(error))")
+    assert "TypeError" in blocked
+    assert before == len(site.requests)
+    assert any("Content Security Policy" in problem for problem in tab.problems)
+    tab.problems.clear()
+
+
+def test_parts_of_the_page_are_what_the_report_says(sample):
+    exported = export_page(sample, "scene.csplat")
+    assert len(exported.page) == exported.code_bytes + exported.scene_bytes
+    assert abs(exported.scene_bytes / len(sample) - 4 / 3) < 0.001
+    assert exported.code_bytes == export_page(b"", "scene.csplat").code_bytes
+
+
+def test_cameras_and_axes_go_into_the_page(tab, tmp_path, make_model):
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 6.5
+    entry = {"K": [[90, 0, 40], [0, 90, 30], [0, 0, 1]], "viewmat": viewmat.tolist(), "W": 80, "H": 60}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    (tmp_path / "scene.csplat").write_bytes(encode(make_model(100, 0)))
+    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--camera", tmp_path / "cameras.json", "--axes", "RFU"]
+    done = invoke(*words)
+    assert 0 == done.exit_code, done.output
+    tab.page.goto((tmp_path / "page.html").as_uri())
+    tab.until("'csplatViewer' in window")
+    tab.page.evaluate("csplatViewer.ready")
+    assert list(viewmat.ravel()) == tab.page.evaluate("csplatViewer.rig.camera(80, 60).viewmat")
+    assert [0, 0, 1] == tab.page.evaluate("csplatViewer.rig.pose.up")
+
+
+def test_names_with_markup_stay_text(tab, make_model, tmp_path):
+    name = "</script><script>alert(1)</script>&.csplat"
+    (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), name).page)
+    tab.page.goto((tmp_path / "page.html").as_uri())
+    tab.until("'csplatViewer' in window")
+    tab.page.evaluate("csplatViewer.ready")
+    assert name == tab.page.inner_text("#title")
+    assert f"{name} – csplat viewer" == tab.page.title()
+
+
+def test_every_module_is_in_the_page_once(sample):
+    text = export_page(sample, "scene.csplat").page.decode()
+    described = json.loads(re.search(r'id="csplat-page">(.*?)</script>', text)[1])
+    texts = {name: path.read_text("utf-8") for name, path in web_files().items() if name.endswith(".mjs")}
+    modules = ["".join(str(part) for part in parts) for parts in described["modules"]]
+    assert len(modules) == len(set(modules))
+    for number, parts in enumerate(described["modules"]):
+        assert all(part < number for part in parts if isinstance(part, int))
+        code = "".join(part for part in parts if isinstance(part, str))
+        assert not re.findall(r"^(?:import|export)\b[^;]*?from '\.", code, re.MULTILINE)
+        assert not re.findall(r"(?<![{.\w] )(?:await |= |return )import\('\.", code)
+    assert len(modules) <= len(texts)
+    assert "'self'" not in re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert not re.findall(r'(?:src|href)="(?!data:)', text.partition('id="csplat-page"')[0])
+
+
+GRAPH = {
+    "a/main.mjs": "import { x } from './b.mjs';\nimport '../c/d.mjs';\nconst text = \"import y from './none.mjs'\";\n",
+    "a/b.mjs": "import {\n  one,\n  two as three,\n} from '../c/d.mjs';\nexport * from \"./e.mjs\";\n",
+    "a/e.mjs": "// import { x } from './none.mjs';\nexport { one as x } from '../c/d.mjs';\nexport const from = 1;\n",
+    "c/d.mjs": "/** @typedef {import('./none.mjs').T} T */\nexport const one = 1, two = 2;\nexport default one;\n",
+}
+
+
+def test_the_graph_follows_imports_and_nothing_else():
+    assert {
+        "c/d.mjs": [GRAPH["c/d.mjs"]],
+        "a/e.mjs": [
+            "// import { x } from './none.mjs';\nexport { one as x } from '",
+            0,
+            "';\nexport const from = 1;\n",
+        ],
+        "a/b.mjs": ["import {\n  one,\n  two as three,\n} from '", 0, "';\nexport * from \"", 1, '";\n'],
+        "a/main.mjs": [
+            "import { x } from '",
+            2,
+            "';\nimport '",
+            0,
+            "';\nconst text = \"import y from './none.mjs'\";\n",
+        ],
+    } == module_graph(GRAPH, ["a/main.mjs"])
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (
+            {"a.mjs": "import './b.mjs';", "b.mjs": "import './a.mjs';"},
+            r"import each other: a\.mjs -> b\.mjs -> a\.mjs",
+        ),
+        ({"a.mjs": "import './gone.mjs';"}, r"a\.mjs imports gone\.mjs, which is not there"),
+    ],
+)
+def test_a_graph_that_cannot_be_laid_out_is_noticed(texts, expected):
+    with pytest.raises(AssertionError, match=expected):
+        module_graph(texts, ["a.mjs"])
+
+
+def test_a_ply_is_encoded(sample_path, tmp_path):
+    done = invoke(sample_path, tmp_path / "page.html", "--preset", "fast")
+    assert 0 == done.exit_code, done.output
+    assert "encoded with the preset fast" in done.stderr
+    assert re.search(r"page\.html: [\d.]+ kB, of which the scene [\d.]+ kB", done.stderr.replace("\n", " "))
+    assert (tmp_path / "page.html").read_bytes().startswith(b"<!doctype html>")
+
+
+def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
+    target = tmp_path / "page.html"
+    target.write_text("mine")
+    assert "--force replaces it" in invoke(sample_path, target).stderr
+    middle = len(sample) // 2
+    broken = tmp_path / "broken.csplat"
+    broken.write_bytes(sample[:middle] + bytes([sample[middle] ^ 1]) + sample[middle + 1 :])
+    done = invoke(broken, target, "--force")
+    assert (1, True) == (done.exit_code, "E_CRC" in done.stderr)
+    assert 2 == invoke(sample_path, target, "--force", "--preset", "tiny").exit_code
+    assert "mine" == target.read_text()
+    assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
+
+
+def test_the_page_can_go_to_a_pipe(sample_path):
+    words = [sys.executable, "-m", "csplat_tools", "export-html", str(sample_path), "-", "--preset", "fast", "--quiet"]
+    done = subprocess.run(words, capture_output=True, check=True)
+    assert done.stdout.startswith(b"<!doctype html>")
+    assert done.stdout.endswith(b"</html>\n")
+    assert b"" == done.stderr
+
+
+def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path):
+    import csplat_tools.webroot
+
+    monkeypatch.setattr(csplat_tools.webroot, "__file__", str(tmp_path / "a" / "b" / "webroot.py"))
+    with pytest.raises(CsplatError, match="install csplat again"):
+        export_page(b"", "scene.csplat")

@@ -1,0 +1,333 @@
+"""`csplat view`: what its server answers, what it refuses, and how the command ends."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+
+from csplat import EncodeOptions, decode, encode, read_ply, write_ply
+from csplat.errors import FormatError, InputError
+from csplat_tools.serving import byte_range, open_server
+from csplat_tools.viewing import open_scene, view_wishes
+from csplat_tools.webroot import web_files
+
+SIZE = 1000
+
+
+@pytest.fixture
+def scene_path(tmp_path, make_model):
+    path = tmp_path / "a scene.csplat"
+    path.write_bytes(encode(make_model(200)))
+    return path
+
+
+@contextmanager
+def served(path, **options):
+    with open_scene(str(path), preset="fast") as scene, open_server(scene, **options) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def ask(server, path, method="GET", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    try:
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        response = connection.getresponse()
+        return response.status, dict(response.getheaders()), response.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        (None, None),
+        ("bytes=0-0", (0, 1)),
+        ("bytes=10-19", (10, 10)),
+        ("bytes=990-", (990, 10)),
+        ("bytes=-10", (990, 10)),
+        ("bytes=-5000", (0, 1000)),
+        ("bytes=999-5000", (999, 1)),
+        ("BYTES=0-9", (0, 10)),
+        ("bytes=9-3", None),  # a range that makes no sense is no range
+        ("bytes=-", None),
+        ("bytes=a-b", None),
+        ("bytes=0-1,5-6", None),  # several ranges may be answered with everything
+        ("items=0-1", None),
+        ("bytes=\u0661-2", None),  # a digit, but none of ASCII
+    ],
+)
+def test_ranges(header, expected):
+    assert expected == byte_range(header, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("header", "size"), [("bytes=1000-", SIZE), ("bytes=-0", SIZE), ("bytes=0-0", 0), ("bytes=-5", 0)]
+)
+def test_ranges_of_which_nothing_is_there(header, size):
+    with pytest.raises(ValueError, match="range"):
+        byte_range(header, size)
+
+
+def test_the_root_leads_to_the_page_and_the_page_to_the_scene(scene_path):
+    with served(scene_path, wishes={"axes": "RDF"}) as server:
+        status, headers, _ = ask(server, "/")
+        assert 302 == status
+        target = urlsplit(headers["Location"])
+        query = parse_qs(target.query)
+        assert ["RDF"] == query["axes"]
+        assert (200, "text/html; charset=utf-8") == pick(ask(server, headers["Location"]))
+        status, headers, body = ask(server, query["scene"][0])
+        assert (200, "model/vnd.csplat") == (status, headers["Content-Type"])
+        assert scene_path.read_bytes() == body
+
+
+def pick(answer):
+    status, headers, _ = answer
+    return status, headers.get("Content-Type")
+
+
+def test_every_module_of_the_page_is_served_as_javascript(scene_path):
+    with served(scene_path) as server:
+        for name, path in web_files().items():
+            status, headers, body = ask(server, f"/{name}")
+            assert (200, path.read_bytes()) == (status, body)
+            if path.suffix == ".mjs":
+                assert headers["Content-Type"].startswith("text/javascript")
+        assert {"tools/viewer/main.mjs", "tools/viewer/worker.mjs", "codec/js/decoder.mjs"} <= set(web_files())
+        assert not [name for name in web_files() if "test" in name or "node_modules" in name]
+
+
+def test_ranges_of_the_scene(scene_path):
+    data = scene_path.read_bytes()
+    with served(scene_path) as server:
+        path = "/scene/a%20scene.csplat"
+        status, headers, body = ask(server, path, Range="bytes=64-163")
+        assert (206, data[64:164]) == (status, body)
+        assert f"bytes 64-163/{len(data)}" == headers["Content-Range"]
+        assert "100" == headers["Content-Length"]
+        status, headers, body = ask(server, path, Range="bytes=-7")
+        assert (206, data[-7:]) == (status, body)
+        status, headers, body = ask(server, path, Range=f"bytes={len(data)}-")
+        assert (416, f"bytes */{len(data)}", b"") == (status, headers["Content-Range"], body)
+        status, headers, body = ask(server, path)
+        assert (200, "bytes", data) == (status, headers["Accept-Ranges"], body)
+        etag = headers["ETag"]
+        assert 206 == ask(server, path, Range="bytes=0-9", If_Range=etag)[0]
+        assert (200, data) == ask(server, path, Range="bytes=0-9", If_Range='"another"')[::2]
+
+
+def test_head_gives_headers_alone(scene_path):
+    size = scene_path.stat().st_size
+    with served(scene_path) as server:
+        status, headers, body = ask(server, "/scene/a%20scene.csplat", "HEAD")
+        assert (200, str(size), b"") == (status, headers["Content-Length"], body)
+        status, headers, body = ask(server, "/scene/a%20scene.csplat", "HEAD", Range="bytes=5-9")
+        assert (206, "5", b"") == (status, headers["Content-Length"], body)
+        assert (404, b"") == ask(server, "/nothing", "HEAD")[::2]
+
+
+def test_a_file_that_changes_has_another_tag(scene_path, make_model):
+    with served(scene_path) as server:
+        before = ask(server, "/scene/a%20scene.csplat", "HEAD")[1]["ETag"]
+        scene_path.write_bytes(encode(make_model(50)))
+        assert before != ask(server, "/scene/a%20scene.csplat", "HEAD")[1]["ETag"]
+        scene_path.unlink()
+        assert 404 == ask(server, "/scene/a%20scene.csplat")[0]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/scene/",
+        "/scene/other.csplat",
+        "/scene/../secret.txt",
+        "/scene/..%2fsecret.txt",
+        "/scene/%2e%2e/secret.txt",
+        "/tools/viewer/",
+        "/tools/viewer/../../../secret.txt",
+        "/tools/viewer/..%5c..%5csecret.txt",
+        "//etc/passwd",
+        "/etc/passwd",
+        "/codec/js/package.json",
+        "/codec/js/test/adapter.mjs",
+        "/tools/viewer/main.mjs%00.html",
+        "/%",
+    ],
+)
+def test_nothing_else_is_reachable(scene_path, path):
+    (scene_path.parent / "secret.txt").write_text("secret")
+    with served(scene_path) as server:
+        status, _, body = ask(server, path)
+        assert 404 == status
+        assert b"secret" not in body
+
+
+def test_another_name_for_this_machine_is_misdirected(scene_path):
+    with served(scene_path) as server:
+        port = server.server_address[1]
+        assert 421 == ask(server, "/", Host="evil.example:80")[0]
+        assert 421 == ask(server, "http://evil.example/scene/a%20scene.csplat")[0]
+        assert 302 == ask(server, "/", Host=f"localhost:{port}")[0]
+
+
+def test_other_methods_are_refused(scene_path):
+    with served(scene_path) as server:
+        assert 501 == ask(server, "/", "POST")[0]
+
+
+def test_a_ply_is_encoded_in_memory(tmp_path, make_model):
+    model = make_model(300)
+    write_ply(tmp_path / "scene.ply", model)
+    with served(tmp_path / "scene.ply") as server:
+        _, _, body = ask(server, "/scene/scene.csplat")
+        assert len(model) == len(decode(body))
+        assert 206 == ask(server, "/scene/scene.csplat", Range="bytes=0-63")[0]
+    assert ["scene.ply"] == sorted(path.name for path in tmp_path.iterdir())
+
+
+def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
+    entry = {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([entry, entry]))
+    with served(scene_path, wishes=view_wishes(str(cameras), None)) as server:
+        query = parse_qs(urlsplit(ask(server, "/")[1]["Location"]).query)
+        status, headers, body = ask(server, query["camera"][0])
+        assert (200, "application/json") == (status, headers["Content-Type"])
+        assert [500.0, 500.0] == [one["K"][0][0] for one in json.loads(body)]
+
+
+@pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
+def test_axes_that_are_none_are_refused(axes):
+    with pytest.raises(InputError, match="wanted one of R and L"):
+        view_wishes(None, axes)
+
+
+def refused(path):
+    with pytest.raises((FormatError, InputError)) as caught, open_scene(str(path), preset="fast"):
+        pass
+    return str(caught.value)
+
+
+def test_damaged_files_are_refused_before_they_are_served(scene_path):
+    data = scene_path.read_bytes()
+    scene_path.write_bytes(data[:-1])
+    assert "E_TRUNCATED" in refused(scene_path)
+    scene_path.write_bytes(data + b"x")
+    assert "E_TRAILING" in refused(scene_path)
+    scene_path.write_bytes(data[:100] + bytes([data[100] ^ 1]) + data[101:])
+    assert "E_CRC" in refused(scene_path)
+    scene_path.write_bytes(data[:20])
+    assert "E_TRUNCATED" in refused(scene_path)
+
+
+def test_a_profile_that_browsers_do_not_read_is_refused(tmp_path, make_model):
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(encode(make_model(2000), EncodeOptions(profile="archive")))
+    assert "do not read the profile archive" in refused(path)
+
+
+def test_something_else_is_refused(tmp_path):
+    path = tmp_path / "scene.txt"
+    path.write_text("no scene")
+    assert "not a PLY" in refused(path)
+
+
+def test_a_taken_port_is_refused(scene_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with (
+            open_scene(str(scene_path), preset="fast") as scene,
+            pytest.raises(InputError, match=f"port {port} is taken"),
+            open_server(scene, port=port),
+        ):
+            pass
+
+
+def test_an_address_of_another_machine_is_refused(scene_path):
+    with (
+        open_scene(str(scene_path), preset="fast") as scene,
+        pytest.raises(InputError, match=r"203\.0\.113\.1 is no address of this machine"),
+        open_server(scene, host="203.0.113.1"),
+    ):
+        pass
+
+
+def test_the_page_runs_from_the_server(tab, tmp_path, make_model):
+    tab.page.set_viewport_size({"width": 300, "height": 200})
+    write_ply(tmp_path / "a & b.ply", make_model(200, 1))
+    with served(tmp_path / "a & b.ply", wishes={"axes": "RFU"}) as server:
+        tab.page.goto(server.url)
+        tab.page.evaluate("csplatViewer.ready")
+        assert "a & b.csplat" == tab.page.inner_text("#title")
+        assert "200 splats" in tab.page.inner_text("#summary")
+        assert [0, 0, 1] == tab.page.evaluate("csplatViewer.rig.pose.up")
+        tab.page.goto("about:blank")  # hangs up, so that the server can end
+
+
+@contextmanager
+def command(*words):
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "csplat_tools", "view", *map(str, words)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
+    with command(sample_path, "--no-browser") as process:
+        url = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
+        connection.request("GET", "/scene/sample.csplat")
+        assert len(read_ply(sample_path)) == len(decode(connection.getresponse().read()))
+        process.send_signal(signal.SIGINT)  # while the connection is still open
+        assert 0 == process.wait(timeout=10)
+        connection.close()
+        said = process.stderr.read()
+    assert "encoded with the preset fast" in said
+    assert "Ctrl-C" in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "expected"),
+    [
+        (["absent.csplat"], 1, "No such file"),
+        (["SAMPLE", "--preset", "tiny"], 2, "the preset is 'tiny'"),
+        (["SAMPLE", "--axes", "RRR"], 1, "the axes are 'RRR'"),
+        (["SAMPLE", "--camera", "absent.json"], 1, "absent.json"),
+        (["SAMPLE", "--port", "70000"], 2, "65535"),
+    ],
+)
+def test_the_command_says_what_is_wrong(sample_path, words, status, expected):
+    with command(*(str(sample_path) if word == "SAMPLE" else word for word in words), "--no-browser") as process:
+        out, said = process.communicate(timeout=60)
+    assert (status, "") == (process.returncode, out)
+    assert expected in " ".join(said.split())

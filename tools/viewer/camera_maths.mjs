@@ -1,0 +1,75 @@
+// Cameras as cull and shaders want them. Conventions are those of the rasteriser (csplat_render/conventions.py).
+
+/**
+ * @typedef {import('./types.d.ts').Camera} Camera
+ * @typedef {import('./types.d.ts').View} View
+ */
+
+export const DEFAULT_NEAR = 0.2;
+
+/** Added to both variances of the projected covariance, in square pixels. */
+export const DILATION = 0.3;
+
+/** A splat does not touch a pixel that it covers with less than this alpha. */
+export const ALPHA_MIN = 1 / 255;
+
+/** The perspective is linearised at most this far outside the picture, in half-widths of it. */
+const FOV_MARGIN = 0.3;
+
+/** How far a splat of alpha 1 reaches at ALPHA_MIN, in standard deviations. */
+export const REACH_MAX = Math.sqrt(2 * Math.log(1 / ALPHA_MIN));
+
+/**
+ * A camera with the size of its picture, everything checked and copied.
+ *
+ * @param {Camera} camera
+ * @param {number} width pixels
+ * @param {number} height pixels
+ * @returns {View}
+ */
+export function viewOf({ viewmat, fx, fy, cx, cy, near = DEFAULT_NEAR }, width, height) {
+  const matrix = Array.from(viewmat, Number);
+  if (matrix.length !== 16 || ![...matrix, fx, fy, cx, cy, near].every(Number.isFinite)) {
+    throw new RangeError('a camera is 16 numbers of viewmat and fx, fy, cx, cy, near, all finite');
+  }
+  if (!(fx > 0 && fy > 0 && near > 0)) throw new RangeError(`fx ${fx}, fy ${fy} and near ${near} must be above 0`);
+  return { viewmat: matrix, fx, fy, cx, cy, near, width, height };
+}
+
+/**
+ * Smallest and largest x/z and y/z at which the perspective is linearised.
+ *
+ * @param {View} view
+ * @returns {[number, number, number, number]}
+ */
+export function slopeLimits({ fx, fy, cx, cy, width, height }) {
+  const marginX = (FOV_MARGIN * 0.5 * width) / fx;
+  const marginY = (FOV_MARGIN * 0.5 * height) / fy;
+  return [-cx / fx - marginX, (width - cx) / fx + marginX, -cy / fy - marginY, (height - cy) / fy + marginY];
+}
+
+/**
+ * A point of the world in camera coordinates.
+ *
+ * @param {ArrayLike<number>} m viewmat
+ * @param {ArrayLike<number>} p
+ * @returns {[number, number, number]}
+ */
+export function toCamera(m, p) {
+  return [
+    m[0] * p[0] + m[1] * p[1] + m[2] * p[2] + m[3],
+    m[4] * p[0] + m[5] * p[1] + m[6] * p[2] + m[7],
+    m[8] * p[0] + m[9] * p[1] + m[10] * p[2] + m[11],
+  ];
+}
+
+/**
+ * Where a camera stands: −Rᵀ t.
+ *
+ * @param {ArrayLike<number>} m viewmat
+ * @returns {[number, number, number]}
+ */
+export function positionOf(m) {
+  const back = (/** @type {number} */ k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]);
+  return [back(0), back(1), back(2)];
+}

@@ -1,0 +1,276 @@
+// Mouse, fingers and keys: what a person does on the canvas, turned into movements of the rig.
+
+import { between } from './rig.mjs';
+
+/**
+ * @typedef {import('./rig.mjs').Pose} Pose
+ * @typedef {import('./rig.mjs').Rig} Rig
+ *
+ * @typedef {object} Hooks
+ * @property {() => void} moved called when the rig's pose has changed
+ * @property {(x: number, y: number) => Pose | null} pivotAt the pose that turns around what lies at a point of the
+ *   canvas, CSS pixels; null where nothing does
+ * @property {() => boolean} calm whether a person wants no animations
+ */
+
+const ORBIT = Math.PI; // radians per shorter side of the canvas
+const WHEEL = 0.0015; // natural logarithm of the distance per pixel that a wheel scrolls
+const PINCH_WHEEL = 0.01; // the same where a trackpad reports a pinch
+const LINE = 16; // pixels of a line that a wheel scrolls by
+const KEY_TURN = 1.2; // radians per second
+const KEY_ZOOM = 1.4; // natural logarithm of the distance per second
+const FASTER = 4; // with Shift
+const GLIDE_MS = 450;
+const FOLLOW_MS = 45; // within which a drag is followed to two thirds
+const TAP_MS = 320; // between two taps
+const TAP_PIXELS = 24; // between two taps
+const STILL_PIXELS = 6; // that a tap may move
+
+/** Keys that fly: to the right, down, forward. */
+const FLY = /** @type {Record<string, [number, number, number]>} */ ({
+  KeyW: [0, 0, 1],
+  ArrowUp: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  ArrowDown: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  ArrowLeft: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  ArrowRight: [1, 0, 0],
+  KeyQ: [0, 1, 0],
+  KeyE: [0, -1, 0],
+});
+
+/** Keys that turn around the pivot (arrows with Shift): to the right, down. */
+const TURN = /** @type {Record<string, [number, number]>} */ ({
+  ArrowLeft: [-1, 0],
+  ArrowRight: [1, 0],
+  ArrowUp: [0, -1],
+  ArrowDown: [0, 1],
+});
+
+const ZOOM = /** @type {Record<string, number>} */ ({ Equal: -1, NumpadAdd: -1, Minus: 1, NumpadSubtract: 1 });
+
+export class Controls {
+  /**
+   * @param {HTMLElement} canvas
+   * @param {Rig} rig
+   * @param {Hooks} hooks
+   */
+  constructor(canvas, rig, hooks) {
+    this.canvas = canvas;
+    this.rig = rig;
+    this.hooks = hooks;
+    /** Whether a person has moved the camera since it was placed. */
+    this.touched = false;
+    /** @type {Map<number, {x: number, y: number}>} */
+    this.pointers = new Map();
+    /** @type {Set<string>} */
+    this.keys = new Set();
+    this.shift = false;
+    this.pending = { right: 0, down: 0 };
+    /** @type {{from: Pose, to: Pose, start: number} | null} */
+    this.gliding = null;
+    this.tap = { time: -Infinity, x: 0, y: 0 };
+    this.press = { x: 0, y: 0, still: false, pans: false };
+    this.frame = 0;
+    this.last = 0;
+    this.#listen();
+  }
+
+  /**
+   * Bring the camera to a pose, at once where no animations are wanted.
+   *
+   * @param {Pose} pose
+   * @param {boolean} [atOnce]
+   */
+  glide(pose, atOnce = false) {
+    this.pending = { right: 0, down: 0 };
+    if (atOnce || this.hooks.calm()) {
+      this.gliding = null;
+      this.rig.pose = pose;
+      this.hooks.moved();
+      return;
+    }
+    this.gliding = { from: this.rig.pose, to: pose, start: performance.now() };
+    this.#wake();
+  }
+
+  #listen() {
+    const { canvas } = this;
+    canvas.addEventListener('pointerdown', (event) => this.#down(event));
+    canvas.addEventListener('pointermove', (event) => this.#move(event));
+    for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) {
+      canvas.addEventListener(end, (event) => this.#up(/** @type {PointerEvent} */ (event)));
+    }
+    canvas.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
+    canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY));
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+    addEventListener('keydown', (event) => this.#key(event));
+    addEventListener('keyup', ({ code, shiftKey }) => {
+      this.shift = shiftKey;
+      this.keys.delete(code);
+    });
+    addEventListener('blur', () => this.keys.clear());
+  }
+
+  /** @param {PointerEvent} event */
+  #down(event) {
+    const { offsetX: x, offsetY: y, button, shiftKey, ctrlKey, metaKey } = event;
+    this.canvas.focus({ preventScroll: true });
+    this.canvas.setPointerCapture(event.pointerId);
+    this.pointers.set(event.pointerId, { x, y });
+    this.press = { x, y, still: this.pointers.size === 1, pans: button !== 0 || shiftKey || ctrlKey || metaKey };
+    this.gliding = null;
+  }
+
+  /** @param {PointerEvent} event */
+  #move(event) {
+    const before = this.pointers.get(event.pointerId);
+    if (!before) return;
+    const now = { x: event.offsetX, y: event.offsetY };
+    if (Math.hypot(now.x - this.press.x, now.y - this.press.y) > STILL_PIXELS) this.press.still = false;
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
+    this.pointers.set(event.pointerId, now);
+    if (other) {
+      const centre = { x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 };
+      const apart = Math.hypot(now.x - other.x, now.y - other.y);
+      const wasApart = Math.hypot(before.x - other.x, before.y - other.y);
+      this.rig.pan((now.x - before.x) / 2, (now.y - before.y) / 2, width, height);
+      if (apart > 1 && wasApart > 1) this.rig.zoom(wasApart / apart, { ...centre, width, height });
+      this.#changed();
+    } else if (this.press.pans) {
+      this.rig.pan(now.x - before.x, now.y - before.y, width, height);
+      this.#changed();
+    } else {
+      const perPixel = ORBIT / Math.max(1, Math.min(width, height));
+      this.#turn((now.x - before.x) * perPixel, (now.y - before.y) * perPixel);
+    }
+  }
+
+  /** @param {PointerEvent} event */
+  #up(event) {
+    if (!this.pointers.delete(event.pointerId)) return;
+    if (event.type !== 'pointerup' || event.pointerType === 'mouse' || !this.press.still) return;
+    const { offsetX: x, offsetY: y, timeStamp } = event; // browsers differ in whether two taps are a double click
+    const near = Math.hypot(x - this.tap.x, y - this.tap.y) < TAP_PIXELS;
+    if (near && timeStamp - this.tap.time < TAP_MS) this.#choosePivot(x, y);
+    this.tap = { time: timeStamp, x, y };
+  }
+
+  /** @param {WheelEvent} event */
+  #wheel(event) {
+    event.preventDefault();
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const pixels = event.deltaY * (event.deltaMode === 1 ? LINE : event.deltaMode === 2 ? height : 1);
+    const step = Math.min(0.7, Math.max(-0.7, pixels * (event.ctrlKey ? PINCH_WHEEL : WHEEL)));
+    this.gliding = null;
+    this.rig.zoom(Math.exp(step), { x: event.offsetX, y: event.offsetY, width, height });
+    this.#changed();
+  }
+
+  /**
+   * @param {number} x
+   * @param {number} y
+   */
+  #choosePivot(x, y) {
+    const pose = this.hooks.pivotAt(x, y);
+    if (!pose) return;
+    this.touched = true;
+    this.glide(pose);
+  }
+
+  /** @param {KeyboardEvent} event */
+  #key(event) {
+    const { code, target, ctrlKey, metaKey, altKey, shiftKey } = event;
+    this.shift = shiftKey;
+    const elsewhere = target instanceof Element && target.closest('input, select, textarea, dialog');
+    if (ctrlKey || metaKey || altKey || elsewhere || !(code in FLY || code in ZOOM)) return;
+    event.preventDefault();
+    this.keys.add(code);
+    this.gliding = null;
+    this.#wake();
+  }
+
+  /**
+   * @param {number} right radians
+   * @param {number} down radians
+   */
+  #turn(right, down) {
+    this.touched = true;
+    this.pending = { right: this.pending.right + right, down: this.pending.down + down };
+    this.#wake();
+  }
+
+  #changed() {
+    this.touched = true;
+    this.hooks.moved();
+  }
+
+  #wake() {
+    if (this.frame) return;
+    this.last = performance.now();
+    this.frame = requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  /** @param {number} now */
+  #tick(now) {
+    this.frame = 0;
+    const seconds = Math.min(0.1, Math.max(0, now - this.last) / 1000 || 1 / 60);
+    let busy = this.#glideOn(now);
+    busy = this.#follow(seconds) || busy;
+    busy = this.#walk(seconds) || busy;
+    this.hooks.moved();
+    this.last = now;
+    if (busy) this.frame = requestAnimationFrame((next) => this.#tick(next));
+  }
+
+  /** @param {number} now */
+  #glideOn(now) {
+    if (!this.gliding) return false;
+    const { from, to, start } = this.gliding;
+    const t = Math.min(1, Math.max(0, (now - start) / GLIDE_MS));
+    this.rig.pose = between(from, to, t * t * (3 - 2 * t));
+    if (t === 1) this.gliding = null;
+    return t < 1;
+  }
+
+  /**
+   * Follow a drag, a little softened.
+   *
+   * @param {number} seconds
+   */
+  #follow(seconds) {
+    const { right, down } = this.pending;
+    if (right === 0 && down === 0) return false;
+    const left = this.hooks.calm() ? 0 : Math.exp((-1000 * seconds) / FOLLOW_MS);
+    const done = Math.hypot(right, down) * left < 1e-4 ? 1 : 1 - left;
+    this.rig.orbit(right * done, down * done);
+    this.pending = done === 1 ? { right: 0, down: 0 } : { right: right * left, down: down * left };
+    return done < 1;
+  }
+
+  /**
+   * Fly, turn and zoom by the keys that are down.
+   *
+   * @param {number} seconds
+   */
+  #walk(seconds) {
+    const { rig, shift } = this;
+    for (const code of this.keys) {
+      this.touched = true;
+      if (code in ZOOM) rig.zoom(Math.exp(ZOOM[code] * KEY_ZOOM * seconds));
+      else if (shift && code in TURN) rig.orbit(...scaled(TURN[code], KEY_TURN * seconds));
+      else rig.fly(scaled(FLY[code], rig.speed * seconds * (shift ? FASTER : 1)));
+    }
+    return this.keys.size > 0;
+  }
+}
+
+/**
+ * @template {number[]} T
+ * @param {T} values
+ * @param {number} factor
+ * @returns {T}
+ */
+const scaled = (values, factor) => /** @type {T} */ (values.map((value) => value * factor));

@@ -1,0 +1,338 @@
+// The viewer's engine: a canvas, a scene, a camera. Decoding, culling and sorting happen in a worker.
+//
+//   import { createEngine } from './engine.mjs';
+//   const engine = await createEngine(canvas, { onError: ({ message }) => show(message) });
+//   engine.setSize(800, 600);
+//   engine.setCamera({ viewmat, fx: 700, fy: 700, cx: 400, cy: 300 });
+//   await engine.open('scene.csplat');
+
+import { viewOf } from './camera_maths.mjs';
+import { EngineError, E_CONTEXT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
+import { Frames } from './frames.mjs';
+import { Opening } from './opening.mjs';
+import { createRenderer } from './renderer.mjs';
+import { emptyStats, expandedBytes } from './statistics.mjs';
+
+export { EngineError };
+
+/**
+ * @typedef {import('./renderer.mjs').Renderer} Renderer
+ * @typedef {import('./types.d.ts').Camera} Camera
+ * @typedef {import('./types.d.ts').Engine} Engine
+ * @typedef {import('./types.d.ts').EngineOptions} EngineOptions
+ * @typedef {import('./types.d.ts').View} View
+ * @typedef {import('./worker.mjs').Reply} Reply
+ * @typedef {import('./worker.mjs').Request} Request
+ */
+
+/** Of a canvas that has not been given a camera: nothing is drawn but the background. */
+const NO_CAMERA = { viewmat: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], fx: 1, fy: 1, cx: 0, cy: 0 };
+
+/**
+ * Make an engine that draws on a canvas.
+ *
+ * @param {HTMLCanvasElement} canvas
+ * @param {EngineOptions} [options]
+ * @returns {Promise<Engine>} rejects with an EngineError E_WEBGL2 where the browser has no WebGL 2
+ */
+export async function createEngine(canvas, options = {}) {
+  const renderer = createRenderer(canvas, options.pictureFormat);
+  if (renderer === null) {
+    throw new EngineError({ code: E_WEBGL2, message: 'this browser has no WebGL 2, or it is switched off' });
+  }
+  return new SplatEngine(canvas, renderer, options);
+}
+
+function defaultWorker() {
+  return new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' });
+}
+
+/** @implements {Engine} */
+class SplatEngine {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {Renderer} renderer
+   * @param {EngineOptions} options
+   */
+  constructor(canvas, renderer, options) {
+    this.canvas = canvas;
+    this.renderer = renderer;
+    this.options = options;
+    this.background = options.background ?? [0, 0, 0];
+    this.shDegreeAsked = Infinity;
+    /** @type {Camera | null} */
+    this.camera = null;
+    /** @type {View | null} */
+    this.view = null;
+    this.viewId = 0;
+    this.sceneCount = 0;
+    /** @type {Opening | null} */
+    this.opening = null;
+    /** @type {(() => void)[]} those that wait for the next message of the worker */
+    this.waiting = [];
+    this.stats = emptyStats(renderer.capabilities);
+    this.frames = new Frames(
+      () => this.drawFrame(),
+      (frameMs, fps) => this.frameDrawn(frameMs, fps),
+    );
+    this.worker = (options.workerFactory ?? defaultWorker)();
+    this.worker.onmessage = ({ data }) => this.take(data);
+    this.worker.onerror = ({ message }) => {
+      const what = message ?? 'it did not start';
+      this.fail(new EngineError({ code: E_WORKER, message: `the viewer's worker failed: ${what}` }));
+    };
+    this.listeners = new AbortController();
+    const { signal } = this.listeners;
+    canvas.addEventListener('webglcontextlost', (event) => this.contextLost(event), { signal });
+    canvas.addEventListener('webglcontextrestored', () => this.contextRestored(), { signal });
+  }
+
+  get header() {
+    return this.opening?.header ?? null;
+  }
+
+  get bounds() {
+    return this.opening?.bounds ?? null;
+  }
+
+  /** @param {string | URL | Blob | ArrayBuffer} source */
+  open(source) {
+    this.replaced('another scene was opened before everything was decoded');
+    const isAddress = typeof source === 'string' || source instanceof URL;
+    const from = isAddress ? new URL(source, document.baseURI).href : source; // the worker has another base
+    return new Promise((/** @type {(value: void) => void} */ resolve, reject) => this.begin(from, resolve, reject));
+  }
+
+  /**
+   * Have a scene read.
+   *
+   * @param {string | Blob | ArrayBuffer} source
+   * @param {() => void} resolve
+   * @param {(error: EngineError) => void} reject
+   */
+  begin(source, resolve, reject) {
+    this.opening = new Opening(source, ++this.sceneCount, resolve, reject);
+    this.stats = emptyStats(this.renderer.capabilities);
+    this.tell({ type: 'open', scene: this.sceneCount, source });
+  }
+
+  /** @param {Camera} camera */
+  setCamera(camera) {
+    this.camera = { ...camera };
+    this.updateView();
+  }
+
+  /**
+   * @param {number} width
+   * @param {number} height
+   */
+  setSize(width, height) {
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    this.updateView();
+  }
+
+  updateView() {
+    this.requestFrame();
+    if (this.camera === null) return;
+    this.view = viewOf(this.camera, this.canvas.width, this.canvas.height);
+    this.tell({ type: 'view', id: ++this.viewId, view: this.view });
+  }
+
+  /** @param {[number, number, number]} background */
+  setBackground(background) {
+    this.background = background;
+    this.requestFrame();
+  }
+
+  /** @param {number} degree */
+  setShDegree(degree) {
+    this.shDegreeAsked = degree;
+    this.requestFrame();
+  }
+
+  requestFrame() {
+    this.frames.request();
+  }
+
+  async settled() {
+    for (;;) {
+      await this.sorted();
+      const { viewId, opening } = this;
+      await this.frames.settle();
+      if (this.viewId === viewId && this.opening === opening && this.isSorted()) return;
+    }
+  }
+
+  /** Resolves when everything is decoded and sorted for the camera of then. */
+  async sorted() {
+    for (;;) {
+      if (this.opening?.error) throw this.opening.error;
+      if (this.isSorted()) return;
+      await new Promise((/** @type {(value: void) => void} */ resolve) => this.waiting.push(resolve));
+    }
+  }
+
+  isSorted() {
+    return this.opening === null || this.opening.isSorted(this.viewId);
+  }
+
+  async readPixels() {
+    await this.sorted();
+    this.frames.skip();
+    this.drawNow(); // at once: a browser may clear what it has shown
+    return this.renderer.readPixels();
+  }
+
+  /** @param {number} count */
+  async timeFrames(count) {
+    await this.settled();
+    const times = [];
+    for (let i = 0; i < count; i++) {
+      const start = performance.now();
+      this.drawNow();
+      this.renderer.wait();
+      times.push(performance.now() - start);
+    }
+    return times;
+  }
+
+  close() {
+    this.replaced('the engine was closed before everything was decoded');
+    this.opening = null;
+    this.listeners.abort();
+    this.frames.close();
+    this.worker.terminate();
+    this.renderer.dispose();
+    this.wake();
+  }
+
+  /** @param {string} message */
+  replaced(message) {
+    this.opening?.fail(new EngineError({ code: E_REPLACED, message }));
+  }
+
+  /** @param {Request} request */
+  tell(request) {
+    this.worker.postMessage(request);
+  }
+
+  wake() {
+    const { waiting } = this;
+    this.waiting = [];
+    for (const resolve of waiting) resolve();
+  }
+
+  /** @param {Reply} reply */
+  take(reply) {
+    const { opening, renderer } = this;
+    if (opening === null || reply.scene !== opening.scene || opening.error) return;
+    if (reply.type === 'header') this.takeHeader(opening, reply);
+    else if (reply.type === 'progress') this.takeProgress(reply);
+    else if (reply.type === 'geometry') this.takeGeometry(opening, reply);
+    else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
+    else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
+    else if (reply.type === 'order') this.takeOrder(opening, reply);
+    else if (reply.type === 'error') this.fail(new EngineError(reply.error));
+    else {
+      renderer.complete();
+      opening.finish();
+    }
+    if (reply.type === 'header' || reply.type === 'band' || reply.type === 'order' || reply.type === 'done') {
+      this.requestFrame();
+    }
+    this.wake();
+  }
+
+  /**
+   * @param {Opening} opening
+   * @param {Reply & {type: 'header'}} reply
+   */
+  takeHeader(opening, { header, description }) {
+    try {
+      opening.takeHeader(header, this.renderer);
+    } catch (error) {
+      if (!(error instanceof EngineError)) throw error;
+      this.tell({ type: 'stop' });
+      return this.fail(error);
+    }
+    const { splatCount, fileSize } = header;
+    Object.assign(this.stats, { splatCount, fileSize, expandedBytesPerSplat: expandedBytes(header.shDegree) });
+    this.options.onHeader?.(header, description);
+  }
+
+  /** @param {Reply & {type: 'progress'}} reply */
+  takeProgress({ progress, decodeMs }) {
+    Object.assign(this.stats, { received: progress.received, decodeMs });
+    this.options.onProgress?.(progress);
+  }
+
+  /**
+   * @param {Opening} opening
+   * @param {Reply & {type: 'geometry'}} reply
+   */
+  takeGeometry(opening, reply) {
+    opening.takeGeometry(reply, this.renderer);
+    this.stats.splatsResident = opening.splatsHere;
+    if (opening.isWhole) this.stats.firstPictureBytes = this.stats.received;
+  }
+
+  /**
+   * @param {Opening} opening
+   * @param {Reply & {type: 'order'}} reply
+   */
+  takeOrder(opening, { id, tiles, order, count, cullMs, sortMs }) {
+    this.renderer.setOrder(order, count);
+    opening.order = { id, tiles };
+    Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
+    this.worker.postMessage({ type: 'recycle', order }, [order.buffer]);
+  }
+
+  /** @param {EngineError} error */
+  fail(error) {
+    this.opening?.fail(error);
+    this.options.onError?.(error.report());
+    this.wake();
+  }
+
+  drawNow() {
+    const { renderer, canvas, background } = this;
+    const view = this.view ?? viewOf(NO_CAMERA, canvas.width, canvas.height);
+    renderer.draw(view, { background, shDegree: this.shDegreeAsked });
+  }
+
+  drawFrame() {
+    this.drawNow();
+    return this.renderer.finished();
+  }
+
+  /**
+   * @param {number} frameMs
+   * @param {number} fps
+   */
+  frameDrawn(frameMs, fps) {
+    const { stats, opening } = this;
+    const { attributes, order, work } = this.renderer.bytes;
+    Object.assign(stats, { frameMs, fps, gpuBytes: attributes + order, workBytes: work });
+    stats.gpuBytesPerSplat = stats.splatsResident ? attributes / stats.splatsResident : 0;
+    stats.shDegree = Math.min(this.shDegreeAsked, opening?.header?.shDegree ?? 0);
+    if (opening?.isOrderWhole && stats.firstPictureMs === 0) stats.firstPictureMs = performance.now() - opening.begun;
+    this.options.onFrame?.(stats);
+  }
+
+  /** @param {Event} event */
+  contextLost(event) {
+    event.preventDefault(); // or it would never be given back
+    const message = 'the browser has taken the GPU away; the picture comes back with it';
+    this.options.onError?.({ code: E_CONTEXT, message, fatal: false });
+  }
+
+  contextRestored() {
+    const renderer = createRenderer(this.canvas, this.options.pictureFormat);
+    if (renderer === null) return;
+    this.renderer = renderer;
+    const { opening } = this;
+    if (opening && !opening.error) this.begin(opening.source, opening.resolve, opening.reject);
+    this.requestFrame();
+  }
+}

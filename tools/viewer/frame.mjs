@@ -1,0 +1,175 @@
+// Where a scene lies, how large it is and of which kind it is, from samples of its splats. No box of everything is
+// looked at: a few splats far away must not decide what the first picture shows.
+
+/**
+ * @typedef {import('./vectors.mjs').Vec3} Vec3
+ * @typedef {Pick<import('./types.d.ts').Bounds, 'samples' | 'weights'>} Samples means [S, 3], and alpha times area [S]
+ *
+ * An object is looked at from outside. Surroundings reach much farther than their dense middle, in or near which one
+ * stands; one stands inside a room, too.
+ * @typedef {'object' | 'surroundings' | 'room'} Kind
+ *
+ * @typedef {object} Frame
+ * @property {Kind} kind
+ * @property {Vec3} centre
+ * @property {number} extent what distances are multiples of, above 0: half the diagonal of an object or a room, the
+ *   distance from the centre within which half of surroundings lies
+ * @property {Vec3} half half the sides of the box of 5 to 95 % of the scene
+ */
+
+const FAR_REACH = 4; // times the distance within which half of a scene lies: nothing of an object lies there
+const FAR_SHARE = 0.02; // of the surface, that an object may have there
+const WALL = 0.08; // of the side of a box, within which its wall is looked for
+const WALL_CELLS = 6; // per side of a wall
+const WALL_COVER = 0.9; // of the cells, in which a wall has something: also in its corners
+const INNER_SHARE = 0.15; // of a room that stands away from its walls, at most
+
+/**
+ * Quantiles of values that have weights.
+ *
+ * @param {ArrayLike<number>} values
+ * @param {ArrayLike<number>} weights of the same length, not all 0
+ * @param {number[]} shares 0 to 1, rising
+ * @returns {number[]}
+ */
+export function quantiles(values, weights, shares) {
+  const order = Uint32Array.from(values, (_, i) => i).sort((a, b) => values[a] - values[b]);
+  let total = 0;
+  for (let i = 0; i < values.length; i++) total += weights[i];
+  let sum = 0;
+  let at = 0;
+  return shares.map((share) => {
+    while (at < order.length - 1 && sum + weights[order[at]] < share * total) sum += weights[order[at++]];
+    return values[order[at]];
+  });
+}
+
+/**
+ * @param {Samples} samples
+ * @param {Vec3} up an axis of the world or its opposite, for the floor and the ceiling of a room
+ * @returns {Frame} one of extent 1 around 0 where there are no samples
+ */
+export function findFrame({ samples, weights }, up) {
+  const count = weights.length;
+  if (!count) return { kind: 'object', centre: [0, 0, 0], extent: 1, half: [0.5, 0.5, 0.5] };
+  const even = evened(weights);
+  const axes = [0, 1, 2].map((k) => Float32Array.from({ length: count }, (_, i) => samples[3 * i + k]));
+  const [low, middle, high] = transposed(axes.map((values) => quantiles(values, even, [0.05, 0.5, 0.95])));
+  const half = /** @type {Vec3} */ (low.map((value, k) => (high[k] - value) / 2));
+  const distances = Float32Array.from({ length: count }, (_, i) =>
+    Math.hypot(...middle.map((value, k) => samples[3 * i + k] - value)),
+  );
+  const [reach] = quantiles(distances, even, [0.5]);
+  const size = Math.hypot(...half);
+  const extent = size > 0 ? size : Math.sqrt(Math.max(...even)) || 1; // one splat, or several in one place
+  if (reach > 0 && farShare(distances, weights, reach) > FAR_SHARE) {
+    return { kind: 'surroundings', centre: middle, extent: reach, half };
+  }
+  const centre = /** @type {Vec3} */ (low.map((value, k) => (value + high[k]) / 2));
+  const kind = isRoom(samples, even, up) ? 'room' : 'object';
+  return { kind, centre, extent, half };
+}
+
+/**
+ * Weights of which none outweighs a scene: the sky is a handful of splats, and a large one is no more interesting.
+ *
+ * @param {ArrayLike<number>} weights
+ * @returns {Float32Array}
+ */
+export function evened(weights) {
+  const positive = Float32Array.from(weights).filter((weight) => weight > 0).sort();
+  if (!positive.length) return new Float32Array(weights.length).fill(1);
+  const most = positive[positive.length >> 1];
+  return Float32Array.from(weights, (weight) => Math.min(weight, most));
+}
+
+/**
+ * The share of the surface that lies far from the middle.
+ *
+ * @param {Float32Array} distances
+ * @param {ArrayLike<number>} weights
+ * @param {number} reach
+ */
+function farShare(distances, weights, reach) {
+  const most = (0.5 * reach) ** 2; // no single floater makes a landscape
+  let all = 0;
+  let far = 0;
+  for (let i = 0; i < distances.length; i++) {
+    const weight = Math.min(weights[i], most);
+    all += weight;
+    if (distances[i] > FAR_REACH * reach) far += weight;
+  }
+  return all > 0 ? far / all : 0;
+}
+
+/**
+ * Whether a scene is closed above, below and on three sides at least, and nearly hollow: a room seen from inside. The
+ * bottom of an object is rarely there, and rarely does an object fill the corners of its box.
+ *
+ * @param {ArrayLike<number>} samples
+ * @param {Float32Array} even
+ * @param {Vec3} up
+ */
+function isRoom(samples, even, up) {
+  const bounds = [0, 1, 2].map((k) =>
+    quantiles(
+      Float32Array.from(even, (_, i) => samples[3 * i + k]),
+      even,
+      [0.01, 0.99],
+    ),
+  );
+  const walls = [0, 1, 2].map((axis) => [0, 1].map((side) => wallCover(samples, bounds, axis, side)));
+  const vertical = up.findIndex((value) => Math.abs(value) > 0.5);
+  if (Math.min(...walls[vertical]) < WALL_COVER) return false;
+  const sides = walls.flatMap((pair, axis) => (axis === vertical ? [] : pair));
+  return sides.filter((cover) => cover >= WALL_COVER).length >= 3 && innerShare(samples, even, bounds) < INNER_SHARE;
+}
+
+/**
+ * How much of one side of a box has samples close by, 0 to 1.
+ *
+ * @param {ArrayLike<number>} samples
+ * @param {number[][]} bounds low and high of each axis
+ * @param {number} axis
+ * @param {number} side 0 the low one, 1 the high one
+ */
+function wallCover(samples, bounds, axis, side) {
+  const [u, v] = [0, 1, 2].filter((k) => k !== axis);
+  const cells = new Uint8Array(WALL_CELLS ** 2);
+  const place = (/** @type {number} */ value, /** @type {number} */ k) =>
+    (value - bounds[k][0]) / (bounds[k][1] - bounds[k][0] || 1);
+  const cell = (/** @type {number} */ t) => Math.min(WALL_CELLS - 1, Math.max(0, Math.floor(t * WALL_CELLS)));
+  for (let i = 0; i < samples.length; i += 3) {
+    if (Math.abs(place(samples[i + axis], axis) - side) > WALL) continue;
+    cells[cell(place(samples[i + u], u)) * WALL_CELLS + cell(place(samples[i + v], v))] = 1;
+  }
+  return cells.reduce((sum, one) => sum + one, 0) / cells.length;
+}
+
+/**
+ * The share of a scene in the inner half of its box, along each axis.
+ *
+ * @param {ArrayLike<number>} samples
+ * @param {Float32Array} even
+ * @param {number[][]} bounds
+ */
+function innerShare(samples, even, bounds) {
+  let inner = 0;
+  let all = 0;
+  for (let i = 0; i < even.length; i++) {
+    all += even[i];
+    const inside = bounds.every(([low, high], k) => {
+      const t = (samples[3 * i + k] - low) / (high - low || 1);
+      return t > 0.25 && t < 0.75;
+    });
+    if (inside) inner += even[i];
+  }
+  return inner / (all || 1);
+}
+
+/**
+ * @param {number[][]} rows three of three
+ * @returns {[Vec3, Vec3, Vec3]}
+ */
+const transposed = (rows) =>
+  /** @type {[Vec3, Vec3, Vec3]} */ ([0, 1, 2].map((k) => /** @type {unknown} */ (rows.map((row) => row[k]))));

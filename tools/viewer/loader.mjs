@@ -1,0 +1,243 @@
+// Reads a file for the viewer: layer 0 of all tiles first, then the SH bands; packs each for the GPU as it arrives.
+
+import { CsplatReader } from '../../codec/js/decoder.mjs';
+import { SAMPLE_COUNT, showing } from './bounds.mjs';
+import { toCamera } from './camera_maths.mjs';
+import { reachClass } from './cull.mjs';
+import { layoutSlots, packBand, packGeometry, packRows } from './pack.mjs';
+
+/**
+ * @typedef {import('../../codec/js/decoder.d.ts').Header} Header
+ * @typedef {import('../../codec/js/decoder.d.ts').PackedGeometry} PackedGeometry
+ * @typedef {import('../../codec/js/decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./cull.mjs').CullTile} CullTile
+ * @typedef {import('./pack.mjs').BandTexels} BandTexels
+ * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./types.d.ts').View} View
+ *
+ * What becomes of a file's parts.
+ *
+ * @typedef {object} Sink
+ * @property {(header: Header, description: any) => void} header
+ * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry
+ * @property {(codebook: number, layer: number, rows: Rows) => void} table
+ * @property {(tile: number, layer: number, band: BandTexels) => void} band
+ * @property {(progress: {phase: 'open' | 'layers', received: number, fileSize: number, splatsDone: number,
+ *   splatCount: number, layer: number, decodeMs: number}) => void} progress
+ * @property {() => View | null} view the camera of now
+ *
+ * @typedef {{points: Float32Array<ArrayBuffer>, weights: Float32Array<ArrayBuffer>}} Samples
+ */
+
+/** Layers are fetched in groups of so many bytes, and one group ahead of the one that is being decoded. */
+const GROUP_BYTES = 1 << 19;
+
+/**
+ * Read all of a file.
+ *
+ * @param {string | Blob | ArrayBuffer} source
+ * @param {Sink} sink
+ * @param {AbortSignal} signal
+ */
+export async function load(source, sink, signal) {
+  const state = { received: 0, fileSize: 0, splatsDone: 0, splatCount: 0, decodeMs: 0 };
+  const tell = (/** @type {number} */ layer) =>
+    sink.progress({ phase: state.fileSize ? 'layers' : 'open', layer, ...state });
+  const reader = await CsplatReader.open(asSource(source), {
+    signal,
+    onProgress: (received) => {
+      state.received = received;
+      tell(0);
+    },
+  });
+  const { header } = reader;
+  const description = await reader.describe({ signal });
+  Object.assign(state, { fileSize: header.fileSize, splatCount: header.splatCount });
+  const isLocal = typeof source !== 'string'; // then nothing is reported as received
+  if (isLocal) state.received = header.indexSize;
+  sink.header(header, description);
+  tell(0);
+  const order = tileOrder(header.tiles, sink.view());
+  const tables = new Set();
+  const starts = layoutSlots(header.tiles).starts;
+  for (let layer = 0; layer <= header.shDegree; layer++) {
+    for await (const tile of fetched(reader, order, layer, signal)) {
+      const begun = performance.now() - reader.waitedMs;
+      if (layer === 0) await readGeometry(reader, tile, starts[tile.index], sink, signal);
+      else await readBand(reader, tile, layer, tables, sink, signal);
+      state.decodeMs += performance.now() - reader.waitedMs - begun;
+      if (layer === 0) state.splatsDone += tile.splatCount;
+      if (isLocal) state.received += tile.layers.find((one) => one.layer === layer)?.size ?? 0;
+      tell(layer);
+    }
+  }
+  if (isLocal) {
+    state.received = header.fileSize;
+    tell(header.shDegree);
+  }
+}
+
+/**
+ * What a reader takes.
+ *
+ * @param {string | Blob | ArrayBuffer} source
+ */
+function asSource(source) {
+  if (!(source instanceof ArrayBuffer)) return source;
+  const bytes = new Uint8Array(source);
+  return new Blob([bytes]); // it notices reads beyond the end
+}
+
+/**
+ * Tiles, the nearest to the camera first; in the order of the file where there is no camera yet.
+ *
+ * @param {TileRecord[]} tiles
+ * @param {View | null} view
+ */
+export function tileOrder(tiles, view) {
+  if (view === null) return tiles;
+  const distance = (/** @type {TileRecord} */ { min, max }) => {
+    const centre = [0, 1, 2].map((axis) => (min[axis] + max[axis]) / 2);
+    const half = Math.hypot(max[0] - min[0], max[1] - min[1], max[2] - min[2]) / 2;
+    const [x, y, z] = toCamera(view.viewmat, centre);
+    return Math.hypot(x, y, z) + (z < -half ? 1e30 : 0) - half; // what lies behind comes last
+  };
+  const far = new Map(tiles.map((tile) => [tile, distance(tile)]));
+  return [...tiles].sort((a, b) => Number(far.get(a)) - Number(far.get(b)));
+}
+
+/**
+ * Tiles that have a layer, each once its bytes have been asked for.
+ *
+ * @param {CsplatReader} reader
+ * @param {TileRecord[]} order
+ * @param {number} layer
+ * @param {AbortSignal} signal
+ */
+async function* fetched(reader, order, layer, signal) {
+  /** @type {TileRecord[][]} */
+  const groups = [];
+  let bytes = Infinity;
+  for (const tile of order) {
+    const place = tile.layers.find((one) => one.layer === layer);
+    if (place === undefined) continue;
+    if (bytes >= GROUP_BYTES) {
+      groups.push([]);
+      bytes = 0;
+    }
+    groups[groups.length - 1].push(tile);
+    bytes += place.size;
+  }
+  const ask = (/** @type {TileRecord[] | undefined} */ group) => {
+    if (group)
+      reader.prefetch(
+        group.map(({ index }) => ({ tile: index, layer })),
+        { signal },
+      );
+  };
+  ask(groups[0]);
+  for (const [i, group] of groups.entries()) {
+    ask(groups[i + 1]);
+    yield* group;
+  }
+}
+
+/**
+ * @param {CsplatReader} reader
+ * @param {TileRecord} tile
+ * @param {number} slot of its first splat
+ * @param {Sink} sink
+ * @param {AbortSignal} signal
+ */
+async function readGeometry(reader, tile, slot, sink, signal) {
+  const { index } = tile;
+  /** @type {PackedGeometry} */
+  const packed = await reader.readLayer(index, 0, { form: 'packed', signal });
+  const [opacities, , quats] = reader.header.attributes;
+  const texels = packGeometry(packed, opacities, quats);
+  const stride = Math.max(1, Math.floor(reader.header.splatCount / SAMPLE_COUNT));
+  const alphas = alphasOf(packed, opacities);
+  sink.geometry(index, texels, cullTile(packed, alphas, tile, slot), samplesOf(packed, alphas, stride));
+}
+
+/**
+ * @param {PackedGeometry} packed
+ * @param {{levels: number, mapping: string}} record
+ */
+function alphasOf({ opacities: { columns, offsets }, count }, { levels, mapping }) {
+  const alphas = new Float32Array(count);
+  for (let i = 0; i < count; i++) alphas[i] = (offsets[0] + columns[i]) / levels;
+  if (mapping === 'square') for (let i = 0; i < count; i++) alphas[i] *= alphas[i];
+  return alphas;
+}
+
+/**
+ * Log-scale of a splat's column.
+ *
+ * @param {PackedGeometry} packed
+ * @param {number} column
+ * @param {number} i
+ */
+const logScale = ({ scales: { columns, offsets, step }, count }, column, i) =>
+  (offsets[column] + columns[column * count + i]) * step;
+
+/**
+ * @param {PackedGeometry} packed
+ * @param {Float32Array} alphas
+ * @param {TileRecord} tile
+ * @param {number} slot
+ * @returns {CullTile}
+ */
+function cullTile(packed, alphas, { extent, maxScale }, slot) {
+  const { count, means } = packed;
+  const reaches = new Uint8Array(count);
+  for (let i = 0; i < count; i++) {
+    const largest = Math.max(logScale(packed, 0, i), logScale(packed, 1, i), logScale(packed, 2, i));
+    reaches[i] = reachClass(alphas[i], largest);
+  }
+  const reach = 4 * Math.exp(maxScale); // above REACH_MAX with the rounding of the classes
+  return { count, slot, means: means.columns, corner: means.offsets, step: means.step, extent, reach, reaches };
+}
+
+/**
+ * Every `stride`-th splat.
+ *
+ * @param {PackedGeometry} packed
+ * @param {Float32Array} alphas
+ * @param {number} stride
+ * @returns {Samples}
+ */
+function samplesOf(packed, alphas, stride) {
+  const { count, means } = packed;
+  const n = Math.ceil(count / stride);
+  const points = new Float32Array(3 * n);
+  const weights = new Float32Array(n);
+  for (let k = 0, i = 0; k < n; k++, i += stride) {
+    for (let axis = 0; axis < 3; axis++) {
+      points[3 * k + axis] = (means.offsets[axis] + means.columns[axis * count + i]) * means.step;
+    }
+    const [, b, c] = [0, 1, 2].map((column) => logScale(packed, column, i)).sort((x, y) => x - y);
+    weights[k] = showing(alphas[i], b, c);
+  }
+  return { points, weights };
+}
+
+/**
+ * @param {CsplatReader} reader
+ * @param {TileRecord} tile
+ * @param {number} layer
+ * @param {Set<string>} tables those that the sink has
+ * @param {Sink} sink
+ * @param {AbortSignal} signal
+ */
+async function readBand(reader, tile, layer, tables, sink, signal) {
+  /** @type {import('../../codec/js/decoder.d.ts').PackedBand} */
+  const { sh, count } = await reader.readLayer(tile.index, layer, { form: 'packed', signal });
+  if (sh.lookup) {
+    const key = `${sh.lookup.codebook}.${layer}`;
+    if (!tables.has(key)) sink.table(sh.lookup.codebook, layer, packRows(sh.lookup.table));
+    tables.add(key);
+  }
+  sink.band(tile.index, layer, packBand(sh, count));
+}

@@ -1,0 +1,67 @@
+// What went wrong, in words for people who do not know the format.
+
+/**
+ * @typedef {{code: string, message: string, offset?: number | null, clause?: string | null}} Problem
+ * @typedef {{title: string, advice: string, facts: string}} Message
+ */
+
+const AGAIN = 'Download or copy it again; if that does not help, whoever made it has to write it again.';
+const NEWER = 'A newer version of this viewer may know it.';
+const BROKEN = {
+  title: 'This file contradicts itself.',
+  advice: `It is damaged, or what wrote it is at fault. ${AGAIN}`,
+};
+const DAMAGED = { title: 'This file is damaged: some of its bytes are not what was written.', advice: AGAIN };
+
+/** @type {Record<string, {title: string, advice: string}>} */
+const WORDS = {
+  E_MAGIC: { title: 'This is not a .csplat file.', advice: 'A PLY becomes one with the command “csplat encode”.' },
+  E_VERSION: { title: 'This file was written in another version of the format.', advice: NEWER },
+  E_TRUNCATED: { title: 'This file ends too early: a part of it is missing.', advice: AGAIN },
+  E_TRAILING: { title: 'Something follows the end of this file.', advice: AGAIN },
+  E_CRC: DAMAGED,
+  E_DIGEST: DAMAGED,
+  E_CODER: DAMAGED,
+  E_RESERVED: BROKEN,
+  E_VALUE: BROKEN,
+  E_INDEX: BROKEN,
+  E_STREAM: BROKEN,
+  E_RANGE: BROKEN,
+  E_CODEBOOK: BROKEN,
+  E_BOX: BROKEN,
+  E_JSON: BROKEN,
+  E_UNSUPPORTED: { title: 'This file uses something that this viewer does not have.', advice: NEWER },
+  E_LIMIT: { title: 'This scene is too large for this viewer.', advice: 'A scene of fewer splats will fit.' },
+  E_INPUT: { title: 'The file could not be read.', advice: 'Check its address and the connection, then try again.' },
+  E_WEBGL2: {
+    title: 'This browser cannot draw the scene: it has no WebGL 2.',
+    advice: 'A current version of Chrome, Edge, Firefox or Safari has; hardware acceleration may be switched off.',
+  },
+  E_CONTEXT: {
+    title: 'The graphics card gave up on this page.',
+    advice: 'If the picture does not come back, load the page again, and close others that use the card.',
+  },
+  E_WORKER: {
+    title: 'A part of this page could not start.',
+    advice: 'Load the page again; a current version of Chrome, Edge, Firefox or Safari is wanted.',
+  },
+};
+
+/**
+ * @param {Problem} problem
+ * @param {string} [name] of the file
+ * @returns {Message} one line that everybody understands, what to do, and what a report of the error needs
+ */
+export function explain({ code, message, offset, clause }, name = '') {
+  let words = WORDS[code] ?? { title: 'Something went wrong.', advice: 'Load the page again.' };
+  if (code === 'E_MAGIC' && /\.ply$/i.test(name)) {
+    words = {
+      title: 'This is a PLY, not a .csplat file.',
+      advice: `“csplat encode” compresses it; “csplat view ${name}” shows it.`,
+    };
+  }
+  const place = typeof offset === 'number' ? ` at byte ${offset.toLocaleString('en')}` : '';
+  const rule = clause ? ` (${clause})` : '';
+  const detail = message.replace(/^E_[A-Z0-9_]+( at byte \d+)?( \([A-Z0-9-]+\))?: /, '');
+  return { ...words, facts: `${code}${place}${rule}: ${detail}` };
+}

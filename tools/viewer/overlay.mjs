@@ -1,0 +1,231 @@
+// What stands over the scene: progress, statistics, messages, the place to drop a file. No scene is known here.
+
+import { explain } from './messages.mjs';
+
+/**
+ * @typedef {import('./types.d.ts').Progress} Progress
+ * @typedef {import('./types.d.ts').Stats} Stats
+ * @typedef {{open: (file: File) => void}} Hooks
+ */
+
+const TOAST_MS = 2600;
+const STATISTICS_MS = 250; // between two updates of the numbers
+
+/** @type {(value: number) => string} */
+const count = (value) => Math.round(value).toLocaleString('en');
+
+/** @type {(bytes: number) => string} MB = 10^6 bytes */
+const megabytes = (bytes) => (bytes < 1e7 ? (bytes / 1e6).toFixed(2) : (bytes / 1e6).toFixed(1));
+
+/** @type {(ms: number) => string} */
+const milliseconds = (ms) => `${ms < 10 ? ms.toFixed(1) : count(ms)} ms`;
+
+/**
+ * @template {HTMLElement} T
+ * @param {string} id
+ * @param {new () => T} kind
+ * @returns {T}
+ */
+export function element(id, kind) {
+  const found = document.getElementById(id);
+  if (!(found instanceof kind)) throw new Error(`the page has no ${id}`);
+  return found;
+}
+
+/** @param {string} id */
+const html = (id) => element(id, HTMLElement);
+
+export class Overlay {
+  /** @param {Hooks} hooks */
+  constructor(hooks) {
+    this.hooks = hooks;
+    this.name = '';
+    this.toastTimer = 0;
+    this.updated = -Infinity;
+    this.failed = false;
+    this.isMoving = false;
+    /** @type {Stats | null} */
+    this.stats = null;
+    this.licence = '';
+    for (const id of ['choose', 'open', 'error-open']) html(id).addEventListener('click', () => this.chooseFile());
+    html('error-close').addEventListener('click', () => this.hideError());
+    html('details').addEventListener('click', () => this.toggleStatistics());
+    html('help').addEventListener('click', () => this.toggleHelp());
+    html('help-close').addEventListener('click', () => this.toggleHelp());
+    const input = element('file', HTMLInputElement);
+    input.addEventListener('change', () => {
+      if (input.files?.[0]) hooks.open(input.files[0]);
+      input.value = ''; // the same file may be chosen again
+    });
+    this.#acceptDrops();
+  }
+
+  chooseFile() {
+    element('file', HTMLInputElement).click();
+  }
+
+  /** Ask for a scene where the page was opened without one. */
+  welcome() {
+    html('welcome').hidden = false;
+  }
+
+  /**
+   * A scene is being opened.
+   *
+   * @param {string} name
+   */
+  begin(name) {
+    this.name = name;
+    this.licence = '';
+    this.failed = false;
+    this.hideError();
+    html('welcome').hidden = true;
+    this.describe(name);
+    this.#bar(0);
+    html('progress').hidden = false;
+    html('summary').textContent = 'Opening …';
+  }
+
+  /**
+   * @param {string} title
+   * @param {string} [licence]
+   */
+  describe(title, licence = '') {
+    this.licence = licence;
+    html('info').hidden = !title;
+    html('title').textContent = title;
+    document.title = title ? `${title} – csplat viewer` : 'csplat viewer';
+  }
+
+  /** @param {Progress} progress */
+  progress({ received, fileSize, splatsDone, splatCount, layer, phase }) {
+    const share = fileSize > 0 ? received / fileSize : 0;
+    this.#bar(Math.min(1, share));
+    const what = layer > 0 ? `colour detail ${layer} of 3` : `${count(splatsDone)} of ${count(splatCount)} splats`;
+    html('summary').textContent =
+      phase === 'open' ? 'Opening …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
+  }
+
+  /** Everything is here. */
+  done() {
+    html('progress').hidden = true;
+    if (this.stats) this.#summary(this.stats);
+    html('live').textContent = `${this.name} is loaded: ${html('summary').textContent}`;
+  }
+
+  /**
+   * @param {Stats} stats
+   * @param {boolean} isMoving whether frames follow each other: only then is there a rate of them
+   */
+  statistics(stats, isMoving) {
+    const now = performance.now();
+    if (isMoving && this.isMoving && now - this.updated < STATISTICS_MS) return;
+    this.stats = stats;
+    this.isMoving = isMoving;
+    this.updated = now;
+    if (html('progress').hidden && !this.failed) this.#summary(stats);
+    if (!html('statistics').hidden) this.#table(stats);
+  }
+
+  toggleStatistics() {
+    const list = html('statistics');
+    list.hidden = !list.hidden;
+    html('details').setAttribute('aria-expanded', String(!list.hidden));
+    if (this.stats && !list.hidden) this.#table(this.stats);
+  }
+
+  toggleHelp() {
+    const dialog = element('help-dialog', HTMLDialogElement);
+    if (dialog.open) dialog.close();
+    else dialog.showModal();
+  }
+
+  /**
+   * @param {import('./messages.mjs').Problem} problem
+   * @param {boolean} scene whether it is a scene's, not the page's
+   */
+  error(problem, scene = true) {
+    const { title, advice, facts } = explain(problem, this.name);
+    this.failed = true;
+    html('progress').hidden = true;
+    html('welcome').hidden = true;
+    html('summary').textContent = 'Not shown, or only in part';
+    html('error-title').textContent = title;
+    html('error-advice').textContent = advice;
+    html('error-facts').textContent = facts;
+    html('error-open').hidden = !scene;
+    const card = html('error');
+    card.dataset.code = problem.code;
+    card.hidden = false;
+  }
+
+  hideError() {
+    html('error').hidden = true;
+  }
+
+  /**
+   * Say something for a moment.
+   *
+   * @param {string} text
+   */
+  toast(text) {
+    const toast = html('toast');
+    toast.textContent = text;
+    toast.hidden = false;
+    clearTimeout(this.toastTimer);
+    this.toastTimer = window.setTimeout(() => (toast.hidden = true), TOAST_MS);
+  }
+
+  /** @param {Stats} stats */
+  #summary({ splatCount, fileSize, fps }) {
+    const rate = this.isMoving ? ` · ${Math.round(fps)} fps` : '';
+    html('summary').textContent = `${count(splatCount)} splats · ${megabytes(fileSize)} MB${rate}`;
+  }
+
+  /** @param {Stats} stats */
+  #table(stats) {
+    const perSplat = stats.splatCount ? stats.fileSize / stats.splatCount : 0;
+    const rows = [
+      ['Splats drawn', `${count(stats.splatsDrawn)} of ${count(stats.splatCount)}`],
+      ['File', `${megabytes(stats.fileSize)} MB, ${perSplat.toFixed(1)} B per splat`],
+      ['Colour degree', String(stats.shDegree)],
+      ['First picture', `${milliseconds(stats.firstPictureMs)}, ${megabytes(stats.firstPictureBytes)} MB`],
+      ['Decoding', milliseconds(stats.decodeMs)],
+      ['Sorting', `${milliseconds(stats.sortMs)}, culling ${milliseconds(stats.cullMs)}`],
+      ['Frame', milliseconds(stats.frameMs) + (this.isMoving ? `, ${Math.round(stats.fps)} fps` : '')],
+      ['Graphics memory', `${megabytes(stats.gpuBytes)} MB, ${stats.gpuBytesPerSplat.toFixed(1)} B per splat`],
+      ['Renderer', stats.glRenderer],
+      ...(this.licence ? [['Licence', this.licence]] : []),
+    ];
+    html('statistics').replaceChildren(
+      ...rows.flatMap((row) =>
+        row.map((text, i) => Object.assign(document.createElement(i ? 'dd' : 'dt'), { textContent: text })),
+      ),
+    );
+  }
+
+  /** @param {number} share */
+  #bar(share) {
+    html('progress-bar').style.transform = `scaleX(${share})`;
+    html('progress').setAttribute('aria-valuenow', String(Math.round(100 * share)));
+  }
+
+  #acceptDrops() {
+    const target = html('drop');
+    const files = (/** @type {DragEvent} */ event) => event.dataTransfer?.types.includes('Files');
+    addEventListener('dragover', (event) => {
+      if (!files(event)) return;
+      event.preventDefault();
+      target.hidden = false;
+    });
+    addEventListener('dragleave', (event) => {
+      if (event.relatedTarget === null) target.hidden = true;
+    });
+    addEventListener('drop', (event) => {
+      event.preventDefault();
+      target.hidden = true;
+      const file = event.dataTransfer?.files[0];
+      if (file) this.hooks.open(file);
+    });
+  }
+}

@@ -1,0 +1,288 @@
+// From a tile's integers to texels of four 32-bit words, and back. shaders.mjs reads the same layout.
+//
+// Geometry is a string of bits per splat: means x y z, quats x y z, scales (three), opacity, sh0 r g b, each field with
+// as many bits as the tile needs; the first 128 bits are a texel, what does not fit follows in words apart. Colours of
+// SH bands are rows of equal fields that do not cross words: entries of a codebook, or one row per splat. Indices of a
+// codebook are such fields too. Each of these arrays of words is filled up to whole texels.
+
+/**
+ * @typedef {import('../../codec/js/decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('../../codec/js/decoder.d.ts').Packed} Packed
+ * @typedef {import('../../codec/js/decoder.d.ts').PackedColumns} PackedColumns
+ * @typedef {import('../../codec/js/decoder.d.ts').PackedGeometry} PackedGeometry
+ * @typedef {Uint8Array | Uint16Array | Uint32Array | Float64Array} Elements
+ *
+ * Values are `offset` + field × step, or binary32 patterns where a field has 32 bits (offset and step are then unused).
+ *
+ * @typedef {object} GeometryTexels
+ * @property {number} count splats
+ * @property {Uint32Array<ArrayBuffer>} first [4 × count], the first texel of each splat
+ * @property {Uint32Array<ArrayBuffer> | null} more [moreWords × count], filled up
+ * @property {number} moreWords of each splat
+ * @property {{means: number[], quats: number, scales: number, opacities: number, sh0: number}} bits of a field
+ * @property {{offsets: number[], step: number}} scales
+ * @property {{offsets: number[], step: number}} sh0
+ *
+ * Rows of SH coefficients, r g b of one after the other; a value is (offset + field) × step, or a binary32 pattern.
+ *
+ * @typedef {{texels: Uint32Array<ArrayBuffer>, rowWords: number, rows: number, bits: number, offset: number, step: number}} Rows
+ *
+ * An SH band of a tile: a row per splat, or indices of rows and a row for each escaped splat (null: none is). An index
+ * of `size` + k is the k-th of those.
+ *
+ * @typedef {{rows: Rows | null, codebook: {id: number, size: number, index: Uint32Array<ArrayBuffer>, indexBits: number} | null}} BandTexels
+ */
+
+/** Splats of a tile begin at a multiple of this, so that a table of blocks tells a splat's tile. */
+export const BLOCK_SPLATS = 64;
+
+/** Integers of up to so many bits, and their sums with offsets of as many, are exact in binary32. */
+const EXACT_BITS = 23;
+const FLOAT_BITS = 32;
+const TEXEL_WORDS = 4;
+
+/**
+ * First slots of tiles.
+ *
+ * @param {{splatCount: number}[]} tiles
+ * @returns {{starts: number[], slotCount: number}} slotCount: of all, those between tiles too
+ */
+export function layoutSlots(tiles) {
+  const starts = [];
+  let slotCount = 0;
+  for (const { splatCount } of tiles) {
+    starts.push(slotCount);
+    slotCount += Math.ceil(splatCount / BLOCK_SPLATS) * BLOCK_SPLATS;
+  }
+  return { starts, slotCount };
+}
+
+/**
+ * Layer 0 of a tile.
+ *
+ * @param {PackedGeometry} tile
+ * @param {{levels: number}} opacities attribute record
+ * @param {{levels: number}} quats attribute record
+ * @returns {GeometryTexels}
+ */
+export function packGeometry(tile, opacities, quats) {
+  const { count } = tile;
+  const scales = fieldsOf(tile.scales, count);
+  const sh0 = fieldsOf(expanded(tile.sh0, count), count);
+  const levels = quats.levels;
+  const meansBits = [0, 1, 2].map((axis) => bitsFor(largest(tile.means.columns, axis * count, count)));
+  const bits = {
+    means: meansBits,
+    quats: bitsFor(2 * levels),
+    scales: scales.bits,
+    opacities: bitsFor(opacities.levels),
+    sh0: sh0.bits,
+  };
+  const total = meansBits[0] + meansBits[1] + meansBits[2] + 3 * (bits.quats + bits.scales + bits.sh0) + bits.opacities;
+  const words = Math.max(TEXEL_WORDS, Math.ceil(total / 32));
+  const writer = new BitWriter(count, words);
+  for (let axis = 0; axis < 3; axis++) writer.put(tile.means.columns, axis * count, 0, meansBits[axis]);
+  for (let c = 0; c < 3; c++) writer.put(tile.quats.columns, c * count, tile.quats.offsets[c] + levels, bits.quats);
+  for (let c = 0; c < 3; c++) writer.put(scales.fields, c * count, 0, bits.scales);
+  writer.put(tile.opacities.columns, 0, tile.opacities.offsets[0], bits.opacities);
+  for (let c = 0; c < 3; c++) writer.put(sh0.fields, c * count, 0, bits.sh0);
+  return { count, ...splitTexels(writer.words, count, words), bits, scales: scales.values, sh0: sh0.values };
+}
+
+/** Fields of splats, one string of bits each. */
+class BitWriter {
+  /**
+   * @param {number} count splats
+   * @param {number} stride words of a splat
+   */
+  constructor(count, stride) {
+    this.count = count;
+    this.stride = stride;
+    this.words = new Uint32Array(count * stride);
+    this.bit = 0;
+  }
+
+  /**
+   * Append a field to every splat.
+   *
+   * @param {Elements} from
+   * @param {number} first element
+   * @param {number} add to each element, the sum is at least 0 and has `bits` bits
+   * @param {number} bits at most 32
+   */
+  put(from, first, add, bits) {
+    const { count, stride, words } = this;
+    const word = this.bit >>> 5;
+    const shift = this.bit & 31;
+    const crosses = shift + bits > 32;
+    for (let i = 0, at = word; i < count; i++, at += stride) {
+      const value = from[first + i] + add;
+      words[at] |= value << shift;
+      if (crosses) words[at + 1] = value >>> (32 - shift);
+    }
+    this.bit += bits;
+  }
+}
+
+/**
+ * @param {Uint32Array<ArrayBuffer>} words
+ * @param {number} count
+ * @param {number} stride words of a splat
+ */
+function splitTexels(words, count, stride) {
+  const moreWords = stride - TEXEL_WORDS;
+  if (moreWords === 0) return { first: words, more: null, moreWords };
+  const first = new Uint32Array(TEXEL_WORDS * count);
+  const more = wholeTexels(moreWords * count);
+  for (let i = 0; i < count; i++) {
+    first.set(words.subarray(i * stride, i * stride + TEXEL_WORDS), i * TEXEL_WORDS);
+    more.set(words.subarray(i * stride + TEXEL_WORDS, (i + 1) * stride), i * moreWords);
+  }
+  return { first, more, moreWords };
+}
+
+/** An array of at least so many words. @param {number} words */
+const wholeTexels = (words) => new Uint32Array(Math.ceil(words / TEXEL_WORDS) * TEXEL_WORDS);
+
+/**
+ * Fields of columns with one width: the integers above each column's offset, or binary32 patterns where those are many.
+ *
+ * @param {PackedColumns} packed
+ * @param {number} count splats
+ * @returns {{fields: Elements, bits: number, values: {offsets: number[], step: number}}}
+ */
+function fieldsOf({ columns, offsets, step }, count) {
+  const bits = columns instanceof Float64Array ? FLOAT_BITS : bitsFor(largest(columns, 0, columns.length));
+  if (bits <= EXACT_BITS) {
+    return { fields: columns, bits, values: { offsets: offsets.map((offset) => offset * step), step } };
+  }
+  const floats = new Float32Array(columns.length);
+  for (let i = 0; i < columns.length; i++) floats[i] = (offsets[Math.floor(i / count)] + columns[i]) * step;
+  return {
+    fields: new Uint32Array(floats.buffer),
+    bits: FLOAT_BITS,
+    values: { offsets: offsets.map(() => 0), step: 0 },
+  };
+}
+
+/**
+ * Colours without their codebook.
+ *
+ * @param {Packed} packed
+ * @param {number} count splats
+ * @returns {PackedColumns}
+ */
+function expanded(packed, count) {
+  const { lookup, columns, offsets, step } = packed;
+  if (lookup === undefined) return packed;
+  const { table, index, escaped } = lookup;
+  const size = table.columns.length / offsets.length;
+  const out = new Float64Array(offsets.length * count);
+  for (let c = 0; c < offsets.length; c++) {
+    for (let i = 0; i < count; i++) out[c * count + i] = table.offsets[c] + table.columns[c * size + index[i]];
+    for (let k = 0; k < escaped.length; k++) {
+      out[c * count + escaped[k]] = offsets[c] + columns[c * escaped.length + k];
+    }
+  }
+  return narrowed(out, offsets.length, step);
+}
+
+/**
+ * @param {Float64Array} columns integers
+ * @param {number} width columns
+ * @param {number} step
+ * @returns {PackedColumns}
+ */
+function narrowed(columns, width, step) {
+  const n = columns.length / width;
+  const offsets = Array.from({ length: width }, (_, c) => columns.subarray(c * n, (c + 1) * n).reduce(lesser));
+  const above = columns.map((value, i) => value - offsets[Math.floor(i / n)]);
+  if (largest(above, 0, above.length) >= 2 ** EXACT_BITS) return { columns, offsets: offsets.fill(0), step };
+  return { columns: Uint32Array.from(above), offsets, step };
+}
+
+/** @param {number} a @param {number} b */
+const lesser = (a, b) => Math.min(a, b);
+
+/**
+ * An SH band of a tile.
+ *
+ * @param {Packed} packed
+ * @param {number} count splats
+ * @returns {BandTexels}
+ */
+export function packBand(packed, count) {
+  if (packed.lookup === undefined) return { rows: packRows(packed), codebook: null };
+  const { codebook: id, table, index, escaped } = packed.lookup;
+  const size = table.columns.length / packed.offsets.length - 1; // the last row stands for the escaped
+  const full = Uint32Array.from(index);
+  for (let k = 0; k < escaped.length; k++) full[escaped[k]] = size + k;
+  const indexBits = bitsFor(Math.max(0, size + escaped.length - 1));
+  const words = packFields(full, count, indexBits);
+  const rows = escaped.length ? packRows(packed) : null;
+  return { rows, codebook: { id, size, index: words, indexBits } };
+}
+
+/**
+ * Rows of colours, each beginning with a word.
+ *
+ * @param {PackedColumns} packed
+ * @returns {Rows}
+ */
+export function packRows({ columns, offsets, step }) {
+  const width = offsets.length;
+  const rows = columns.length / width;
+  const offset = offsets.reduce(lesser);
+  let high = -Infinity;
+  for (let c = 0; c < width; c++) high = Math.max(high, offsets[c] + largest(columns, c * rows, rows));
+  const isNarrow = !(columns instanceof Float64Array) && high - offset < 2 ** EXACT_BITS;
+  const isExact = isNarrow && Math.abs(offset) < 2 ** EXACT_BITS;
+  const bits = isExact ? bitsFor(high - offset) : FLOAT_BITS;
+  const perWord = Math.floor(32 / bits);
+  const rowWords = Math.ceil(width / perWord);
+  const words = wholeTexels(rows * rowWords);
+  const pattern = new Float32Array(1);
+  const patternBits = new Uint32Array(pattern.buffer);
+  for (let c = 0; c < width; c++) {
+    const field = 3 * (c % (width / 3)) + Math.floor((3 * c) / width); // columns are channel by channel
+    const shift = (field % perWord) * bits;
+    let at = Math.floor(field / perWord);
+    const add = offsets[c] - offset;
+    for (let i = 0; i < rows; i++, at += rowWords) {
+      if (isExact) words[at] |= (columns[c * rows + i] + add) << shift;
+      else {
+        pattern[0] = (offsets[c] + columns[c * rows + i]) * step;
+        words[at] = patternBits[0];
+      }
+    }
+  }
+  return { texels: words, rowWords, rows, bits, offset: isExact ? offset : 0, step };
+}
+
+/**
+ * One field per splat, as many to a word as fit.
+ *
+ * @param {Uint32Array} values
+ * @param {number} count
+ * @param {number} bits
+ */
+function packFields(values, count, bits) {
+  const perWord = Math.floor(32 / bits);
+  const words = wholeTexels(Math.ceil(count / perWord));
+  for (let i = 0; i < count; i++) words[Math.floor(i / perWord)] |= values[i] << ((i % perWord) * bits);
+  return words;
+}
+
+/** Bits of an unsigned integer below 2^32, at least one. @param {number} most */
+export const bitsFor = (most) => Math.max(1, 32 - Math.clz32(most));
+
+/**
+ * @param {Elements} elements not negative
+ * @param {number} first
+ * @param {number} count
+ */
+function largest(elements, first, count) {
+  let most = 0;
+  for (let i = first; i < first + count; i++) if (elements[i] > most) most = elements[i];
+  return most;
+}

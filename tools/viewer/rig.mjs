@@ -1,0 +1,244 @@
+// The camera that a person moves: where it stands, what it turns around, and how its lens fits the canvas. No DOM here.
+
+import {
+  add,
+  cross,
+  dot,
+  length,
+  lookAlong,
+  mix,
+  scale,
+  slerp,
+  sub,
+  toBasis,
+  toQuat,
+  turnBasis,
+  unit,
+} from './vectors.mjs';
+
+/**
+ * @typedef {import('./vectors.mjs').Vec3} Vec3
+ * @typedef {import('./vectors.mjs').Basis} Basis
+ *
+ * A lens, as it stands in a camera file: focal lengths and principal point of a picture of W by H pixels.
+ * @typedef {{fx: number, fy: number, cx: number, cy: number, W: number, H: number}} Lens
+ *
+ * @typedef {object} Pose
+ * @property {Basis} basis right, down, forward
+ * @property {Vec3} eye where the camera stands
+ * @property {number} distance to the pivot, straight ahead; above 0
+ * @property {Vec3} up of the world
+ * @property {Lens} lens
+ * @property {number} near distance of the near plane
+ * @property {number[]} [viewmat] exactly as a file gave it, 16 numbers by rows, until the camera moves
+ *
+ * @typedef {{viewmat: number[], fx: number, fy: number, cx: number, cy: number, near: number}} EngineCamera
+ */
+
+const POLE = 0.02; // radians that stay between the line of sight and the vertical
+const NEAREST = 1e-4; // of the extent: the pivot comes no nearer
+const FARTHEST = 60; // extents
+const NEAR_SHARE = 0.1; // of the distance to the pivot: the near plane lies no farther than that
+
+/** Field of view of the shorter side of the canvas, where no file says another, radians. */
+export const FIELD_OF_VIEW = (55 * Math.PI) / 180;
+
+/** @returns {Lens} the lens where no file says another */
+export function defaultLens() {
+  const focal = 0.5 / Math.tan(FIELD_OF_VIEW / 2);
+  return { fx: focal, fy: focal, cx: 0.5, cy: 0.5, W: 1, H: 1 };
+}
+
+/**
+ * Scale of a lens whose whole picture is to be seen on a canvas.
+ *
+ * @param {Lens} lens
+ * @param {number} width
+ * @param {number} height
+ */
+const fit = (lens, width, height) => Math.min(width / lens.W, height / lens.H);
+
+export class Rig {
+  /**
+   * @param {Pose} pose
+   * @param {number} extent of the scene: what speeds and limits are multiples of
+   */
+  constructor(pose, extent) {
+    this.pose = pose;
+    this.home = pose;
+    this.extent = extent;
+  }
+
+  /** @returns {Vec3} what the camera turns around */
+  get pivot() {
+    return pivotOf(this.pose);
+  }
+
+  /**
+   * What the engine wants.
+   *
+   * @param {number} width of the drawing buffer, pixels
+   * @param {number} height
+   * @returns {EngineCamera}
+   */
+  camera(width, height) {
+    const { basis, eye, lens, near, distance, viewmat } = this.pose;
+    const k = fit(lens, width, height);
+    const [right, down, forward] = basis;
+    return {
+      viewmat: viewmat ?? [
+        ...[...right, -dot(right, eye)],
+        ...[...down, -dot(down, eye)],
+        ...[...forward, -dot(forward, eye)],
+        ...[0, 0, 0, 1],
+      ],
+      fx: lens.fx * k,
+      fy: lens.fy * k,
+      cx: lens.cx * k + (width - lens.W * k) / 2,
+      cy: lens.cy * k + (height - lens.H * k) / 2,
+      near: viewmat ? near : Math.min(near, NEAR_SHARE * distance),
+    };
+  }
+
+  /**
+   * Turn around the pivot: the scene follows the hand.
+   *
+   * @param {number} right radians
+   * @param {number} down radians
+   */
+  orbit(right, down) {
+    const { pivot } = this;
+    const basis = this.#turned(right, down);
+    this.#change({ basis, eye: sub(pivot, scale(basis[2], this.pose.distance)) });
+  }
+
+  /**
+   * Turn the head.
+   *
+   * @param {number} right radians
+   * @param {number} down radians
+   */
+  look(right, down) {
+    this.#change({ basis: this.#turned(right, down) });
+  }
+
+  /**
+   * Move across the picture, so that what lies at the distance of the pivot follows the hand.
+   *
+   * @param {number} right of the hand, pixels
+   * @param {number} down of the hand, pixels
+   * @param {number} width of the canvas in the same pixels
+   * @param {number} height
+   */
+  pan(right, down, width, height) {
+    const { basis, eye, lens, distance } = this.pose;
+    const k = fit(lens, width, height);
+    const aside = scale(basis[0], (-right * distance) / (lens.fx * k));
+    const below = scale(basis[1], (-down * distance) / (lens.fy * k));
+    this.#change({ eye: add(eye, add(aside, below)) });
+  }
+
+  /**
+   * Come nearer to the pivot or go farther away; what lies under the pointer stays there.
+   *
+   * @param {number} factor of the distance, below 1 to come nearer
+   * @param {{x: number, y: number, width: number, height: number}} [at] the pointer on the canvas
+   */
+  zoom(factor, at) {
+    const { basis, eye, lens, distance } = this.pose;
+    const wanted = Math.min(Math.max(distance * factor, NEAREST * this.extent), FARTHEST * this.extent);
+    const step = distance - wanted;
+    let ray = basis[2];
+    if (at) {
+      const k = fit(lens, at.width, at.height);
+      const camera = this.camera(at.width, at.height);
+      const aside = scale(basis[0], (at.x - camera.cx) / (lens.fx * k));
+      ray = add(ray, add(aside, scale(basis[1], (at.y - camera.cy) / (lens.fy * k))));
+    }
+    this.#change({ distance: wanted, eye: add(eye, scale(ray, step)) });
+  }
+
+  /**
+   * Move through the scene; the pivot comes along.
+   *
+   * @param {Vec3} by to the right, down and forward, scene units
+   */
+  fly(by) {
+    const { basis, eye } = this.pose;
+    const moved = add(eye, add(scale(basis[0], by[0]), add(scale(basis[1], by[1]), scale(basis[2], by[2]))));
+    this.#change({ eye: moved });
+  }
+
+  /** @returns {number} scene units per second that suit where the camera is */
+  get speed() {
+    return 0.7 * Math.min(Math.max(this.pose.distance, 0.2 * this.extent), 2 * this.extent);
+  }
+
+  /**
+   * The pose that looks at another pivot from where the camera stands.
+   *
+   * @param {Vec3} point
+   * @returns {Pose}
+   */
+  towards(point) {
+    const { eye, up } = this.pose;
+    const line = sub(point, eye);
+    return { ...this.pose, basis: lookAlong(line, up), distance: length(line), viewmat: undefined };
+  }
+
+  /**
+   * The pose of the same place seen with another direction upwards: the scene turns around the pivot.
+   *
+   * @param {Vec3} up
+   * @returns {Pose}
+   */
+  turnedUp(up) {
+    const { pose, pivot } = this;
+    const axis = cross(pose.up, up);
+    const angle = Math.atan2(length(axis), dot(pose.up, up));
+    const around = length(axis) > 1e-9 ? unit(axis) : pose.basis[2]; // upside down: around the line of sight
+    const basis = turnBasis(pose.basis, around, angle);
+    return { ...pose, basis, up, eye: sub(pivot, scale(basis[2], pose.distance)), viewmat: undefined };
+  }
+
+  /**
+   * @param {number} right
+   * @param {number} down
+   * @returns {Basis}
+   */
+  #turned(right, down) {
+    const { basis, up } = this.pose;
+    const turned = turnBasis(basis, up, -right);
+    const slope = Math.acos(Math.min(1, Math.max(-1, dot(turned[2], up)))); // 0 looks straight up
+    const wanted = Math.min(Math.max(slope + down, POLE), Math.PI - POLE);
+    // A start view that rolls has its own horizon: its picture tilts around its own horizontal line.
+    return turnBasis(turned, turned[0], slope - wanted);
+  }
+
+  /** @param {Partial<Pose>} change */
+  #change(change) {
+    this.pose = { ...this.pose, viewmat: undefined, ...change };
+  }
+}
+
+/**
+ * @param {Pose} pose
+ * @returns {Vec3}
+ */
+export const pivotOf = ({ eye, basis, distance }) => add(eye, scale(basis[2], distance));
+
+/**
+ * Between two poses, for a camera that glides: around the pivot rather than straight through it.
+ *
+ * @param {Pose} from
+ * @param {Pose} to
+ * @param {number} t 0 to 1
+ * @returns {Pose}
+ */
+export function between(from, to, t) {
+  if (t >= 1) return to;
+  const basis = toBasis(slerp(toQuat(from.basis), toQuat(to.basis), t));
+  const distance = from.distance ** (1 - t) * to.distance ** t;
+  const pivot = mix(pivotOf(from), pivotOf(to), t);
+  return { ...to, basis, distance, eye: sub(pivot, scale(basis[2], distance)), viewmat: undefined };
+}

@@ -1,0 +1,181 @@
+// The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, the order.
+
+import { toCamera } from './camera_maths.mjs';
+import { BLOCK_SPLATS, layoutSlots } from './pack.mjs';
+import { UNITS } from './programs.mjs';
+import { BAND_CODEBOOK, BAND_ROWS, TILE_TEXELS } from './shader_attributes.mjs';
+import { Records } from './targets.mjs';
+import { LinearTexture, Store, formats } from './textures.mjs';
+
+/**
+ * @typedef {import('./pack.mjs').BandTexels} BandTexels
+ * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
+ * @typedef {import('./types.d.ts').View} View
+ */
+
+const TILE_WORDS = 4 * TILE_TEXELS;
+
+export class SceneTextures {
+  /**
+   * @param {WebGL2RenderingContext} gl
+   * @param {SceneLayout} layout
+   * @param {number} splatsMax
+   */
+  constructor(gl, layout, splatsMax) {
+    const { tiles } = layout;
+    const { starts, slotCount } = layoutSlots(tiles);
+    if (slotCount > splatsMax) throw new RangeError(`${slotCount} splats, this GPU has room for ${splatsMax}`);
+    const { words, word, floats } = formats(gl);
+    this.gl = gl;
+    this.layout = layout;
+    this.starts = starts;
+    this.first = new LinearTexture(gl, words, slotCount);
+    this.store = new Store(gl, words);
+    this.tiles = new LinearTexture(gl, words, TILE_TEXELS * tiles.length);
+    this.places = new LinearTexture(gl, floats, tiles.length);
+    this.blocks = new LinearTexture(gl, word, slotCount / BLOCK_SPLATS);
+    this.order = new LinearTexture(gl, word, slotCount);
+    this.records = new Records(gl, slotCount);
+    this.count = 0; // of the order
+    this.constants = new Uint32Array(TILE_WORDS * tiles.length);
+    this.constantFloats = new Float32Array(this.constants.buffer);
+    this.corners = new Float32Array(4 * tiles.length);
+    /** @type {Map<string, {at: number, rows: Rows}>} by codebook and layer */
+    this.tables = new Map();
+    /** @type {Map<string, number>} where the indices lie, by tile and codebook */
+    this.indices = new Map();
+    this.putBlocks();
+  }
+
+  get bytes() {
+    const textures = [this.first, this.store.linear, this.tiles, this.places, this.blocks];
+    return textures.reduce((sum, { bytes }) => sum + bytes, 0);
+  }
+
+  /** Which tile each block of slots belongs to. */
+  putBlocks() {
+    const { starts, layout } = this;
+    layout.tiles.forEach(({ splatCount }, tile) => {
+      const count = Math.ceil(splatCount / BLOCK_SPLATS);
+      this.blocks.write(starts[tile] / BLOCK_SPLATS, new Uint32Array(count).fill(tile));
+    });
+  }
+
+  /**
+   * @param {number} tile
+   * @param {GeometryTexels} texels
+   */
+  putGeometry(tile, { first, more, moreWords, bits, scales, sh0 }) {
+    const start = this.starts[tile];
+    this.first.write(start, first);
+    const [x, y, z] = bits.means;
+    const at = TILE_WORDS * tile;
+    this.constants.set(
+      [
+        x | (y << 5) | (z << 10) | (bits.quats << 15) | (bits.opacities << 20),
+        bits.scales | (bits.sh0 << 8),
+        more ? this.store.append(more) : 0,
+        moreWords | ((start / BLOCK_SPLATS) << 4),
+      ],
+      at,
+    );
+    this.constantFloats.set([...scales.offsets, scales.step, ...sh0.offsets, sh0.step], at + 4);
+    this.putConstants(tile);
+  }
+
+  /**
+   * @param {number} codebook
+   * @param {number} layer
+   * @param {Rows} rows
+   */
+  putTable(codebook, layer, rows) {
+    this.tables.set(`${codebook}.${layer}`, { at: this.store.append(rows.texels), rows });
+  }
+
+  /**
+   * @param {number} tile
+   * @param {number} layer
+   * @param {BandTexels} band
+   */
+  putBand(tile, layer, { rows, codebook }) {
+    const at = TILE_WORDS * tile + 4 * (1 + 2 * layer);
+    const rowsAt = rows ? this.store.append(rows.texels) : 0;
+    const rowBits = rows ? rows.bits : 1;
+    const table = codebook && this.tables.get(`${codebook.id}.${layer}`);
+    if (!codebook || !table) {
+      this.constants.set([BAND_ROWS | (rowBits << 16), 0, 0, rowsAt], at);
+      this.constantFloats.set([0, rows ? rows.offset : 0, rows ? rows.step : 0], at + 4);
+    } else {
+      const key = `${tile}.${codebook.id}`; // all bands of a codebook have the same indices
+      let indexAt = this.indices.get(key);
+      if (indexAt === undefined) this.indices.set(key, (indexAt = this.store.append(codebook.index)));
+      const bits = (codebook.indexBits << 2) | (table.rows.bits << 8) | (rowBits << 16);
+      this.constants.set([BAND_CODEBOOK | bits, indexAt, table.at, rowsAt], at);
+      this.constantFloats.set([table.rows.offset, rows ? rows.offset : 0, table.rows.step], at + 4);
+      this.constants[at + 7] = codebook.size;
+    }
+    this.putConstants(tile);
+  }
+
+  /** @param {number} tile */
+  putConstants(tile) {
+    const at = TILE_WORDS * tile;
+    this.tiles.write(TILE_TEXELS * tile, this.constants.subarray(at, at + TILE_WORDS));
+  }
+
+  /**
+   * @param {Uint32Array} order
+   * @param {number} count
+   */
+  putOrder(order, count) {
+    this.order.write(0, order.subarray(0, count));
+    this.count = count;
+  }
+
+  /**
+   * Corners of tiles in camera coordinates, from binary64: far from the origin nothing trembles.
+   *
+   * @param {View} view
+   */
+  putPlaces({ viewmat }) {
+    const { corners, layout } = this;
+    layout.tiles.forEach(({ corner, step }, tile) => {
+      corners.set(
+        toCamera(
+          viewmat,
+          corner.map((n) => n * step),
+        ),
+        4 * tile,
+      );
+      corners[4 * tile + 3] = step;
+    });
+    this.places.write(0, corners);
+  }
+
+  /** Bind everything that shaders read. */
+  bind() {
+    const { gl } = this;
+    const textures = {
+      uFirst: this.first,
+      uStore: this.store.linear,
+      uTiles: this.tiles,
+      uPlaces: this.places,
+      uBlocks: this.blocks,
+      uOrder: this.order,
+    };
+    for (const [name, { texture }] of Object.entries(textures)) {
+      gl.activeTexture(gl.TEXTURE0 + UNITS[/** @type {keyof typeof UNITS} */ (name)]);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    }
+    this.records.bind();
+  }
+
+  dispose() {
+    for (const linear of [this.first, this.store.linear, this.tiles, this.places, this.blocks, this.order]) {
+      linear.dispose();
+    }
+    this.records.dispose();
+  }
+}

@@ -1,0 +1,258 @@
+// A scene's cameras: what its file and the address say of them, which one is shown first, which way is up.
+
+import {
+  DEFAULT_AXES,
+  automaticPose,
+  cameraPose,
+  directionOf,
+  frontFor,
+  readCamera,
+  upOfCameras,
+  waysUp,
+} from './autocamera.mjs';
+import { findFrame } from './frame.mjs';
+import { defaultLens } from './rig.mjs';
+import { pick } from './survey.mjs';
+import { dot } from './vectors.mjs';
+
+/**
+ * @typedef {import('./controls.mjs').Controls} Controls
+ * @typedef {import('./rig.mjs').Pose} Pose
+ * @typedef {import('./rig.mjs').Rig} Rig
+ * @typedef {import('./types.d.ts').Bounds} Bounds
+ * @typedef {import('./types.d.ts').Description} Description
+ * @typedef {import('./types.d.ts').Header} Header
+ * @typedef {import('./vectors.mjs').Vec3} Vec3
+ * @typedef {ReturnType<typeof readCamera> & {image: string}} Camera
+ */
+
+const AXIS_NAMES = ['x', 'y', 'z'];
+
+/** @returns {Pose} of a camera before anything is known */
+export function emptyPose() {
+  return {
+    basis: [
+      [1, 0, 0],
+      [0, 1, 0],
+      [0, 0, 1],
+    ],
+    eye: [0, 0, -3],
+    distance: 3,
+    up: directionOf(DEFAULT_AXES, 'U'),
+    lens: defaultLens(),
+    near: 0.01,
+  };
+}
+
+/** What a file says of its scene. */
+const noFacts = () => {
+  return {
+    axes: '',
+    /** @type {Camera[]} */
+    cameras: [],
+    /** @type {Camera | null} of the metadata */
+    start: null,
+    title: '',
+    licence: '',
+  };
+};
+
+export class SceneView {
+  /**
+   * @param {Rig} rig
+   * @param {Controls} controls
+   * @param {string | null} axes instead of the file's
+   */
+  constructor(rig, controls, axes) {
+    this.rig = rig;
+    this.controls = controls;
+    this.wantedAxes = axes;
+    /** @type {Camera[]} of the address: for whatever scene */
+    this.wantedCameras = [];
+    this.first = 0;
+    this.facts = noFacts();
+    /** @type {Bounds | null} */
+    this.bounds = null;
+    this.shown = 0;
+    this.up = directionOf(DEFAULT_AXES, 'U');
+    /** Whether the camera still has to find its place. */
+    this.waits = true;
+  }
+
+  /** Forget the scene before. */
+  begin() {
+    this.facts = noFacts();
+    this.bounds = null;
+    this.waits = true;
+    this.controls.touched = false;
+  }
+
+  /** The cameras that one can step through. */
+  get cameras() {
+    return this.wantedCameras.length ? this.wantedCameras : this.facts.cameras;
+  }
+
+  /**
+   * Take the cameras that the address names.
+   *
+   * @param {unknown[]} entries of a camera file
+   * @param {number} first which one to show first
+   */
+  useCameras(entries, first) {
+    this.wantedCameras = entries.map(named);
+    if (first >= entries.length) throw new RangeError(`number ${first} of ${entries.length}, counted from 0`);
+    this.first = first;
+  }
+
+  /**
+   * @param {Header} header
+   * @param {Description} description
+   */
+  read({ axes }, { metadata, cameras }) {
+    this.facts = {
+      axes,
+      cameras: (cameras ?? []).flatMap(sound),
+      start: [metadata?.view].flatMap(sound)[0] ?? null,
+      title: typeof metadata?.title === 'string' ? metadata.title : '',
+      licence: typeof metadata?.licence === 'string' ? metadata.licence : '',
+    };
+    this.up = this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U');
+    this.shown = this.first;
+  }
+
+  /** Whether the file, or who took its pictures, says which way is up. */
+  get knowsUp() {
+    return this.#namedUp() !== null;
+  }
+
+  /** @returns {Vec3 | null} */
+  #namedUp() {
+    const axes = this.wantedAxes ?? this.facts.axes;
+    if (axes) return directionOf(axes, 'U');
+    const { start } = this.facts;
+    const known = [...(start ? [start] : []), ...this.cameras];
+    return known.length ? upOfCameras(known) : null;
+  }
+
+  /**
+   * Put the camera where the first picture is taken from: once roughly, once for good, never after a person moved it.
+   *
+   * @param {Bounds} bounds
+   * @param {number} splatCount
+   * @param {boolean} atOnce nothing is to be seen yet: no need to glide
+   * @returns {boolean} whether it was moved
+   */
+  place(bounds, splatCount, atOnce) {
+    if (!this.waits || (bounds.coarse && this.bounds)) return false;
+    this.bounds = bounds;
+    this.waits = bounds.coarse;
+    const pose = this.#firstPose(bounds, splatCount);
+    this.rig.home = pose;
+    if (this.controls.touched) return false;
+    this.controls.glide(pose, atOnce || pose.viewmat !== undefined);
+    return true;
+  }
+
+  /** Back to the first view. */
+  goHome() {
+    this.shown = this.first;
+    this.controls.glide(this.rig.home);
+  }
+
+  /**
+   * Show the next camera of the file.
+   *
+   * @param {number} step 1, or −1 for the one before
+   * @returns {string} its name, empty where there are no others
+   */
+  otherCamera(step) {
+    const { cameras, bounds } = this;
+    if (!bounds || !cameras.length) return '';
+    this.shown = (this.shown + step + cameras.length) % cameras.length;
+    const camera = cameras[this.shown];
+    this.controls.touched = true;
+    this.controls.glide(cameraPose(camera, bounds, findFrame(bounds, this.up), this.up));
+    return `Camera ${this.shown + 1} of ${cameras.length}${camera.image ? `: ${camera.image}` : ''}`;
+  }
+
+  /**
+   * Turn another side of the scene up, and look at it from its front.
+   *
+   * @param {Bounds} bounds
+   * @param {number} splatCount
+   * @returns {string} the axis that is up now
+   */
+  turnUpright(bounds, splatCount) {
+    const all = waysUp(this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U'));
+    this.up = all[(all.findIndex((up) => dot(up, this.up) > 0.999) + 1) % all.length];
+    const pose = this.#automatic(bounds, splatCount, this.up);
+    this.rig.home = pose;
+    this.controls.touched = true;
+    this.controls.glide(pose);
+    const k = this.up.findIndex((value) => Math.abs(value) > 0.9);
+    return k < 0 ? 'The cameras’ own direction' : `${this.up[k] < 0 ? '−' : '+'}${AXIS_NAMES[k]}`;
+  }
+
+  /**
+   * The pose that turns around what lies at a point of the canvas.
+   *
+   * @param {number} x CSS pixels
+   * @param {number} y CSS pixels
+   * @param {number} width
+   * @param {number} height
+   */
+  pivotAt(x, y, width, height) {
+    if (!this.bounds) return null;
+    const point = pick(this.bounds, this.rig.camera(width, height), x, y);
+    return point && this.rig.towards(point);
+  }
+
+  /**
+   * @param {Bounds} bounds
+   * @param {number} splatCount
+   * @returns {Pose}
+   */
+  #firstPose(bounds, splatCount) {
+    const frame = findFrame(bounds, this.up);
+    this.rig.extent = frame.extent;
+    const camera = this.wantedCameras[this.first] ?? this.facts.start ?? this.cameras[0];
+    if (camera) return cameraPose(camera, bounds, frame, this.up);
+    return this.#automatic(bounds, splatCount, this.up);
+  }
+
+  /**
+   * @param {Bounds} bounds
+   * @param {number} splatCount
+   * @param {Vec3} up
+   */
+  #automatic(bounds, splatCount, up) {
+    const axes = this.wantedAxes ?? this.facts.axes;
+    const front = frontFor(axes || DEFAULT_AXES, up);
+    const { pose, frame } = automaticPose(bounds, splatCount, { up, front, isFrontKnown: axes !== '' });
+    this.rig.extent = frame.extent;
+    return pose;
+  }
+}
+
+/**
+ * @param {unknown} entry
+ * @returns {Camera}
+ */
+function named(entry) {
+  const image = /** @type {any} */ (entry)?.image;
+  return { ...readCamera(entry), image: typeof image === 'string' ? image.slice(image.lastIndexOf('/') + 1) : '' };
+}
+
+/**
+ * A camera of a file, or none: a wrong one is not worth the scene.
+ *
+ * @param {unknown} entry
+ * @returns {Camera[]}
+ */
+function sound(entry) {
+  try {
+    return [named(entry)];
+  } catch {
+    return [];
+  }
+}

@@ -1,0 +1,84 @@
+// The size of the picture: that of the page at the screen's pixels, coarser while a slow machine is moving.
+
+/** @typedef {{setSize: (width: number, height: number) => void}} Sized */
+
+const PIXEL_RATIO = 2; // pixels of the drawing buffer per CSS pixel at most: more nobody sees in splats
+const SLOW_MS = 45; // of a frame while moving: coarser
+const FAST_MS = 20; // finer again
+const WANTED_MS = 30;
+const COARSEST = 0.4; // of the pixels per side
+const STEPS = [0.6, 1.15]; // limits of what one frame changes
+const REST_MS = 220; // without movement, until the picture is drawn at full size
+
+export class Stage {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{width: number, height: number} | null} fixed size of the drawing buffer, whatever the page's
+   * @param {() => void} resized called when the drawing buffer has another size
+   */
+  constructor(canvas, fixed, resized) {
+    this.canvas = canvas;
+    this.fixed = fixed;
+    this.resized = resized;
+    /** @type {Sized | null} */
+    this.engine = null;
+    this.width = 1;
+    this.height = 1;
+    this.moving = false;
+    this.quality = 1; // while moving
+    this.rest = 0;
+    if (fixed) {
+      document.documentElement.classList.add('fixed');
+      canvas.style.width = `${fixed.width}px`;
+      canvas.style.height = `${fixed.height}px`;
+    } else new ResizeObserver(() => this.fit()).observe(canvas);
+  }
+
+  /** @param {Sized} engine */
+  attach(engine) {
+    this.engine = engine;
+    this.width = 0;
+    this.fit();
+  }
+
+  /** Give the drawing buffer the size that it is to have now. */
+  fit() {
+    const { canvas, fixed } = this;
+    const ratio = Math.min(devicePixelRatio || 1, PIXEL_RATIO) * (this.moving ? this.quality : 1);
+    const width = fixed?.width ?? Math.max(1, Math.round(canvas.clientWidth * ratio));
+    const height = fixed?.height ?? Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (width === this.width && height === this.height) return;
+    this.width = width;
+    this.height = height;
+    this.engine?.setSize(width, height);
+    this.resized();
+  }
+
+  /** The camera moves. */
+  moved() {
+    if (this.fixed) return;
+    if (!this.moving) {
+      this.moving = true;
+      this.fit();
+    }
+    clearTimeout(this.rest);
+    this.rest = window.setTimeout(() => {
+      this.moving = false;
+      this.fit();
+    }, REST_MS);
+  }
+
+  /**
+   * A frame has been drawn.
+   *
+   * @param {number} frameMs what it took
+   */
+  drawn(frameMs) {
+    if (!this.moving || (frameMs >= FAST_MS && frameMs <= SLOW_MS)) return;
+    const step = Math.min(STEPS[1], Math.max(STEPS[0], Math.sqrt(WANTED_MS / Math.max(1, frameMs))));
+    const quality = Math.min(1, Math.max(COARSEST, this.quality * step));
+    if (quality === this.quality) return;
+    this.quality = quality;
+    this.fit();
+  }
+}

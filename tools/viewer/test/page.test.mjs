@@ -1,0 +1,67 @@
+// What the address asks for, and what errors say.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import * as spec from '../../../codec/js/spec.mjs';
+import { explain } from '../messages.mjs';
+import { fetchCameras, readWishes } from '../page.mjs';
+
+test('an empty address wishes nothing', () => {
+  const { wishes, complaints } = readWishes(new URLSearchParams());
+  assert.deepEqual(complaints, []);
+  assert.deepEqual(wishes, {
+    scene: null,
+    camera: null,
+    view: 0,
+    axes: null,
+    size: null,
+    background: [0, 0, 0],
+    ui: true,
+  });
+});
+
+test('every parameter is read', () => {
+  const { wishes, complaints } = readWishes(
+    new URLSearchParams('scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=ff8000&ui=0'),
+  );
+  assert.deepEqual(complaints, []);
+  assert.deepEqual(wishes.size, { width: 512, height: 384 });
+  assert.deepEqual(wishes.background, [1, 128 / 255, 0]);
+  const { scene, camera, view, axes, ui } = wishes;
+  assert.deepEqual([scene, camera, view, axes, ui], ['/a.csplat', '[]', 3, 'RUB', false]);
+});
+
+for (const query of ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x']) {
+  test(`${query} is complained about, and left out`, () => {
+    const { wishes, complaints } = readWishes(new URLSearchParams(query));
+    assert.equal(complaints.length, 1);
+    assert.deepEqual(wishes, readWishes(new URLSearchParams()).wishes);
+  });
+}
+
+test('cameras may stand in the address', async () => {
+  assert.deepEqual(await fetchCameras(' [{"W": 1}, {"W": 2}]'), [{ W: 1 }, { W: 2 }]);
+  assert.deepEqual(await fetchCameras('{"W": 1}'), [{ W: 1 }]);
+  await assert.rejects(fetchCameras('[1'), SyntaxError);
+});
+
+test('every code of the format has words of its own', () => {
+  const codes = Object.entries(spec)
+    .filter(([name]) => /^ERROR_[A-Z]+$/.test(name))
+    .map(([, code]) => code)
+    .filter((code) => typeof code === 'string' && code.startsWith('E_'));
+  assert.ok(codes.length > 15);
+  for (const code of codes) assert.notEqual(explain({ code, message: '' }).title, 'Something went wrong.', code);
+});
+
+test('an error names its code, byte and clause once', () => {
+  const message = 'E_CRC at byte 12345 (CHK-1): the chunk has another CRC';
+  const { title, facts } = explain({ code: 'E_CRC', message, offset: 12345, clause: 'CHK-1' });
+  assert.equal(facts, 'E_CRC at byte 12,345 (CHK-1): the chunk has another CRC');
+  assert.match(title, /damaged/);
+});
+
+test('a PLY is recognised by its name', () => {
+  assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.PLY').title, /PLY/);
+  assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.zip').title, /not a \.csplat/);
+});

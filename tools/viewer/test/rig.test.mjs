@@ -1,0 +1,190 @@
+// The camera that a person moves: where the pivot lies in the picture before and after each movement.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { Rig, between, defaultLens, pivotOf } from '../rig.mjs';
+import { cross, dot, length, lookAlong, slerp, sub, toBasis, toQuat, turnBasis } from '../vectors.mjs';
+
+const WIDTH = 800;
+const HEIGHT = 600;
+
+/** A camera three units before the origin, looking along +z, y down; what it turns around is the origin. */
+function rig(changes = {}) {
+  const pose = {
+    basis: lookAlong([0, 0, 1], [0, -1, 0]),
+    eye: [0, 0, -3],
+    distance: 3,
+    up: [0, -1, 0],
+    lens: defaultLens(),
+    near: 0.2,
+    ...changes,
+  };
+  return new Rig(pose, 1);
+}
+
+/** Where a point falls on the picture, in pixels, and its depth. */
+function project(some, [x, y, z], width = WIDTH, height = HEIGHT) {
+  const { viewmat: m, fx, fy, cx, cy } = some.camera(width, height);
+  const [a, b, c] = [0, 4, 8].map((row) => m[row] * x + m[row + 1] * y + m[row + 2] * z + m[row + 3]);
+  return { x: (fx * a) / c + cx, y: (fy * b) / c + cy, z: c };
+}
+
+function close(actual, expected, tolerance = 1e-9) {
+  const differs = [...actual].some((value, i) => Math.abs(value - expected[i]) > tolerance);
+  assert.ok(!differs, `${[...actual]} instead of ${[...expected]}`);
+}
+
+function proper([right, down, forward]) {
+  for (const axis of [right, down, forward]) close([length(axis)], [1]);
+  close(cross(right, down), forward);
+}
+
+test('a camera that looks along +z with -y up has the axes of the world', () => {
+  close(rig().camera(WIDTH, HEIGHT).viewmat, [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1]);
+});
+
+test('looking straight up gives a basis too', () => {
+  proper(lookAlong([0, -1, 0], [0, -1, 0]));
+});
+
+test('orbiting keeps the pivot in the middle at its distance', () => {
+  const some = rig();
+  some.orbit(0.7, -0.4);
+  const { x, y, z } = project(some, [0, 0, 0]);
+  close([x, y, z], [WIDTH / 2, HEIGHT / 2, 3]);
+  proper(some.pose.basis);
+});
+
+test('what faces the camera follows the hand', () => {
+  const right = rig();
+  right.orbit(0.3, 0);
+  assert.ok(project(right, [0, 0, -0.5]).x > WIDTH / 2);
+  const down = rig();
+  down.orbit(0, 0.3);
+  assert.ok(project(down, [0, 0, -0.5]).y > HEIGHT / 2);
+  assert.ok(down.pose.eye[1] < 0, 'the camera rises');
+});
+
+test('orbiting stops before the poles and can come back', () => {
+  const some = rig();
+  for (let i = 0; i < 100; i++) some.orbit(0, 0.3);
+  assert.ok(dot(some.pose.basis[2], some.pose.up) > -1);
+  proper(some.pose.basis);
+  some.orbit(0, -Math.PI / 2);
+  assert.ok(Math.abs(dot(some.pose.basis[2], some.pose.up)) < 0.05);
+});
+
+test('a full turn comes back to where it began', () => {
+  const some = rig();
+  for (let i = 0; i < 360; i++) some.orbit((2 * Math.PI) / 360, 0);
+  close(some.pose.eye, [0, 0, -3]);
+});
+
+test('panning moves what lies at the pivot as far as the hand', () => {
+  const some = rig();
+  some.pan(40, -25, WIDTH, HEIGHT);
+  const { x, y } = project(some, [0, 0, 0]);
+  close([x, y], [WIDTH / 2 + 40, HEIGHT / 2 - 25]);
+});
+
+test('zooming leaves what is under the pointer where it is', () => {
+  const some = rig();
+  const point = [0.4, -0.3, 0]; // at the distance of the pivot
+  const before = project(some, point);
+  some.zoom(0.5, { x: before.x, y: before.y, width: WIDTH, height: HEIGHT });
+  const after = project(some, point);
+  close([after.x, after.y, after.z], [before.x, before.y, 1.5]);
+});
+
+test('zooming ends at limits that follow from the extent', () => {
+  const some = rig();
+  for (let i = 0; i < 200; i++) some.zoom(0.5);
+  assert.ok(some.pose.distance > 0);
+  assert.ok(some.camera(WIDTH, HEIGHT).near < some.pose.distance);
+  for (let i = 0; i < 200; i++) some.zoom(2);
+  assert.equal(some.pose.distance, 60);
+});
+
+test('flying takes the pivot along', () => {
+  const some = rig();
+  some.fly([1, 0.5, 2]);
+  close(some.pose.eye, [1, 0.5, -1]);
+  close(some.pivot, [1, 0.5, 2]);
+});
+
+test('looking around stays where it is', () => {
+  const some = rig();
+  some.look(0.2, 0.1);
+  close(some.pose.eye, [0, 0, -3]);
+  assert.ok(some.pose.basis[2][0] > 0 && some.pose.basis[2][1] > 0);
+});
+
+test('turning towards a point puts it into the middle', () => {
+  const some = rig();
+  some.pose = some.towards([0.5, 0.2, 1]);
+  const { x, y, z } = project(some, [0.5, 0.2, 1]);
+  close([x, y, z], [WIDTH / 2, HEIGHT / 2, some.pose.distance]);
+});
+
+test('a lens of a file is fitted into the canvas', () => {
+  const lens = { fx: 500, fy: 510, cx: 310, cy: 245, W: 640, H: 480 };
+  const { fx, fy, cx, cy } = rig({ lens }).camera(640, 480);
+  close([fx, fy, cx, cy], [500, 510, 310, 245]);
+  const wide = rig({ lens }).camera(2000, 960);
+  close([wide.fx, wide.fy, wide.cx, wide.cy], [1000, 1020, 620 + 360, 490]);
+  const tall = rig({ lens }).camera(320, 700);
+  close([tall.fx, tall.fy, tall.cx, tall.cy], [250, 255, 155, 122.5 + 230]);
+});
+
+test('the matrix of a file is used as it is until the camera moves', () => {
+  const viewmat = [1, 0, 0, 1e-17, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1];
+  const some = rig({ viewmat });
+  assert.equal(some.camera(WIDTH, HEIGHT).viewmat, viewmat);
+  some.orbit(0, 0);
+  assert.notEqual(some.camera(WIDTH, HEIGHT).viewmat, viewmat);
+});
+
+test('the near plane keeps away from the pivot', () => {
+  assert.equal(rig().camera(WIDTH, HEIGHT).near, 0.2);
+  assert.equal(rig({ distance: 0.5 }).camera(WIDTH, HEIGHT).near, 0.05);
+});
+
+for (const up of [[0, 1, 0], [0, 0, 1], [1, 0, 0]]) {
+  test(`turning ${up} up keeps the pivot in the middle`, () => {
+    const some = rig();
+    some.orbit(0.3, 0.2);
+    some.pose = some.turnedUp(up);
+    proper(some.pose.basis);
+    const { x, y, z } = project(some, [0, 0, 0]);
+    close([x, y, z], [WIDTH / 2, HEIGHT / 2, 3]);
+    assert.ok(dot(some.pose.basis[1], up) < 0, 'up is not down');
+  });
+}
+
+test('a camera glides around the pivot', () => {
+  const from = rig().pose;
+  const other = rig();
+  other.orbit(Math.PI / 2, 0);
+  const half = between(from, other.pose, 0.5);
+  close([length(half.eye)], [3]);
+  close(pivotOf(half), [0, 0, 0]);
+  assert.equal(between(from, other.pose, 1), other.pose);
+});
+
+test('rotations survive the way through quaternions', () => {
+  let basis = lookAlong([0, 0, 1], [0, -1, 0]);
+  for (let i = 0; i < 50; i++) {
+    basis = turnBasis(basis, [0.6, 0, 0.8], 0.9);
+    basis = turnBasis(basis, [0, 1, 0], 0.4);
+    const again = toBasis(toQuat(basis));
+    for (let row = 0; row < 3; row++) close(again[row], basis[row]);
+    close(slerp(toQuat(basis), toQuat(basis), 0.3), toQuat(basis));
+  }
+});
+
+test('the shorter way round is taken', () => {
+  const quat = toQuat(turnBasis(lookAlong([0, 0, 1], [0, -1, 0]), [0, 1, 0], 0.5));
+  const half = slerp(quat, quat.map((value) => -value), 0.5);
+  close([Math.abs(half.reduce((sum, value, i) => sum + value * quat[i], 0))], [1]);
+  close(sub([1, 2, 3], [1, 2, 3]), [0, 0, 0]);
+});

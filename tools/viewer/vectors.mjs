@@ -1,0 +1,137 @@
+// Vectors of three numbers and rotations, as far as the cameras of the page need them. Nothing is changed in place.
+
+/**
+ * @typedef {[number, number, number]} Vec3
+ * @typedef {[Vec3, Vec3, Vec3]} Basis rows: right, down and forward of a camera, in world coordinates
+ * @typedef {[number, number, number, number]} Quat w x y z
+ */
+
+/** @type {(a: Vec3, b: Vec3) => Vec3} */
+export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+
+/** @type {(a: Vec3, b: Vec3) => Vec3} */
+export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+
+/** @type {(a: Vec3, k: number) => Vec3} */
+export const scale = (a, k) => [a[0] * k, a[1] * k, a[2] * k];
+
+/** @type {(a: Vec3, b: Vec3) => number} */
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+/** @type {(a: Vec3, b: Vec3) => Vec3} */
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+/** @type {(a: Vec3) => number} */
+export const length = (a) => Math.hypot(a[0], a[1], a[2]);
+
+/** @type {(a: Vec3) => Vec3} */
+export const unit = (a) => scale(a, 1 / (length(a) || 1));
+
+/** @type {(a: Vec3, b: Vec3, t: number) => Vec3} */
+export const mix = (a, b, t) => add(scale(a, 1 - t), scale(b, t));
+
+/**
+ * Turn a vector around an axis of unit length (Rodrigues).
+ *
+ * @param {Vec3} v
+ * @param {Vec3} axis
+ * @param {number} angle radians, right-handed
+ * @returns {Vec3}
+ */
+export function turn(v, axis, angle) {
+  const c = Math.cos(angle);
+  const s = Math.sin(angle);
+  return add(add(scale(v, c), scale(cross(axis, v), s)), scale(axis, dot(axis, v) * (1 - c)));
+}
+
+/**
+ * Turn a whole basis, and take out what rounding has bent.
+ *
+ * @param {Basis} basis
+ * @param {Vec3} axis
+ * @param {number} angle
+ * @returns {Basis}
+ */
+export function turnBasis([right, , forward], axis, angle) {
+  const ahead = unit(turn(forward, axis, angle));
+  const down = unit(cross(ahead, turn(right, axis, angle)));
+  return [cross(down, ahead), down, ahead];
+}
+
+/**
+ * The basis of a camera that looks along a direction with `up` upwards in its picture.
+ *
+ * @param {Vec3} direction
+ * @param {Vec3} up where it is parallel to the direction, any other will do
+ * @returns {Basis}
+ */
+export function lookAlong(direction, up) {
+  const forward = unit(direction);
+  let right = cross(forward, up);
+  if (length(right) < 1e-6 * length(up)) right = cross(forward, across(forward));
+  right = unit(right);
+  return [right, cross(forward, right), forward];
+}
+
+/**
+ * The axis of the world that lies most across a direction.
+ *
+ * @param {Vec3} direction
+ * @returns {Vec3}
+ */
+export function across(direction) {
+  const sizes = direction.map(Math.abs);
+  const smallest = sizes.indexOf(Math.min(...sizes));
+  return [Number(smallest === 0), Number(smallest === 1), Number(smallest === 2)];
+}
+
+/**
+ * @param {Basis} basis
+ * @returns {Quat} of unit length
+ */
+export function toQuat([[a, b, c], [d, e, f], [g, h, i]]) {
+  const w = Math.max(0, 1 + a + e + i);
+  const x = Math.max(0, 1 + a - e - i);
+  const y = Math.max(0, 1 - a + e - i);
+  const z = Math.max(0, 1 - a - e + i);
+  const most = Math.max(w, x, y, z);
+  /** @type {Quat} */
+  let q = [w, h - f, c - g, d - b];
+  if (most === x) q = [h - f, x, b + d, c + g];
+  else if (most === y) q = [c - g, b + d, y, f + h];
+  else if (most === z) q = [d - b, c + g, f + h, z];
+  const size = Math.hypot(...q);
+  return [q[0] / size, q[1] / size, q[2] / size, q[3] / size];
+}
+
+/**
+ * @param {Quat} quat of unit length
+ * @returns {Basis}
+ */
+export function toBasis([w, x, y, z]) {
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+}
+
+/**
+ * The rotation at `t` of the way from one to another, the shorter way round.
+ *
+ * @param {Quat} from
+ * @param {Quat} to
+ * @param {number} t 0 to 1
+ * @returns {Quat}
+ */
+export function slerp(from, to, t) {
+  let cosine = from[0] * to[0] + from[1] * to[1] + from[2] * to[2] + from[3] * to[3];
+  const sign = cosine < 0 ? -1 : 1;
+  cosine = Math.min(1, cosine * sign);
+  const angle = Math.acos(cosine);
+  const [p, q] = angle < 1e-4 ? [1 - t, t] : [Math.sin((1 - t) * angle), Math.sin(t * angle)];
+  /** @type {(k: 0 | 1 | 2 | 3) => number} */
+  const at = (k) => p * from[k] + q * sign * to[k];
+  const size = Math.hypot(at(0), at(1), at(2), at(3));
+  return [at(0) / size, at(1) / size, at(2) / size, at(3) / size];
+}

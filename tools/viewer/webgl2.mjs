@@ -1,0 +1,177 @@
+// The WebGL 2 back end: see renderer.mjs for what its methods do.
+
+import { slopeLimits } from './camera_maths.mjs';
+import { Programs } from './programs.mjs';
+import { SceneTextures } from './scene_textures.mjs';
+import { RECORD_COLUMNS, ROW_TEXELS } from './shader_attributes.mjs';
+import { Picture, Quads, pictureFormat } from './targets.mjs';
+
+/**
+ * @typedef {import('./pack.mjs').BandTexels} BandTexels
+ * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./renderer.mjs').Capabilities} Capabilities
+ * @typedef {import('./renderer.mjs').Renderer} Renderer
+ * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
+ * @typedef {import('./types.d.ts').PictureFormat} PictureFormat
+ * @typedef {import('./types.d.ts').View} View
+ */
+
+/** Names of drivers that draw on the CPU. */
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+
+/** @implements {Renderer} */
+export class WebGl2Renderer {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {PictureFormat} [format] of the picture, if it can be
+   */
+  static create(canvas, format) {
+    const gl = canvas.getContext('webgl2', {
+      alpha: false,
+      antialias: false,
+      depth: false,
+      stencil: false,
+      powerPreference: 'high-performance',
+    });
+    return gl && new WebGl2Renderer(gl, format);
+  }
+
+  /**
+   * @param {WebGL2RenderingContext} gl
+   * @param {PictureFormat} [format]
+   */
+  constructor(gl, format) {
+    const name = deviceName(gl);
+    this.gl = gl;
+    this.programs = new Programs(gl);
+    this.picture = new Picture(gl, pictureFormat(gl, SOFTWARE.test(name), format));
+    this.quads = new Quads(gl);
+    /** @type {Capabilities} */
+    this.capabilities = {
+      name,
+      pictureFormat: this.picture.format,
+      splatsMax: gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW_TEXELS,
+    };
+    /** @type {SceneTextures | null} */
+    this.scene = null;
+  }
+
+  get bytes() {
+    const work = this.picture.bytes + this.quads.bytes;
+    if (this.scene === null) return { attributes: 0, order: 0, work };
+    return { attributes: this.scene.bytes, order: this.scene.order.bytes, work: work + this.scene.records.bytes };
+  }
+
+  /** @param {SceneLayout} layout */
+  allocate(layout) {
+    this.scene?.dispose();
+    this.scene = null;
+    this.scene = new SceneTextures(this.gl, layout, this.capabilities.splatsMax);
+  }
+
+  /**
+   * @param {number} tile
+   * @param {GeometryTexels} texels
+   */
+  uploadGeometry(tile, texels) {
+    this.scene?.putGeometry(tile, texels);
+  }
+
+  /**
+   * @param {number} codebook
+   * @param {number} layer
+   * @param {Rows} rows
+   */
+  uploadTable(codebook, layer, rows) {
+    this.scene?.putTable(codebook, layer, rows);
+  }
+
+  /**
+   * @param {number} tile
+   * @param {number} layer
+   * @param {BandTexels} band
+   */
+  uploadBand(tile, layer, band) {
+    this.scene?.putBand(tile, layer, band);
+  }
+
+  complete() {
+    this.scene?.store.trim();
+  }
+
+  /**
+   * @param {Uint32Array} order
+   * @param {number} count
+   */
+  setOrder(order, count) {
+    this.scene?.putOrder(order, count);
+  }
+
+  /**
+   * @param {View} view
+   * @param {{background: number[], shDegree: number}} look
+   */
+  draw(view, { background, shDegree }) {
+    const { gl, scene, programs, picture } = this;
+    if (gl.isContextLost() || !(view.width > 0 && view.height > 0)) return;
+    picture.resize(view.width, view.height);
+    picture.clear();
+    if (scene !== null && scene.count > 0) {
+      scene.putPlaces(view);
+      scene.bind();
+      programs.setView(view, slopeLimits(view), scene.layout, Math.min(shDegree, scene.layout.shDegree));
+      for (let begin = 0; begin < scene.count; begin += scene.records.capacity) {
+        const end = Math.min(scene.count, begin + scene.records.capacity);
+        const rows = Math.ceil((end - begin) / RECORD_COLUMNS);
+        programs.useProject(begin, end);
+        scene.records.target(rows);
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+        programs.useSplat();
+        picture.target();
+        this.quads.draw(rows);
+      }
+    }
+    programs.useResolve(background);
+    picture.show();
+  }
+
+  readPixels() {
+    return this.picture.read();
+  }
+
+  finished() {
+    const { gl } = this;
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return new Promise((/** @type {(value: void) => void} */ resolve) => {
+      const poll = () => {
+        const isDone = sync === null || gl.isContextLost() || gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.SIGNALED;
+        if (!isDone) return void setTimeout(poll, 0);
+        gl.deleteSync(sync);
+        resolve();
+      };
+      poll();
+    });
+  }
+
+  wait() {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // gl.finish does not wait in browsers
+  }
+
+  dispose() {
+    this.scene?.dispose();
+    this.scene = null;
+    this.picture.dispose();
+    this.quads.dispose();
+    this.programs.dispose();
+  }
+}
+
+/** @param {WebGL2RenderingContext} gl */
+function deviceName(gl) {
+  const extension = gl.getExtension('WEBGL_debug_renderer_info');
+  return String(gl.getParameter(extension ? extension.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+}
