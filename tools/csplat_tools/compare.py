@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera, metrics, render
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.extras import need_renderer
+from csplat_tools.photographs import relative_to
 
 __all__ = ["Comparison", "SourceView", "ViewQuality", "compare_models", "comparison_cameras", "render_source"]
 
@@ -31,6 +32,7 @@ Distance = Callable[[F32, F32], float]
 OnView = Callable[[int, F32, F32], None]
 
 BLACK: Colour = (0.0, 0.0, 0.0)
+WHITE: Colour = (1.0, 1.0, 1.0)
 
 _VIEWS = 8
 _SIZE = (640, 480)
@@ -195,7 +197,7 @@ def compare_models(
     for number, view in enumerate(views):
         if progress is not None:
             progress("comparing", number / count)
-        result = render(other, _moved(view.camera, shift), background=background, mode=mode)
+        result = render(other, relative_to(shift, view.camera), background=background, mode=mode)
         picture = _clipped(result.rgb)
         measured.append(_measure(view, picture, ssim=ssim, lpips=lpips))
         ignored = (max(ignored[0], view.ignored_count), max(ignored[1], result.ignored))
@@ -249,12 +251,3 @@ def _mean(values: list[float | None]) -> float | None:
 
 def _clipped(picture: F32) -> F32:
     return np.clip(picture, 0.0, 1.0)
-
-
-def _moved(camera: Camera, shift: NDArray[np.float64]) -> Camera:
-    """The same camera for a scene whose origin lies elsewhere."""
-    if not shift.any():
-        return camera
-    viewmat = camera.viewmat.copy()
-    viewmat[:3, 3] += viewmat[:3, :3] @ shift
-    return replace(camera, viewmat=viewmat)

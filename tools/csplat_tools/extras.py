@@ -8,7 +8,7 @@ from importlib import import_module
 from csplat.errors import InputError
 from csplat_tools.console import note
 
-__all__ = ["need_pictures", "need_renderer", "need_trainer", "prepare_renderer"]
+__all__ = ["need_photographs", "need_pictures", "need_renderer", "need_trainer", "prepare_renderer"]
 
 
 def need_renderer() -> None:
@@ -54,6 +54,16 @@ def need_pictures() -> None:
         InputError: pillow is not installed.
     """
     _need("PIL", "pillow")
+
+
+def need_photographs() -> None:
+    """Import what reading data sets needs.
+
+    Raises:
+        InputError: a package is not installed.
+    """
+    for module, package in (("numba", None), ("scipy", None), ("PIL", "pillow")):
+        _need(module, package)
 
 
 def _need(module: str, package: str | None = None, extra: str = "render") -> None:

@@ -8,8 +8,9 @@ import re
 import typer
 
 from csplat_render.conventions import MODES
+from csplat_tools.photographs import SPLITS
 
-__all__ = ["parse_colour", "parse_mode", "parse_size"]
+__all__ = ["parse_colour", "parse_mode", "parse_size", "parse_split"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -52,4 +53,15 @@ def parse_mode(text: str) -> str:
     """
     if text not in MODES:
         raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
+    return text
+
+
+def parse_split(text: str) -> str:
+    """A part of a data set.
+
+    Raises:
+        typer.BadParameter: there is no such part.
+    """
+    if text not in SPLITS:
+        raise typer.BadParameter(f"the split is {text!r}, wanted one of {', '.join(SPLITS)}")
     return text

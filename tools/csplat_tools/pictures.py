@@ -72,18 +72,20 @@ def to_bytes(values: F32) -> U8:
     return result
 
 
-def panels(a: F32, b: F32, amplification: float) -> U8:
+def panels(a: F32, b: F32, amplification: float, photograph: F32 | None = None) -> U8:
     """Lay side by side one picture, another, and the amplified magnitude of their difference.
 
     Args:
         a, b: [H, W, 3], 0..1.
         amplification: what the difference is multiplied with.
+        photograph: [H, W, 3], before the others, if there is one.
 
     Returns:
-        [H, 3 W, 3].
+        [H, 3 W, 3], or [H, 4 W, 3] with a photograph.
     """
     difference = np.abs(b.astype(np.float32) - a) * np.float32(amplification)
-    return np.concatenate([to_bytes(a), to_bytes(b), to_bytes(difference)], axis=1)
+    shown = [a, b, difference] if photograph is None else [photograph, a, b, difference]
+    return np.concatenate([to_bytes(one) for one in shown], axis=1)
 
 
 def write_png(path: Path, pixels: NDArray[Any]) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a scene in a folder: what `csplat render` does, apart from the command line."""
+"""Pictures of a scene in a folder, or as a film: what `csplat render` does, apart from the command line."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from csplat_render import Camera, render
 from csplat_render.cameras import load_cameras
 from csplat_render.virtual import orbit_cameras
 from csplat_tools.extras import need_pictures, need_renderer
-from csplat_tools.inout import write_array
+from csplat_tools.film import check_film, write_film
+from csplat_tools.inout import check_output, write_array
+from csplat_tools.photographs import DataViews, relative_to
 from csplat_tools.pictures import check_folder, picture_names, to_bytes, write_png
 
-__all__ = ["Rendered", "find_cameras", "render_folder", "resized"]
+__all__ = ["Rendered", "find_cameras", "render_film", "render_folder", "resized"]
 
 F32 = NDArray[np.float32]
 
@@ -39,24 +41,32 @@ class Rendered:
 
 
 def find_cameras(
-    model: SplatModel, path: str | None, orbit_count: int | None, size: tuple[int, int] | None
+    model: SplatModel,
+    path: str | None = None,
+    orbit_count: int | None = None,
+    data: DataViews | None = None,
+    size: tuple[int, int] | None = None,
 ) -> list[Camera]:
-    """Get the cameras that a command line names: a file's, or those of an orbit.
+    """Get the cameras that a command line names: a file's, those of an orbit, or a data set's.
 
     Args:
-        model: the scene to orbit around.
+        model: the scene to orbit around; a data set's cameras are brought to its origin.
         path: of a camera file.
         orbit_count: how many cameras on a circle.
+        data: views of a data set, whose size counts, not `size`.
         size: width and height of the pictures; the file's own, or 640 by 480, if left out.
 
     Raises:
-        InputError: not exactly one of the two is given; the file is none; a picture of that size would be distorted.
+        InputError: not exactly one of the three is given; the file or the set is none; a picture of that size would be
+            distorted.
     """
-    if (path is None) == (orbit_count is None):
-        raise InputError("wanted the cameras: a file of them, or a number for an orbit")
+    if (path is None) + (orbit_count is None) + (data is None) != 2:
+        raise InputError("wanted the cameras: a file of them, a number for an orbit, or a data set")
     if path is not None:
         cameras = load_cameras(path)
         return cameras if size is None else [resized(camera, *size) for camera in cameras]
+    if data is not None:
+        return [relative_to(model.origin, picture.camera) for picture in data.read()]
     assert orbit_count is not None
     return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE))
 
@@ -85,6 +95,7 @@ def render_folder(
     depth: bool = False,
     alpha: bool = False,
     force: bool = False,
+    prepare: Callable[[], object] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Rendered:
     """Render a scene and write NAME.png for each camera.
@@ -99,6 +110,7 @@ def render_folder(
             average, scene units; 0 where nothing is.
         alpha: write NAME.alpha.png too, 255 where nothing of the background shows.
         force: existing files may be replaced.
+        prepare: is called when the folder is found to be fit, before the first picture.
         progress: is told how much is done.
 
     Raises:
@@ -110,6 +122,8 @@ def render_folder(
     names = picture_names([camera.image for camera in cameras])
     endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
     target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
+    if prepare is not None:
+        prepare()
     files, ignored = [], 0
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         if progress is not None:
@@ -127,6 +141,51 @@ def render_folder(
     if progress is not None:
         progress("rendering", 1.0)
     return Rendered(tuple(files), ignored)
+
+
+def render_film(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    path: str,
+    *,
+    fps: float,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    mode: str = "standard",
+    force: bool = False,
+    prepare: Callable[[], object] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Rendered:
+    """Render a scene into one animated file.
+
+    Args:
+        model: the scene.
+        cameras: where to stand, at least one, with pictures of one size.
+        path: of the file; its ending tells the format, see `film`.
+        fps: pictures per second.
+        background, mode, prepare, progress: see `render_folder`.
+        force: an existing file may be replaced.
+
+    Raises:
+        InputError: the file exists, or cannot hold these pictures; or the renderer is not installed.
+        OSError: it cannot be written.
+    """
+    need_renderer()
+    need_pictures()
+    check_output(path, force=force)
+    check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
+    if prepare is not None:
+        prepare()
+    frames, ignored = [], 0
+    for number, camera in enumerate(cameras):
+        if progress is not None:
+            progress("rendering", number / len(cameras))
+        result = render(model, camera, background=background, mode=mode)
+        ignored = max(ignored, result.ignored)
+        frames.append(to_bytes(result.rgb))
+    if progress is not None:
+        progress("rendering", 1.0)
+    write_film(path, frames, fps)
+    return Rendered((Path(path),), ignored)
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
+from csplat.errors import InputError
 from csplat_tools.console import note
 from csplat_tools.extras import need_trainer
 from csplat_tools.inout import write_model
@@ -71,6 +72,7 @@ def run_training(
     from csplat_trainer.outputs import Outputs
     from csplat_trainer.report import plot_loss, write_log
 
+    _check_inputs(options, files)
     data = load(source, reading.size, images=reading.images, test_every=reading.test_every, near=reading.near)
     if not quiet:
         for line in data.report:
@@ -95,6 +97,26 @@ def run_training(
         plot_loss(files.plot, result.log["losses"], Path(source).name)
     if not quiet:
         note(_summary(result.log, result.metrics))
+
+
+def _check_inputs(options: TrainOptions, files: Files) -> None:
+    """Read what is small, or fail: before the data set is read and kernels are compiled, which takes its time.
+
+    Raises:
+        InputError: weights, checkpoint or torch are absent or damaged, or what early pictures go to is no folder.
+    """
+    from csplat_render.lpips import load_lpips
+    from csplat_trainer.checkpoint import load_checkpoint
+    from csplat_trainer.perceptual import PerceptualLoss
+
+    if options.lpips_weight > 0.0:
+        PerceptualLoss(load_lpips(files.lpips_weights))
+    elif files.lpips_weights is not None:
+        load_lpips(files.lpips_weights)
+    if files.resume is not None:
+        load_checkpoint(files.resume)
+    if files.previews is not None and Path(files.previews).exists() and not Path(files.previews).is_dir():
+        raise InputError(f"{files.previews} is not a folder")
 
 
 def _wait_frugally() -> None:

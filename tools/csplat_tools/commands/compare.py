@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,7 +13,8 @@ from csplat_tools.compare import Comparison
 from csplat_tools.compare_files import FileComparison, compare_files
 from csplat_tools.console import format_table, guarded, note, progress_bar, say, say_json
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.parsing import parse_colour, parse_mode
+from csplat_tools.parsing import parse_colour, parse_mode, parse_size, parse_split
+from csplat_tools.photographs import SPLITS, DataViews
 
 __all__ = ["compare"]
 
@@ -23,12 +25,30 @@ _PAIRING = {
 }
 
 
+_DATA = "Views of a data set"
+
+
 @guarded
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
     cameras: Annotated[
         str | None, typer.Option(metavar="FILE.json", help="Cameras, instead of eight virtual ones around A.")
+    ] = None,
+    data: Annotated[
+        str | None, typer.Option(metavar="DATA", help="Or where a data set's pictures were taken; they judge A and B.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option(metavar="|".join(SPLITS), rich_help_panel=_DATA, help="Which of its pictures.")
+    ] = "test",
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", rich_help_panel=_DATA, help="Scale its pictures to this size.")
+    ] = None,
+    test_every: Annotated[
+        int, typer.Option(metavar="N", rich_help_panel=_DATA, help="Every Nth picture was held out; see `train`.")
+    ] = 8,
+    images: Annotated[
+        str | None, typer.Option(metavar="NAME", rich_help_panel=_DATA, help="COLMAP: folder of pictures, images_4.")
     ] = None,
     source_index: Annotated[
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
@@ -42,8 +62,9 @@ def compare(
         typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`."),
     ] = None,
     background: Annotated[
-        str, typer.Option(metavar="R,G,B", help="Colour behind the scene; white flatters every measure.")
-    ] = "black",
+        str | None,
+        typer.Option(metavar="R,G,B", help="Behind the scene: black, but white behind pictures with alpha."),
+    ] = None,
     mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
     force: Annotated[bool, typer.Option("--force", help="Replace existing pictures.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Everything, for programs.")] = False,
@@ -54,20 +75,29 @@ def compare(
     `psnr` is that of the squared error pooled over eight 640x480 views
     around A in front of black, over all pixels and channels, 99 at most. The
     same error scores 10 dB more from four times as far away: compare only
-    numbers from the same cameras. Needs the packages of the render extra.
+    numbers from the same cameras and background; white flatters all of them.
+    With --data the held-out photographs judge A and B as well. Needs the
+    packages of the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
+      csplat compare scene.ply scene.csplat --data capture --lpips auto
       csplat compare scene.ply scene.csplat --pictures differences
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
-    colour, chosen = parse_colour(background), parse_mode(mode)
-    prepare_renderer(quiet=quiet)
+    if cameras is not None and data is not None:
+        raise typer.BadParameter("wanted one of --cameras and --data")
+    if data is None and (size is not None or images is not None):
+        raise typer.BadParameter("--size and --images are for the pictures of --data")
+    colour = None if background is None else parse_colour(background)
+    chosen, pixels = parse_mode(mode), None if size is None else parse_size(size)
+    shots = None if data is None else DataViews(data, parse_split(split), pixels, images, test_every)
     with progress_bar(quiet=quiet) as progress:
         compared = compare_files(
             a,
             b,
             cameras=cameras,
+            data=shots,
             source_index=source_index,
             lpips=lpips,
             pictures=pictures,
@@ -75,6 +105,7 @@ def compare(
             background=colour,
             mode=chosen,
             force=force,
+            prepare=partial(prepare_renderer, quiet=quiet),
             progress=progress,
         )
     if as_json:
@@ -91,7 +122,10 @@ def _format(compared: FileComparison, a: str, b: str) -> str:
         parts.append("errors of the splats are not known: which is which, `encode --source-index` writes down")
     else:
         parts.append(_attributes(compared.attributes))
-    parts += [_quality(compared), f"{compared.seconds:.1f} s"]
+    parts.append(_quality(compared))
+    if compared.photographs is not None:
+        parts.append(_photographs(compared.photographs))
+    parts.append(f"{compared.seconds:.1f} s")
     return "\n\n".join(parts)
 
 
@@ -133,6 +167,16 @@ def _quality(compared: FileComparison) -> str:
     if compared.a.model.antialiased != compared.b.model.antialiased:
         lines.append(f"only {'A' if compared.a.model.antialiased else 'B'} is antialiased, and was rendered so")
     return "\n".join(lines)
+
+
+def _photographs(scores: dict[str, Any]) -> str:
+    rows = []
+    for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
+        a, b = scores["a"][name], scores["b"][name]
+        if a is not None and b is not None:
+            rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
+    header = (f"against {scores['a']['views']} {scores['split']} photographs", "A", "B", "B - A")
+    return format_table(header, rows)
 
 
 def _cameras(compared: FileComparison) -> str:

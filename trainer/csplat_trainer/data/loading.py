@@ -22,6 +22,7 @@ def load(
     images: str | None = None,
     test_every: int = 8,
     near: float | None = None,
+    only: str | None = None,
 ) -> DataSet:
     """Read a data set of posed pictures.
 
@@ -38,6 +39,7 @@ def load(
             the smallest that is large enough.
         test_every: which share is held out where the set names no test pictures; 0: none.
         near: near plane of the cameras, scene units; `None`: one that suits the set.
+        only: read the pictures of one split, `train` or `test`, and leave the other empty; `None`: both.
 
     Returns:
         All pictures, undistorted and in memory, with their cameras.
@@ -53,13 +55,14 @@ def load(
         raise InputError(f"{path} leaves no pictures to train on")
     shots = [*found.train, *found.test]
     near = near_plane(shots) if near is None else near
-    train = [read_picture(shot, size, near) for shot in found.train]
-    test = [read_picture(shot, size, near) for shot in found.test]
+    train = [read_picture(shot, size, near) for shot in found.train if only != "test"]
+    test = [read_picture(shot, size, near) for shot in found.test if only != "train"]
     name = f"{found.kind} {path}"
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
     points = "" if found.points is None else f", {len(found.points)} points"
-    report = [f"{name}: {len(train)} training and {len(test)} test pictures of {shown} pixels{points}", *found.report]
+    counts = f"{len(found.train)} training and {len(found.test)} test pictures"
+    report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
         report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")

@@ -1,0 +1,247 @@
+"""`csplat compare --data` and `csplat render --data`, and that both look at their inputs before they compile."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import EncodeOptions, encode, write_ply
+from csplat.errors import InputError
+from csplat_tools.app import app
+
+pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from csplat_render import render  # noqa: E402
+from csplat_render.cameras import intrinsics, look_at  # noqa: E402
+from csplat_tools.compare_files import compare_files  # noqa: E402
+from csplat_tools.photographs import DataViews, relative_to, show_photograph  # noqa: E402
+from csplat_trainer.pictures import Picture  # noqa: E402
+
+W, H = 64, 48
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def call(*words):
+    result = invoke(*words)
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result.stdout
+
+
+@pytest.fixture
+def scene(make_model):
+    model = make_model(300, 1)
+    dim = {name: getattr(model, name) * np.float32(0.2) for name in ("sh0", "shN")}  # no colour beyond 1
+    return replace(model, scales=model.scales * np.float32(0.3) - np.float32(1.5), **dim)
+
+
+def cameras(count):
+    K, angles = intrinsics(W, H, 60.0), np.linspace(0.2, 5.5, count)
+    return [look_at((5 * np.cos(a), 5 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1), K, W, H) for a in angles]
+
+
+def write_set(folder, scene, *, alpha, shift=(0.0, 0.0, 0.0)):
+    """Nine photographs of the scene, transforms.json; the world's origin lies `shift` away from the scene's."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for number, camera in enumerate(cameras(9)):
+        seen = render(scene, camera, background=(0.0, 0.0, 0.0))
+        pixels = np.clip(seen.rgb, 0.0, 1.0)
+        if alpha:
+            straight = np.clip(pixels / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
+            pixels = np.concatenate([straight, seen.alpha[..., None]], axis=2)
+        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number}.png")
+        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] += shift
+        frames.append({"file_path": f"images/view{number}.png", "transform_matrix": pose.tolist()})
+    K = intrinsics(W, H, 60.0)
+    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+@pytest.fixture
+def files(scene, tmp_path):
+    write_ply(tmp_path / "a.ply", scene)
+    worse = replace(scene, sh0=scene.sh0 + np.float32(0.2))
+    (tmp_path / "b.csplat").write_bytes(encode(worse, EncodeOptions(preset="fast")))
+    return tmp_path / "a.ply", tmp_path / "b.csplat"
+
+
+def test_photographs_judge_both_scenes(scene, files, tmp_path):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    result = json.loads(call("compare", *files, "--data", data, "--json"))
+    assert ["view0.png", "view8.png"] == [view["image"].removeprefix("images/") for view in result["views"]]
+    assert ["capture", [0.0, 0.0, 0.0]] == [result["cameras"], result["background"]]
+    judged = result["photographs"]
+    assert "test" == judged["split"]
+    assert 2 == judged["a"]["views"] == judged["b"]["views"]
+    assert judged["a"]["psnr"] > 50.0  # what rounding to bytes leaves
+    assert judged["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
+    assert judged["b"]["ssim"] < judged["a"]["ssim"]
+    assert judged["a"]["lpips"] is None
+
+
+def test_training_pictures_are_the_others(scene, files, tmp_path):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    result = json.loads(call("compare", *files, "--data", data, "--split", "train", "--test-every", 3, "--json"))
+    assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in result["views"]]
+    assert 6 == result["photographs"]["a"]["views"]
+
+
+def test_white_is_behind_pictures_with_alpha(scene, files, tmp_path):
+    data = write_set(tmp_path / "object", scene, alpha=True)
+    result = json.loads(call("compare", *files, "--data", data, "--json"))
+    assert [1.0, 1.0, 1.0] == result["background"]
+    assert result["photographs"]["a"]["psnr"] > 45.0
+    assert result["photographs"]["a"]["psnr_covered"] is not None
+    black = json.loads(call("compare", *files, "--data", data, "--background", "black", "--json"))
+    assert [0.0, 0.0, 0.0] == black["background"]
+    assert black["photographs"]["a"]["psnr"] > 45.0
+
+
+def test_cameras_are_brought_to_the_origin_of_the_scene(scene, tmp_path):
+    shift = (100.0, -20.0, 7.0)
+    data = write_set(tmp_path / "capture", scene, alpha=False, shift=shift)
+    write_ply(tmp_path / "moved.ply", replace(scene, origin=shift))
+    result = json.loads(call("compare", tmp_path / "moved.ply", tmp_path / "moved.ply", "--data", data, "--json"))
+    assert result["photographs"]["a"]["psnr"] > 50.0
+    call("render", tmp_path / "moved.ply", "--data", data, "-o", tmp_path / "out")
+    with Image.open(tmp_path / "out" / "view0.png") as ours, Image.open(data / "images" / "view0.png") as photograph:
+        assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
+
+
+def test_the_table_has_a_column_for_each_scene(scene, files, tmp_path):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    text = call("compare", *files, "--data", data, "--size", "32x24", "--pictures", tmp_path / "out")
+    for word in ("2 views of capture", "against 2 test photographs", "B - A", "psnr_mean"):
+        assert word in text
+    with Image.open(tmp_path / "out" / "view8.png") as sheet:
+        assert (4 * 32, 24) == sheet.size
+
+
+def test_lpips_judges_too(scene, files, tmp_path, data_dir):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    weights = data_dir / "lpips" / "lpips_alex.npz"
+    judged = json.loads(call("compare", *files, "--data", data, "--lpips", weights, "--json"))["photographs"]
+    assert 0.0 <= judged["a"]["lpips"] < judged["b"]["lpips"] < 1.0
+
+
+@pytest.mark.parametrize(("split", "expected"), [("test", [0, 8]), ("train", [1, 2, 3, 4, 5, 6, 7])])
+def test_renders_have_the_names_and_sizes_of_the_photographs(scene, files, tmp_path, split, expected):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    call("render", files[0], "--data", data, "--split", split, "-o", tmp_path / "out")
+    assert [f"view{number}.png" for number in expected] == sorted(path.name for path in (tmp_path / "out").iterdir())
+    name = f"view{expected[0]}.png"
+    with Image.open(tmp_path / "out" / name) as ours, Image.open(data / "images" / name) as photograph:
+        assert (W, H) == ours.size
+        assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
+
+
+def test_only_the_split_that_is_wanted_is_read(scene, tmp_path):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    (data / "images" / "view3.png").write_bytes(b"no picture")
+    assert 2 == len(DataViews(str(data)).read())
+    with pytest.raises(InputError, match=r"view3\.png"):
+        DataViews(str(data), split="train").read()
+
+
+def test_a_set_without_test_pictures_is_refused(scene, tmp_path):
+    data = write_set(tmp_path / "capture", scene, alpha=False)
+    with pytest.raises(InputError, match="has no test pictures"):
+        DataViews(str(data), test_every=0).read()
+
+
+def test_cameras_and_data_exclude_each_other(files, tmp_path):
+    assert 2 == invoke("compare", *files, "--cameras", "x.json", "--data", tmp_path).exit_code
+    assert 2 == invoke("render", files[0], "--orbit", 2, "--data", tmp_path, "-o", tmp_path / "o").exit_code
+    assert 2 == invoke("compare", *files, "--size", "32x24").exit_code
+    assert 2 == invoke("compare", *files, "--data", tmp_path, "--split", "val").exit_code
+    with pytest.raises(InputError, match="not both"):
+        compare_files(str(files[0]), str(files[1]), cameras="x.json", data=DataViews(str(tmp_path)))
+
+
+def test_a_photograph_is_shown_in_front_of_the_background():
+    pixels = np.zeros((1, 2, 4), np.uint8)
+    pixels[0, 1] = (255, 0, 0, 51)
+    picture = Picture(replace(cameras(1)[0], W=2, H=1), pixels)
+    shown = show_photograph(picture, (0.0, 1.0, 1.0))
+    assert np.float32 == shown.dtype
+    assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
+
+
+def test_an_origin_moves_the_camera_the_other_way():
+    camera = cameras(1)[0]
+    moved = relative_to((1.0, 2.0, 3.0), camera)
+    assert np.allclose(camera.position - (1.0, 2.0, 3.0), moved.position)
+    assert relative_to((0.0, 0.0, 0.0), camera) is camera
+
+
+# inputs first
+
+
+@pytest.fixture
+def no_compiling(monkeypatch):
+    """Compiling the renderer fails the test."""
+
+    def refuse(*_, **__):
+        pytest.fail("the renderer was compiled before the inputs were looked at")
+
+    monkeypatch.setattr("csplat_tools.commands.compare.prepare_renderer", refuse)
+    monkeypatch.setattr("csplat_tools.commands.render.prepare_renderer", refuse)
+    monkeypatch.setattr("csplat_render.warmup.warm_up", refuse)
+
+
+@pytest.mark.usefixtures("no_compiling")
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("compare", "absent.ply", "B"), "absent.ply"),
+        (("compare", "A", "absent.csplat"), "absent.csplat"),
+        (("compare", "A", "B", "--cameras", "absent.json"), "absent.json"),
+        (("compare", "A", "B", "--data", "absent"), "absent"),
+        (("compare", "A", "B", "--lpips", "absent.npz"), "absent.npz"),
+        (("compare", "A", "B", "--source-index", "absent.npy"), "absent.npy"),
+        (("compare", "A", "B", "--pictures", "A"), "not a folder"),
+        (("render", "absent.ply", "--orbit", "2", "-o", "o"), "absent.ply"),
+        (("render", "A", "--cameras", "absent.json", "-o", "o"), "absent.json"),
+        (("render", "A", "--data", "absent", "-o", "o"), "absent"),
+        (("render", "A", "--orbit", "2", "-o", "A"), "not a folder"),
+        (("render", "A", "--orbit", "2", "-o", "nowhere/film.gif"), "nowhere"),
+        (("train", "absent", "-o", "o.ply"), "absent"),
+        (("train", "capture", "-o", "o.ply", "--resume", "absent.npz"), "absent.npz"),
+        (("train", "capture", "-o", "o.ply", "--lpips-weights", "absent.npz"), "absent.npz"),
+        (("train", "capture", "-o", "o.ply", "--previews", "A"), "not a folder"),
+        (("train", "capture", "-o", "o.ply", "--lpips-weight", "0.1", "--lpips-weights", "absent.npz"), "absent.npz"),
+    ],
+)
+def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, monkeypatch, words, says):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(files[0], "A")
+    shutil.copy(files[1], "B")
+    done = invoke(*words)
+    assert done.exit_code in (1, 2), (done.stdout, done.exception)
+    assert says in done.stderr
+
+
+def test_the_renderer_is_made_ready_once_everything_is_read(files, tmp_path):
+    told = []
+    data = cameras(2)
+    (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in data]))
+    compare_files(
+        str(files[0]),
+        str(files[1]),
+        cameras=str(tmp_path / "cameras.json"),
+        prepare=lambda: told.append("prepare"),
+        progress=lambda stage, _: told.append(stage),
+    )
+    assert 1 == told.count("prepare")
+    assert told.index("prepare") < told.index("comparing")
