@@ -45,8 +45,8 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/codec.py
 	$(BIN)/python tools/benchmarks/render.py
 
-fuzz: $(VENV)/.dev ## ten minutes of malformed files
-	$(BIN)/python tests/fuzz.py --seconds 600
+fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
+	$(BIN)/python tests/fuzz.py --target all --seconds 2400
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -25,11 +25,13 @@ main() {
         if have chromium "the decoder in a browser"; then
             step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
         fi
+        step "JavaScript by the protocol" "$DEV/csplat" conformance decoder --profile base --exact \
+            --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
     fi
     step "wheel" build_and_install_wheel
-    step "conformance of the decoder" "$WHEEL/csplat" conformance decoder
+    step "conformance of the decoder" "$WHEEL/csplat" conformance decoder --level 4
     step "conformance of the encoder" "$WHEEL/csplat" conformance encoder --level 3
-    step "fuzzing" "$WHEEL/python" tests/fuzz.py --seconds 30
+    step "fuzzing" "$WHEEL/python" tests/fuzz.py --target all --seconds 60
     step "Python tests" "$WHEEL/pytest" "$@"
 }
 
@@ -71,7 +73,7 @@ build_and_install_wheel() {
     local pip=("$WHEEL/python" -m pip install --quiet --disable-pip-version-check)
     local wheel
     wheel=$(echo out/dist/csplat-*.whl)
-    "${pip[@]}" "${wheel}[render,torch-tests,browser-tests]" pytest hypothesis
+    "${pip[@]}" "${wheel}[render,torch-tests,browser-tests]" pytest hypothesis jsonschema
     "${pip[@]}" --force-reinstall --no-deps "$wheel"
     "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
 }
