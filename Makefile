@@ -44,6 +44,11 @@ sample: $(VENV)/.core ## make the sample scene again
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/codec.py
 	$(BIN)/python tools/benchmarks/render.py
+	$(BIN)/python tools/benchmarks/training.py
+	$(BIN)/python tools/benchmarks/gradients.py
+	$(BIN)/python tools/benchmarks/compiling.py
+	$(BIN)/python tools/benchmarks/virtual_cameras.py
+	$(BIN)/python tools/benchmarks/viewer.py
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+pytest.importorskip("numba", reason="SSIM wants the extra [render]")
+
 from csplat.errors import InputError
 from csplat_render.metrics import PSNR_CAP, Scorer, psnr, ssim
 

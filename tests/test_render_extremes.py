@@ -1,6 +1,8 @@
 """What breaks rasterisers: pictures and gradients stay finite, and nothing is written out of bounds."""
 
 import math
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,31 +10,16 @@ import pytest
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
 from csplat.errors import LimitError
-from csplat_render import Camera, rasterise, render
+from csplat_render import rasterise, render
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_render.warmup import warm_up
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
+
+# It lies in the folder that is named above.
+from oracle import extreme_splats, facing
+
 W, H = 50, 37
-
-
-def camera(focal=40.0, near=0.2, distance=3.0, width=W, height=H):
-    viewmat = np.eye(4)
-    viewmat[2, 3] = distance
-    return Camera([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], viewmat, width, height, near=near)
-
-
-def splats(count=64, degree=1, seed=0, **fields):
-    rng = np.random.default_rng(seed)
-    arrays = {
-        "means": rng.uniform(-1.0, 1.0, (count, 3)),
-        "quats": rng.standard_normal((count, 4)),
-        "scales": rng.uniform(-4.0, -1.0, (count, 3)),
-        "opacities": rng.random(count),
-        "sh0": rng.standard_normal((count, 3)),
-        "shN": rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
-    }
-    arrays.update({name: np.broadcast_to(value, arrays[name].shape) for name, value in fields.items()})
-    return {name: np.array(value, np.float32) for name, value in arrays.items()}
 
 
 def assert_survives(arrays, view, *, antialiased=False):
@@ -70,94 +57,94 @@ def assert_gradients_agree(found):
     ids=["needle", "disc", "large needle", "large disc", "huge needle"],
 )
 def test_an_anisotropy_of_a_million(scales, antialiased):
-    arrays = splats(scales=scales)
-    assert_gradients_agree(assert_survives(arrays, camera(), antialiased=antialiased))
+    arrays = extreme_splats(scales=scales)
+    assert_gradients_agree(assert_survives(arrays, facing(), antialiased=antialiased))
 
 
 def test_the_camera_inside_splats():
-    arrays = splats(scales=(1.0, 0.5, 0.2))
-    assert_gradients_agree(assert_survives(arrays, camera(distance=0.0)))
+    arrays = extreme_splats(scales=(1.0, 0.5, 0.2))
+    assert_gradients_agree(assert_survives(arrays, facing(distance=0.0)))
 
 
 @pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
 def test_splats_at_the_near_plane_and_behind_it(near):
-    arrays = splats(count=80)
+    arrays = extreme_splats(count=80)
     arrays["means"][:, 2] = np.concatenate([np.float32(near) * np.linspace(0.5, 2.0, 40), np.linspace(-4.0, 4.0, 40)])
-    found = assert_survives(arrays, camera(near=near, distance=0.0))
+    found = assert_survives(arrays, facing(near=near, distance=0.0))
     assert 0 < found[0][0].drawn < 80
 
 
 @pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
 def test_extreme_log_scales(log_scale):
     for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
-        arrays = splats()
+        arrays = extreme_splats()
         arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
-        assert_survives(arrays, camera())
-    mixed = splats()
+        assert_survives(arrays, facing())
+    mixed = extreme_splats()
     mixed["scales"][:, 0], mixed["scales"][:, 1] = 60.0, -60.0
-    assert_survives(mixed, camera(), antialiased=True)
+    assert_survives(mixed, facing(), antialiased=True)
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
 def test_alpha_zero_and_one(alpha):
-    found = assert_survives(splats(opacities=alpha), camera())
+    found = assert_survives(extreme_splats(opacities=alpha), facing())
     assert (found[0][0].alpha.max() > 0.0) == (alpha > 0.0)
     assert_gradients_agree(found)
 
 
 @pytest.mark.parametrize("focal", [1e-6, 1e-2, 1e4, 1e9])
 def test_tiny_and_huge_focal_lengths(focal):
-    assert_survives(splats(), camera(focal=focal))
+    assert_survives(extreme_splats(), facing(focal=focal))
 
 
 @pytest.mark.parametrize("distance", [1e-20, 1e20, 1e37])
 def test_far_and_large_scenes(distance):
-    arrays = splats()
+    arrays = extreme_splats()
     arrays["means"] *= np.float32(distance)
     arrays["scales"] += np.float32(math.log(distance))
-    assert_survives(arrays, camera(near=distance * 1e-3, distance=3 * distance))
+    assert_survives(arrays, facing(near=distance * 1e-3, distance=3 * distance))
 
 
 def test_zero_and_huge_quaternions():
-    arrays = splats()
+    arrays = extreme_splats()
     arrays["quats"][::3] = 0.0
     arrays["quats"][1::3] *= np.float32(1e30)
     arrays["quats"][2::3] *= np.float32(1e-30)
-    found = assert_survives(arrays, camera())
+    found = assert_survives(arrays, facing())
     plain = dict(arrays)
     plain["quats"] = arrays["quats"].copy()
     plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
-    np.testing.assert_array_equal(found[0][0].rgb, render(Splats(**plain), camera()).rgb)
+    np.testing.assert_array_equal(found[0][0].rgb, render(Splats(**plain), facing()).rgb)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
 def test_rows_that_hold_nan_are_left_out_and_counted(name, bad):
-    arrays = splats(count=30)
+    arrays = extreme_splats(count=30)
     clean = {key: value[3:].copy() for key, value in arrays.items()}
     arrays[name].reshape(30, -1)[:3, -1] = bad
-    found = assert_survives(arrays, camera())
+    found = assert_survives(arrays, facing())
     assert [result.ignored for result, _ in found] == [3, 3]
-    assert render(Splats(**arrays), camera(), mode="exact").ignored == 3
-    np.testing.assert_array_equal(found[0][0].rgb, render(Splats(**clean), camera()).rgb)
+    assert render(Splats(**arrays), facing(), mode="exact").ignored == 3
+    np.testing.assert_array_equal(found[0][0].rgb, render(Splats(**clean), facing()).rgb)
 
 
 def test_an_empty_scene_shows_the_background():
     for degree in (0, 3):
-        arrays = splats(count=0, degree=degree)
-        assert_survives(arrays, camera())
-        picture = render(Splats(**arrays), camera(), background=(0.1, 0.2, 0.3))
+        arrays = extreme_splats(count=0, degree=degree)
+        assert_survives(arrays, facing())
+        picture = render(Splats(**arrays), facing(), background=(0.1, 0.2, 0.3))
         np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (H, W, 3)))
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1)])
 def test_pictures_of_any_size(width, height):
-    assert_survives(splats(), camera(width=width, height=height))
+    assert_survives(extreme_splats(), facing(width=width, height=height))
 
 
 def test_gradients_beyond_float32_are_clamped():
     rasteriser = Rasteriser()
-    picture = rasteriser.forward(Splats(**splats(scales=2.0)), camera(focal=1e6))
+    picture = rasteriser.forward(Splats(**extreme_splats(scales=2.0)), facing(focal=1e6))
     g = rasteriser.backward(np.full_like(picture.rgb, 1e30))
     assert all(np.isfinite(value).all() for value in vars(g).values())
 
@@ -165,7 +152,7 @@ def test_gradients_beyond_float32_are_clamped():
 def test_too_many_intersections_are_refused(monkeypatch):
     monkeypatch.setattr(rasterise, "MAX_INTERSECTIONS", 100)
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
-        render(Splats(**splats(scales=2.0)), camera())
+        render(Splats(**extreme_splats(scales=2.0)), facing())
 
 
 def test_warming_up_says_nothing_once_all_is_compiled():

@@ -18,6 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+__all__ = ["peak_bytes", "reset_peak"]
+
 _PROC = Path("/proc/self")
 
 
@@ -64,7 +66,7 @@ def _decode(args: argparse.Namespace) -> dict[str, Any]:
 def _run(call: Callable[[], Any], runs: int) -> tuple[Any, float, int]:
     """Return the last result, the median of the seconds, and what the first call made the process grow by."""
     gc.collect()
-    before = _reset_peak()
+    before = reset_peak()
     seconds, growth, result = [], 0, None
     for run in range(runs):
         result = None  # the next call does not find the memory taken
@@ -72,7 +74,7 @@ def _run(call: Callable[[], Any], runs: int) -> tuple[Any, float, int]:
         result = call()
         seconds.append(time.perf_counter() - start)
         if run == 0:
-            growth = _peak_bytes() - before
+            growth = peak_bytes() - before
     return result, statistics.median(seconds), growth
 
 
@@ -81,7 +83,7 @@ def _array_bytes(model: Any) -> int:
     return sum(getattr(model, name).nbytes for name in names)
 
 
-def _reset_peak() -> int:
+def reset_peak() -> int:
     """Reset the high-water mark where the kernel allows it; return the size before the call."""
     with contextlib.suppress(OSError):
         (_PROC / "clear_refs").write_text("5")
@@ -91,7 +93,8 @@ def _reset_peak() -> int:
     return _max_rss()
 
 
-def _peak_bytes() -> int:
+def peak_bytes() -> int:
+    """Largest resident size since the mark was reset, or ever where it cannot be."""
     peak = _status("VmHWM")
     return _max_rss() if peak is None else peak
 

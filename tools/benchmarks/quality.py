@@ -2,7 +2,7 @@
 
     python tools/benchmarks/quality.py                        # the shared scenes; ten minutes
     python tools/benchmarks/quality.py --scenes plane3 --no-peers
-    python tools/benchmarks/quality.py --extra statue.ply --markdown
+    python tools/benchmarks/quality.py --extra other.ply --markdown
 
 `psnr` is that of `csplat compare`: eight 640 by 480 views, black background, pooled. The cameras are those of the data
 folder (psnr_cameras/NAME.json), else the virtual ones of the source.
@@ -14,7 +14,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,9 @@ from csplat_tools.compare import SourceView, compare_models, render_source
 from csplat_tools.console import format_table
 from csplat_tools.extras import need_renderer
 
-_SCENES = "fox120k,fox60k_noreg,lego60k,plane3,donut,jacket,horse"
+__all__ = ["decoded_presets"]
+
+_SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"
 
 
 def main() -> None:
@@ -83,10 +85,7 @@ def _measure(scene: Scene, presets: Sequence[str], command: list[str] | None, ca
     source = read_ply(scene.path)
     path = DATA / "psnr_cameras" / f"{scene.name}.json"
     views = list(render_source(source, load_cameras(path) if path.exists() else None))
-    columns = {}
-    for preset in presets:
-        data = encode_with_report(source, EncodeOptions(preset=preset)).data
-        columns[preset] = _quality(source, decode(data), views, len(data))
+    columns = {name: _quality(source, other, views, size) for name, other, size in decoded_presets(source, presets)}
     if command is not None:
         peer, back = spz_and_back(command, scene, cache)
         if peer.size_bytes is None:
@@ -100,6 +99,13 @@ def _measure(scene: Scene, presets: Sequence[str], command: list[str] | None, ca
         "cameras": path.name if path.exists() else "virtual",
         "columns": columns,
     }
+
+
+def decoded_presets(source: SplatModel, presets: Sequence[str]) -> Iterator[tuple[str, SplatModel, int]]:
+    """Encode a scene with presets: the name of each, what is decoded, and the size in bytes."""
+    for preset in presets:
+        data = encode_with_report(source, EncodeOptions(preset=preset)).data
+        yield preset, decode(data), len(data)
 
 
 def _quality(source: SplatModel, other: SplatModel, views: list[SourceView], size_bytes: int) -> dict[str, Any]:

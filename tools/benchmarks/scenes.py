@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +14,16 @@ import numpy as np
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 
-__all__ = ["BLOWN_UP", "DATA", "ROOT", "Scene", "blow_up", "describe_ply", "find_scenes"]
+__all__ = [
+    "BLOWN_UP",
+    "CROWDS",
+    "DATA",
+    "ROOT",
+    "Scene",
+    "blow_up",
+    "describe_ply",
+    "find_scenes",
+]
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
@@ -27,6 +38,18 @@ BLOWN_UP = (
     ("fox-4M", "fox120k", 4_000_000),
     ("donut-4M", "donut", 4_000_000),
 )
+
+
+#: Name, what it is split from, splats in view of the scene's cameras.
+CROWDS = (
+    ("fox@90k", "fox120k", 90_000),
+    ("lego@90k", "lego60k", 90_000),
+    ("fox@500k", "fox120k", 500_000),
+    ("lego@500k", "lego60k", 500_000),
+)
+
+#: Scenes that are made where they are named; the data folder has them in another format.
+_SOG = {"statue": "statue", "angel": "angel.sog", "st-peter": "st-peter.sog"}
 
 
 @dataclass(frozen=True)
@@ -51,7 +74,10 @@ def find_scenes(names: list[str], cache: Path) -> list[Scene]:
         names: which ones; empty for all that are there.
         cache: folder for those that have to be made.
     """
-    paths = {"sample": _SAMPLE, **{name: DATA / "ply" / f"{name}.ply" for name in _PLYS}}
+    cache.mkdir(parents=True, exist_ok=True)
+    # Others of the data folder only where they are named.
+    plys = dict.fromkeys([*_PLYS, *(name for name in names if "/" not in name and name != "sample")])
+    paths = {"sample": _SAMPLE, **{name: DATA / "ply" / f"{name}.ply" for name in plys}}
     chosen = []
     for name, path in paths.items():
         if path.exists() and (not names or name in names):
@@ -60,8 +86,23 @@ def find_scenes(names: list[str], cache: Path) -> list[Scene]:
         if paths[source].exists() and (not names or name in names):
             path = cache / f"{name}.ply"
             if not path.exists():
-                cache.mkdir(parents=True, exist_ok=True)
                 write_ply(path, blow_up(read_ply(paths[source]), count))
+            chosen.append(describe_ply(name, path))
+    for name, source, count in CROWDS:
+        if name in names and paths[source].exists():
+            path = cache / f"{name}.ply"
+            if not path.exists():
+                from crowds import cameras_of, crowd  # wants numba
+
+                model = read_ply(paths[source])
+                write_ply(path, crowd(model, cameras_of(name, model), count))
+            chosen.append(describe_ply(name, path))
+    for name, source in _SOG.items():
+        if name in names and (DATA / "sog" / source).exists():
+            path = cache / f"{name}.ply"
+            if not path.exists():
+                convert = [sys.executable, str(DATA / "tools" / "sog2ply.py"), str(DATA / "sog" / source), str(path)]
+                subprocess.run(convert, check=True, stdout=subprocess.DEVNULL)
             chosen.append(describe_ply(name, path))
     return chosen
 

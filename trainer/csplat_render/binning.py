@@ -35,6 +35,7 @@ TILE_BITS = 4
 #: Runs of the depth order that are sorted into tiles independently.
 CHUNKS = 8
 
+_FEW = 6  # tiles of a box that is taken as it is, without asking for the ellipse in it
 _DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 
 
@@ -90,11 +91,17 @@ def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, 
 
 
 @inline
-def _span(tile_y: int, j: int, extent: Any, box: Any) -> tuple[int, int]:
-    """First and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
+def _tiles(j: int, box: Any) -> tuple[int, int, int, int, bool]:
+    """Columns and rows of the tiles of a box, and whether it is taken as it is: roots cost more than they save."""
     first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
-    if last - first < 2 or (box[j, 2] >> TILE_BITS) == ((box[j, 3] - 1) >> TILE_BITS):
-        return first, last  # the box tells all
+    top, bottom = box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1
+    width, height = last - first, bottom - top
+    return first, last, top, bottom, width < 2 or height < 2 or width * height <= _FEW
+
+
+@inline
+def _span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
+    """First and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
     py = extent[j, 5]
     low = max(tile_y * TILE, box[j, 2]) + 0.5 - py
     high = min(tile_y * TILE + TILE, box[j, 3]) - 0.5 - py
@@ -145,22 +152,28 @@ def count_tiles(order: Any, extent: Any, box: Any, tiles_x: int, counts: Any, to
         box: [V, 4], see `arrange`.
         tiles_x: tiles side by side.
         counts: [CHUNKS, tiles] int32, written: splats of each chunk in each tile.
-        touched: [N] int32, written for splats that are drawn: tiles of each.
+        touched: [N] int32, written for splats that are drawn: tiles of each; empty without gradients.
     """
     chunks = counts.shape[0]
     n = len(order)
     for chunk in numba.prange(chunks):
-        for t in range(counts.shape[1]):
-            counts[chunk, t] = 0
+        row = counts[chunk]
+        row[:] = 0
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
-            i = order[j]
-            tiles = 0
-            for ty in range(box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1):
-                x0, x1 = _span(ty, j, extent, box)
-                tiles += max(x1 - x0, 0)
-                for tx in range(x0, x1):
-                    counts[chunk, ty * tiles_x + tx] += 1
-            touched[i] = tiles
+            first, last, top, bottom, few = _tiles(j, box)
+            tiles = (last - first) * (bottom - top) if few else 0
+            if few:
+                for ty in range(top, bottom):
+                    for t in range(ty * tiles_x + first, ty * tiles_x + last):
+                        row[t] += 1
+            else:
+                for ty in range(top, bottom):
+                    x0, x1 = _span(ty, j, extent, box, first, last)
+                    tiles += max(x1 - x0, 0)
+                    for t in range(ty * tiles_x + x0, ty * tiles_x + x1):
+                        row[t] += 1
+            if len(touched) > 0:
+                touched[order[j]] = tiles
 
 
 @kernel
@@ -218,15 +231,18 @@ def fill_tiles(
     n = len(order)
     with_slots = len(offsets) > 0
     for chunk in numba.prange(chunks):
+        row = counts[chunk]
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
             i = order[j]
             slot = offsets[i] if with_slots else 0
-            for ty in range(box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1):
-                x0, x1 = _span(ty, j, extent, box)
-                for tx in range(x0, x1):
-                    t = ty * tiles_x + tx
-                    to = starts[t] + counts[chunk, t]
-                    counts[chunk, t] += 1
+            first, last, top, bottom, few = _tiles(j, box)
+            for ty in range(top, bottom):
+                x0, x1 = first, last
+                if not few:
+                    x0, x1 = _span(ty, j, extent, box, first, last)
+                for t in range(ty * tiles_x + x0, ty * tiles_x + x1):
+                    to = starts[t] + row[t]
+                    row[t] += 1
                     ids[to] = i
                     if with_slots:
                         slots[to] = slot

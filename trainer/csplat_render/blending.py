@@ -1,30 +1,65 @@
 """The loop over pixels, forward: tile by tile, splats front to back, a row of 16 pixels at a time.
 
-A splat's exponent is rewritten for each tile, in float64, as a polynomial of the position within
-the tile: so float32 is enough for the pixels, however far away the centre of the splat lies.
+A splat's exponent is rewritten for each tile, in float64, as one polynomial of x for each row: so float32
+is enough for the pixels, however far away the centre of the splat lies. That is done for a batch
+of splats at a time, because their numbers lie anywhere in memory: the processor fetches many at once.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.jit import fast_exp, inline, parallel_kernel
+from csplat_render.jit import fast_exp2, inline, parallel_kernel
 
-__all__ = ["CHECK", "alive_rows", "blend", "tile_polynomial"]
+__all__ = [
+    "CHECK",
+    "NUMBERS",
+    "ROW0",
+    "ROW1",
+    "THEN",
+    "aligned",
+    "alive_rows",
+    "blend",
+    "gather",
+    "middles",
+    "tile_polynomial",
+]
 
-#: Splats between two looks at which rows of a tile are finished.
+#: Splats of a batch, between two looks at which rows of a tile are finished.
 CHECK = 16
 
+# Numbers of a splat in a batch: for each row of the tile the constant and the linear coefficient of
+# the exponent of 2, then the quadratic one, opacity, red, green, blue, depth.
+ROW0, ROW1, THEN = 0, TILE, 2 * TILE
+NUMBERS = THEN + 6
+
 _HALF = 0.5 * TILE
+_LOG2E = math.log2(math.e)
+_CACHE_LINE = 64  # bytes
 
 # Where a splat has alpha >= 1/255 the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
 # pixel, and changes by at most 1/0.3 per pixel: a tile whose centre says more than this sees nothing.
 _STEEPEST = 1e3
 _DEEPEST = -1e4
+
+
+@inline
+def aligned(size: int, like: Any) -> Any:
+    """Zeros that begin at a cache line, so that 16 float32 never lie in two; `like` has their dtype."""
+    store = np.zeros(size + _CACHE_LINE // like.itemsize, like.dtype)
+    skip = -store.ctypes.data % _CACHE_LINE // like.itemsize
+    return store[skip : skip + size]
+
+
+@inline
+def middles() -> Any:
+    """Positions of the 16 pixels of a row, or of the rows, about the middle of a tile; float64."""
+    return np.arange(TILE) + (0.5 - _HALF)
 
 
 @inline
@@ -60,6 +95,52 @@ def alive_rows(T: Any, low: int, high: int) -> tuple[int, int]:
             break
         high -= 1
     return low, high
+
+
+@inline
+def gather(
+    ids: Any,
+    begin: int,
+    end: int,
+    shape: Any,
+    box: Any,
+    X0: int,
+    Y0: int,
+    low: int,
+    high: int,
+    ys: Any,
+    batch: Any,
+    rows: Any,
+) -> None:
+    """Write what the loop over pixels wants to know of some splats in a tile.
+
+    Args:
+        ids: see `blend`, as shape and box.
+        begin: first of `ids`.
+        end: last of `ids`, plus 1; at most CHECK of them.
+        shape: see `blend`.
+        box: see `blend`.
+        X0: first column of the tile.
+        Y0: first row of the tile.
+        low: first of the tile's rows that is not finished.
+        high: last of them, plus 1.
+        ys: [TILE] float64, see `middles`.
+        batch: [CHECK, NUMBERS], written.
+        rows: [CHECK, 2] int64, written: first row of the tile that each splat may touch, and last plus 1.
+    """
+    for k in range(begin, end):
+        i = ids[k]
+        c0, cx, cy, cxx, cxy, cyy, seen = tile_polynomial(shape, i, X0 + _HALF, Y0 + _HALF)
+        rows[k - begin, 0] = max(box[i, 2] - Y0, low) if seen else 0
+        rows[k - begin, 1] = min(box[i, 3] - Y0, high) if seen else 0
+        c0, cx, cy, cxx, cxy, cyy = c0 * _LOG2E, cx * _LOG2E, cy * _LOG2E, cxx * _LOG2E, cxy * _LOG2E, cyy * _LOG2E
+        one = batch[k - begin]
+        for y in range(len(ys)):
+            one[ROW0 + y] = c0 + ys[y] * (cy + ys[y] * cyy)
+            one[ROW1 + y] = cx + ys[y] * cxy
+        one[THEN] = cxx
+        for n in range(5):
+            one[THEN + 1 + n] = shape[i, 5 + n]
 
 
 @parallel_kernel(relaxed=True)
@@ -98,9 +179,11 @@ def blend(
     for lane in numba.prange(lanes):
         # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
         # 16 transmittances, then 16 each of red, green, blue, depth; and the positions in a row.
-        planes = np.zeros((TILE, 6 * TILE), limits.dtype)
-        for x in range(TILE):
-            planes[:, 5 * TILE + x] = x + 0.5 - _HALF
+        planes = aligned(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
+        ys = middles()
+        for y in range(TILE):
+            planes[y, 5 * TILE :] = ys
+        batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
         alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
         zero, one = alpha_min - alpha_min, alpha_min / alpha_min
         for tile in range(lane, len(used), lanes):
@@ -110,38 +193,34 @@ def blend(
             planes[:, :columns] = one
             planes[:, columns:TILE] = -one  # finished from the start: they are not on the picture
             end = starts[tile + 1]
-            for k in range(starts[tile], end):
-                if (k - starts[tile]) % CHECK == CHECK - 1:
-                    low, high = alive_rows(planes, low, high)
-                    if low >= high:
-                        end = k
-                        break
-                i = ids[k]
-                c0, cx, cy, cxx, cxy, cyy, seen = tile_polynomial(shape, i, X0 + _HALF, Y0 + _HALF)
-                if not seen:
-                    continue
-                a, o = planes.dtype.type(cxx), planes.dtype.type(shape[i, 5])
-                r, g, b = planes.dtype.type(shape[i, 6]), planes.dtype.type(shape[i, 7]), planes.dtype.type(shape[i, 8])
-                d = planes.dtype.type(shape[i, 9])
-                for y in range(max(box[i, 2] - Y0, low), min(box[i, 3] - Y0, high)):
-                    dy = y + 0.5 - _HALF
-                    row0 = planes.dtype.type(c0 + dy * (cy + dy * cyy))
-                    row1 = planes.dtype.type(cx + dy * cxy)
-                    row = planes[y]
-                    for x in range(TILE):
-                        at = row[5 * TILE + x]
-                        power = (a * at + row1) * at + row0
-                        alpha = min(o * fast_exp(min(power, zero)), alpha_cap)
-                        alpha = alpha if alpha >= alpha_min else zero
-                        before = row[x]
-                        after = before * (one - alpha)
-                        going = after >= stop
-                        weight = alpha * before if going else zero
-                        row[x] = after if going else -abs(before)  # finished: negative from here on
-                        row[TILE + x] += weight * r
-                        row[2 * TILE + x] += weight * g
-                        row[3 * TILE + x] += weight * b
-                        row[4 * TILE + x] += weight * d
+            for begin in range(starts[tile], end, CHECK):
+                low, high = alive_rows(planes, low, high)
+                if low >= high:
+                    end = begin
+                    break
+                count = min(CHECK, end - begin)
+                gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
+                for j in range(count):
+                    first, last = rows[j, 0], rows[j, 1]
+                    body, row0, row1 = planes[first:last], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
+                    a, o = batch[j, THEN], batch[j, THEN + 1]
+                    r, g, b, d = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4], batch[j, THEN + 5]
+                    for y in range(len(body)):
+                        row, c0, c1 = body[y], row0[y], row1[y]
+                        for x in range(TILE):
+                            at = row[5 * TILE + x]
+                            power = (a * at + c1) * at + c0
+                            alpha = min(o * fast_exp2(min(power, zero)), alpha_cap)
+                            alpha = alpha if alpha >= alpha_min else zero
+                            before = row[x]
+                            after = before * (one - alpha)
+                            going = after >= stop
+                            weight = alpha * before if going else zero
+                            row[x] = after if going else -abs(before)  # finished: negative from here on
+                            row[TILE + x] += weight * r
+                            row[2 * TILE + x] += weight * g
+                            row[3 * TILE + x] += weight * b
+                            row[4 * TILE + x] += weight * d
             used[tile] = end
             for y in range(min(TILE, height - Y0)):
                 for x in range(columns):

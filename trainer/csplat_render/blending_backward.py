@@ -12,8 +12,8 @@ import numba
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending import CHECK, alive_rows, tile_polynomial
-from csplat_render.jit import fast_exp, parallel_kernel
+from csplat_render.blending import CHECK, NUMBERS, ROW0, ROW1, THEN, aligned, alive_rows, gather, middles
+from csplat_render.jit import fast_exp2, parallel_kernel
 
 __all__ = ["RECORD", "blend_backward"]
 
@@ -72,11 +72,13 @@ def blend_backward(
     height, width = transmittance.shape
     for lane in numba.prange(lanes):
         # Planes of 16 × 16, one after the other, in one array: so the compiler sees what overlaps.
-        planes = np.zeros(_PLANES * _AREA, limits.dtype)
+        planes = aligned(_PLANES * _AREA, limits)
         T = planes[:_AREA].reshape((TILE, TILE))
+        ys = middles()
         for e in range(_AREA):
-            planes[_X + e] = e % TILE + 0.5 - _HALF
-            planes[_Y + e] = e // TILE + 0.5 - _HALF
+            planes[_X + e] = ys[e % TILE]
+            planes[_Y + e] = ys[e // TILE]
+        batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
         alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
         zero, one = alpha_min - alpha_min, alpha_min / alpha_min
         for tile in range(lane, len(used), lanes):
@@ -99,61 +101,57 @@ def blend_backward(
                         + ga * (one - transmittance[Y0 + y, X0 + x])
                         + gd * depth[Y0 + y, X0 + x]
                     )
-            for k in range(starts[tile], used[tile]):
-                if (k - starts[tile]) % CHECK == CHECK - 1:
-                    low, high = alive_rows(T, low, high)
-                i = ids[k]
-                c0, cx, cy, cxx, cxy, cyy, seen = tile_polynomial(shape, i, X0 + _HALF, Y0 + _HALF)
-                record = records[slots[k]]
-                first, last = max(box[i, 2] - Y0, low), min(box[i, 3] - Y0, high)
-                if not (seen and first < last):
-                    record[:] = zero
-                    continue
-                a, o = planes.dtype.type(cxx), planes.dtype.type(shape[i, 5])
-                r, g, b = planes.dtype.type(shape[i, 6]), planes.dtype.type(shape[i, 7]), planes.dtype.type(shape[i, 8])
-                d = planes.dtype.type(shape[i, 9])
-                for y in range(first, last):
-                    dy = y + 0.5 - _HALF
-                    row0 = planes.dtype.type(c0 + dy * (cy + dy * cyy))
-                    row1 = planes.dtype.type(cx + dy * cxy)
-                    row = planes[y * TILE :]
-                    for x in range(TILE):
-                        at = row[_X + x]
-                        power = (a * at + row1) * at + row0
-                        full = o * fast_exp(min(power, zero))
-                        alpha = min(full, alpha_cap)
-                        alpha = alpha if alpha >= alpha_min else zero
-                        before = row[x]
-                        rest = one - alpha
-                        after = before * rest
-                        going = after >= stop
-                        weight = alpha * before if going else zero
-                        row[x] = after if going else -abs(before)
-                        colour = row[_RED + x] * r + row[_GREEN + x] * g + row[_BLUE + x] * b
-                        own = weight * (colour + row[_ALPHA + x] + row[_DEPTH + x] * d)
-                        behind = row[_BEHIND + x] - own
-                        row[_BEHIND + x] = behind
-                        # Colour of this splat against the colour behind; nothing where alpha is capped.
-                        slope = own - behind * alpha / rest
-                        slope = slope if going else zero
-                        row[_SLOPE + x] = slope if full < alpha_cap else zero
-                        row[_WEIGHT + x] = weight
-                m0, m1, m2, m3, m4, m5, m6, m7, m8, m9 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
-                body = planes[first * TILE :]
-                for e in range((last - first) * TILE):
-                    slope, weight = body[_SLOPE + e], body[_WEIGHT + e]
-                    sx, sy = slope * body[_X + e], slope * body[_Y + e]
-                    m0 += slope
-                    m1 += sx
-                    m2 += sy
-                    m3 += sx * body[_X + e]
-                    m4 += sx * body[_Y + e]
-                    m5 += sy * body[_Y + e]
-                    m6 += weight * body[_RED + e]
-                    m7 += weight * body[_GREEN + e]
-                    m8 += weight * body[_BLUE + e]
-                    m9 += weight * body[_DEPTH + e]
-                record[0], record[1], record[2], record[3], record[4] = m0, m1, m2, m3, m4
-                record[5], record[6], record[7], record[8], record[9] = m5, m6, m7, m8, m9
+            for begin in range(starts[tile], used[tile], CHECK):
+                low, high = alive_rows(T, low, high)
+                count = min(CHECK, used[tile] - begin)
+                gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
+                for j in range(count):
+                    record = records[slots[begin + j]]
+                    first, last = rows[j, 0], rows[j, 1]
+                    if first >= last:
+                        record[:] = zero
+                        continue
+                    body, row0, row1 = planes[first * TILE :], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
+                    a, o = batch[j, THEN], batch[j, THEN + 1]
+                    r, g, b, d = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4], batch[j, THEN + 5]
+                    for y in range(last - first):
+                        row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                        for x in range(TILE):
+                            at = row[_X + x]
+                            power = (a * at + c1) * at + c0
+                            full = o * fast_exp2(min(power, zero))
+                            alpha = min(full, alpha_cap)
+                            alpha = alpha if alpha >= alpha_min else zero
+                            before = row[x]
+                            rest = one - alpha
+                            after = before * rest
+                            going = after >= stop
+                            weight = alpha * before if going else zero
+                            row[x] = after if going else -abs(before)
+                            colour = row[_RED + x] * r + row[_GREEN + x] * g + row[_BLUE + x] * b
+                            own = weight * (colour + row[_ALPHA + x] + row[_DEPTH + x] * d)
+                            behind = row[_BEHIND + x] - own
+                            row[_BEHIND + x] = behind
+                            # Colour of this splat against the colour behind; nothing where alpha is capped.
+                            slope = own - behind * alpha / rest
+                            slope = slope if going else zero
+                            row[_SLOPE + x] = slope if full < alpha_cap else zero
+                            row[_WEIGHT + x] = weight
+                    m0, m1, m2, m3, m4, m5, m6, m7, m8, m9 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+                    for e in range((last - first) * TILE):
+                        slope, weight = body[_SLOPE + e], body[_WEIGHT + e]
+                        sx, sy = slope * body[_X + e], slope * body[_Y + e]
+                        m0 += slope
+                        m1 += sx
+                        m2 += sy
+                        m3 += sx * body[_X + e]
+                        m4 += sx * body[_Y + e]
+                        m5 += sy * body[_Y + e]
+                        m6 += weight * body[_RED + e]
+                        m7 += weight * body[_GREEN + e]
+                        m8 += weight * body[_BLUE + e]
+                        m9 += weight * body[_DEPTH + e]
+                    record[0], record[1], record[2], record[3], record[4] = m0, m1, m2, m3, m4
+                    record[5], record[6], record[7], record[8], record[9] = m5, m6, m7, m8, m9
             for k in range(used[tile], starts[tile + 1]):
                 records[slots[k]] = zero

@@ -15,7 +15,18 @@ from numba import extending as typed_extending
 
 from csplat.errors import InputError
 
-__all__ = ["LOCK", "available_threads", "fast_exp", "inline", "kernel", "parallel_kernel", "python", "thread_count"]
+__all__ = [
+    "LOCK",
+    "available_threads",
+    "fast_exp",
+    "fast_exp2",
+    "inline",
+    "kernel",
+    "parallel_kernel",
+    "python",
+    "relaxed_kernel",
+    "thread_count",
+]
 
 # The types that numba states for itself differ from version to version.
 numba: Any = typed_numba
@@ -33,6 +44,7 @@ LOCK = threading.RLock()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
+_LN2 = math.log(2.0)
 _RELAXED = {"reassoc", "nsz", "arcp", "contract", "afn"}
 
 
@@ -45,6 +57,12 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def inline(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function that kernels call; it takes on their arithmetic."""
     compiled: Callable[P, R] = numba.njit(function, inline="never", cache=True, nogil=True, error_model="numpy")
+    return compiled
+
+
+def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function of one thread that may reassociate and contract: the inside of a loop over pixels."""
+    compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
     return compiled
 
 
@@ -65,35 +83,52 @@ def parallel_kernel(*, relaxed: bool = False) -> Callable[[Callable[P, R]], Call
     return decorate
 
 
+def fast_exp2(x: float) -> float:
+    """2**x for x < 128 in kernels: in float32 a polynomial (2e-7) that vectorises, in float64 exact."""
+    return math.exp(x * _LN2)
+
+
 def fast_exp(x: float) -> float:
-    """exp(x) for x <= 0 in kernels: in float32 a polynomial (2e-7) that vectorises, in float64 exact."""
+    """exp(x) for x < 88 in kernels, see `fast_exp2`."""
     return math.exp(x)
+
+
+def _fast_exp2(x: Any) -> Callable[[Any], Any]:
+    def exact(x: Any) -> Any:
+        return math.exp(x * _LN2)
+
+    if x != numba.types.float32:
+        return exact
+
+    lowest, half = np.float32(-120.0), np.float32(0.5)
+    # 2**f for |f| <= 1/2, fitted for the smallest relative error.
+    c0, c1, c2 = np.float32(1.0000001353333114), np.float32(0.6931468253392489), np.float32(0.24021906575261626)
+    c3, c4, c5 = np.float32(0.05550791318132806), np.float32(0.009684186484357147), np.float32(0.0013275470569714626)
+
+    def polynomial(x: Any) -> Any:
+        t = x if x > lowest else lowest
+        whole = np.int32(t - half)
+        f = t - np.float32(whole)
+        power = np.float32(c0 + f * (c1 + f * (c2 + f * (c3 + f * (c4 + f * c5)))))
+        # The whole part of the exponent goes straight into the bits.
+        return np.int32(power.view(np.int32) + (whole << np.int32(23))).view(np.float32)
+
+    return polynomial
 
 
 def _fast_exp(x: Any) -> Callable[[Any], Any]:
     def exact(x: Any) -> Any:
         return math.exp(x)
 
-    if x != numba.types.float32:
-        return exact
-
-    log2e = np.float32(1.4426950408889634)
-    lowest, half = np.float32(-60.0), np.float32(0.5)
-    # 2**f for |f| <= 1/2, fitted for the smallest relative error.
-    c0, c1, c2 = np.float32(1.0000001353333114), np.float32(0.6931468253392489), np.float32(0.24021906575261626)
-    c3, c4, c5 = np.float32(0.05550791318132806), np.float32(0.009684186484357147), np.float32(0.0013275470569714626)
-
     def polynomial(x: Any) -> Any:
-        t = (x if x > lowest else lowest) * log2e
-        whole = np.int32(t - half)
-        f = t - np.float32(whole)
-        power = c0 + f * (c1 + f * (c2 + f * (c3 + f * (c4 + f * c5))))
-        return power * np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
+        return fast_exp2(x * log2e)
 
-    return polynomial
+    log2e = np.float32(1.0 / _LN2)
+    return polynomial if x == numba.types.float32 else exact
 
 
-extending.overload(fast_exp, jit_options={"fastmath": _RELAXED}, inline="always")(_fast_exp)
+for _function, _compiled in ((fast_exp2, _fast_exp2), (fast_exp, _fast_exp)):
+    extending.overload(_function, jit_options={"fastmath": _RELAXED}, inline="always")(_compiled)
 
 
 def python(compiled: Callable[P, R]) -> Callable[P, R]:

@@ -1,4 +1,4 @@
-"""LPIPS v0.1 with AlexNet (Zhang et al. 2018), a forward pass in NumPy.
+"""LPIPS v0.1 with AlexNet (Zhang et al. 2018), a forward pass without PyTorch.
 
 The weights are not part of this package. `load_lpips` looks for them
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["MIN_SIZE", "Lpips", "load_lpips", "save_lpips"]
+__all__ = ["MIN_SIZE", "SCALE", "SHIFT", "Lpips", "load_lpips", "save_lpips"]
 
 F32 = NDArray[np.float32]
 
@@ -36,10 +36,11 @@ MIN_SIZE = 31
 #: Where the weights are looked for after the file that is named.
 ENVIRONMENT = "CSPLAT_LPIPS"
 
-_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
-_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+#: Mean and standard deviation of the network's input, red, green, blue, of pictures in −1 to 1.
+SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
+SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+
 _EPSILON = 1e-10
-_BLOCK = 1 << 23  # values of the matrix that a convolution multiplies at a time
 
 # Kernel (height, width, in, out), stride, padding, pooled before it.
 _LAYERS = (
@@ -195,10 +196,12 @@ def _heads_path() -> Path | None:
 
 def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
     """What AlexNet sees after each of its five convolutions, [h, w, channels] each."""
-    x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - _SHIFT) / _SCALE
+    from csplat_render.convolving import convolve  # numba takes a second to import
+
+    x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
     features = []
     for (_, stride, padding, pooled), kernel, bias in zip(_LAYERS, weights.kernels, weights.biases, strict=True):
-        x = np.maximum(_convolve(_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
+        x = np.maximum(convolve(_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
         features.append(x)
     return features
 
@@ -208,21 +211,6 @@ def _unit(x: F32) -> NDArray[np.float64]:
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result
-
-
-def _convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
-    """Convolution of [h, w, in] as a matrix product, some rows of the result at a time."""
-    height, width, inputs, outputs = kernel.shape
-    padded = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
-    windows = sliding_window_view(padded, (height, width), axis=(0, 1))[::stride, ::stride]
-    windows = windows.transpose(0, 1, 3, 4, 2)  # rows, columns, height, width, in
-    matrix = kernel.reshape(-1, outputs)
-    result = np.empty((*windows.shape[:2], outputs), np.float32)
-    step = max(1, _BLOCK // (windows.shape[1] * height * width * inputs))
-    for start in range(0, len(result), step):
-        block = windows[start : start + step]
-        result[start : start + step] = block.reshape(*block.shape[:2], -1) @ matrix
-    return result + bias
 
 
 def _pool(x: F32) -> F32:

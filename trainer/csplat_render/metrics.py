@@ -36,11 +36,6 @@ PSNR_CAP = 99.0
 #: A pixel counts as covered from this alpha on.
 COVERED_ALPHA = 0.5
 
-_WINDOW = 11
-_SIGMA = 1.5
-_C1 = 0.01**2
-_C2 = 0.03**2
-
 
 @dataclass(frozen=True)
 class Scores:
@@ -152,17 +147,9 @@ def psnr(reference: NDArray[Any], image: NDArray[Any]) -> float:
 
 def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
     """SSIM of one pair of pictures, [H, W, 3] each; 1 where they are the same."""
-    a, b = _clipped(reference, image)
-    total = 0.0
-    for channel in range(3):
-        x, y = np.ascontiguousarray(a[..., channel]), np.ascontiguousarray(b[..., channel])
-        mx, my = _blur(x), _blur(y)
-        xx = _blur(x * x) - mx * mx
-        yy = _blur(y * y) - my * my
-        xy = _blur(x * y) - mx * my
-        similarity = (2.0 * mx * my + _C1) * (2.0 * xy + _C2) / ((mx * mx + my * my + _C1) * (xx + yy + _C2))
-        total += float(np.mean(similarity))
-    return total / 3.0
+    from csplat_render.similarity import mean_ssim  # numba takes a second to import
+
+    return mean_ssim(*_clipped(reference, image))
 
 
 def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
@@ -173,23 +160,8 @@ def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
             raise InputError(f"the {name} is {picture.dtype}, wanted floating values in 0 to 1")
     if reference.shape != image.shape:
         raise InputError(f"pictures of sizes {list(reference.shape)} and {list(image.shape)} cannot be compared")
-    a = np.clip(reference.astype(np.float64), 0.0, 1.0)
-    b = np.clip(image.astype(np.float64), 0.0, 1.0)
+    a = np.clip(np.ascontiguousarray(reference, np.float64), 0.0, 1.0)
+    b = np.clip(np.ascontiguousarray(image, np.float64), 0.0, 1.0)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise InputError("a picture holds NaN")
     return a, b
-
-
-def _blur(x: F64) -> F64:
-    """The window's weighted mean around each pixel of [H, W], zeros beyond the border."""
-    half = _WINDOW // 2
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / _SIGMA) ** 2)
-    weights /= weights.sum()
-    for axis in (0, 1):
-        padding = [(half, half) if i == axis else (0, 0) for i in range(2)]
-        padded = np.pad(x, padding)
-        size = x.shape[axis]
-        x = np.zeros_like(x)
-        for i, weight in enumerate(weights):
-            x += weight * (padded[i : i + size] if axis == 0 else padded[:, i : i + size])
-    return x

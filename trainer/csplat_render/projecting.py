@@ -61,12 +61,14 @@ def deviation(log_scale: float) -> float:
 @inline
 def perspective(view: Any, x: float, y: float, z: float) -> tuple[float, float, float, float, bool, bool]:
     """Jacobian of the perspective: (j0, 0, j02; 0, j1, j12); and whether x/z and y/z were inside the limits."""
-    tx, ty = x / z, y / z
+    over = 1.0 / z
+    tx, ty = x * over, y * over
     inside_x = view[17] < tx < view[18]
     inside_y = view[19] < ty < view[20]
     tx = min(max(tx, view[17]), view[18])
     ty = min(max(ty, view[19]), view[20])
-    return view[12] / z, -view[12] * tx / z, view[13] / z, -view[13] * ty / z, inside_x, inside_y
+    j0, j1 = view[12] * over, view[13] * over
+    return j0, -j0 * tx, j1, -j1 * ty, inside_x, inside_y
 
 
 @inline
@@ -110,16 +112,30 @@ def direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
 
 
 @inline
-def finite_row(i: int, means: Any, quats: Any, scales: Any, opacities: Any, sh0: Any, shN: Any, higher: int) -> bool:
-    """Whether everything that is used of a splat is finite."""
-    total = np.float64(opacities[i])
-    for k in range(3):
-        total += abs(np.float64(means[i, k])) + abs(np.float64(scales[i, k])) + abs(np.float64(sh0[i, k]))
-    for k in range(4):
-        total += abs(np.float64(quats[i, k]))
+def finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> bool:
+    """Whether everything but the colour of a splat is finite."""
+    total = opacities[i] - opacities[i]  # NaN or infinity less itself is NaN
+    total += (means[i, 0] - means[i, 0]) + (means[i, 1] - means[i, 1]) + (means[i, 2] - means[i, 2])
+    total += (scales[i, 0] - scales[i, 0]) + (scales[i, 1] - scales[i, 1]) + (scales[i, 2] - scales[i, 2])
+    total += (quats[i, 0] - quats[i, 0]) + (quats[i, 1] - quats[i, 1])
+    total += (quats[i, 2] - quats[i, 2]) + (quats[i, 3] - quats[i, 3])
+    return bool(total == 0.0)
+
+
+@inline
+def finite_colour(i: int, sh0: Any, shN: Any, higher: int) -> bool:
+    """Whether the coefficients of a splat that are used are finite."""
+    total = (sh0[i, 0] - sh0[i, 0]) + (sh0[i, 1] - sh0[i, 1]) + (sh0[i, 2] - sh0[i, 2])
     for k in range(higher):
-        total += abs(np.float64(shN[i, k, 0])) + abs(np.float64(shN[i, k, 1])) + abs(np.float64(shN[i, k, 2]))
-    return math.isfinite(total)
+        total += (shN[i, k, 0] - shN[i, k, 0]) + (shN[i, k, 1] - shN[i, k, 1]) + (shN[i, k, 2] - shN[i, k, 2])
+    return bool(total == 0.0)
+
+
+@inline
+def beyond(at: float, size: int, squared_reach: float) -> bool:
+    """Whether something around `at` ends more than half a pixel outside of 0 to size."""
+    distance = max(-at, at - size) - 1.0
+    return bool(distance > 0.0 and distance * distance > squared_reach)
 
 
 @parallel_kernel()
@@ -175,62 +191,83 @@ def project(
         bad = 0
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             depth[i], radii[i] = 0.0, 0.0
-            if not finite_row(i, means, quats, scales, opacities, sh0, shN, higher):
+            if not finite_shape(i, means, quats, scales, opacities):
                 bad += 1
                 continue
             X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
             z = view[6] * X + view[7] * Y + view[8] * Z + view[11]
             if not (z > view[16] and opacities[i] >= alpha_min):
+                bad += not finite_colour(i, sh0, shN, higher)
                 continue
             x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
             y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
-            qw, qx, qy, qz, _ = unit(quats[i])
-            r = rotation(qw, qx, qy, qz)
+            px = view[12] * (x / z) + view[14]
+            py = view[13] * (y / z) + view[15]
             s0, s1, s2 = deviation(scales[i, 0]), deviation(scales[i, 1]), deviation(scales[i, 2])
             j0, j02, j1, j12, _, _ = perspective(view, x, y, z)
             pq = rows(view, j0, j02, j1, j12)
-            u0 = s0 * (r[0] * pq[0] + r[3] * pq[1] + r[6] * pq[2])
-            u1 = s1 * (r[1] * pq[0] + r[4] * pq[1] + r[7] * pq[2])
-            u2 = s2 * (r[2] * pq[0] + r[5] * pq[1] + r[8] * pq[2])
-            v0 = s0 * (r[0] * pq[3] + r[3] * pq[4] + r[6] * pq[5])
-            v1 = s1 * (r[1] * pq[3] + r[4] * pq[4] + r[7] * pq[5])
-            v2 = s2 * (r[2] * pq[3] + r[5] * pq[4] + r[8] * pq[5])
+            p0, p1, p2, q0, q1, q2 = pq
+            opacity = np.float64(opacities[i])
+            reach = 2.0 * math.log(opacity / alpha_min)
+            # No axis of the splat is longer on the picture than its longest standard deviation allows.
+            longest = max(s0, s1, s2)
+            longest *= longest
+            most_a, most_c = p0 * p0 + p1 * p1 + p2 * p2, q0 * q0 + q1 * q1 + q2 * q2
+            if beyond(px, width, reach * (longest * most_a + DILATION)) or beyond(
+                py, height, reach * (longest * most_c + DILATION)
+            ):
+                bad += not finite_colour(i, sh0, shN, higher)
+                continue
+            qw, qx, qy, qz, _ = unit(quats[i])
+            r = rotation(qw, qx, qy, qz)
+            u0 = s0 * (r[0] * p0 + r[3] * p1 + r[6] * p2)
+            u1 = s1 * (r[1] * p0 + r[4] * p1 + r[7] * p2)
+            u2 = s2 * (r[2] * p0 + r[5] * p1 + r[8] * p2)
+            v0 = s0 * (r[0] * q0 + r[3] * q1 + r[6] * q2)
+            v1 = s1 * (r[1] * q0 + r[4] * q1 + r[7] * q2)
+            v2 = s2 * (r[2] * q0 + r[5] * q1 + r[8] * q2)
             A = u0 * u0 + u1 * u1 + u2 * u2
             B = u0 * v0 + u1 * v1 + u2 * v2
             C = v0 * v0 + v1 * v1 + v2 * v2
             bare, dilated = determinants(pq, r, s0, s1, s2, A + C)
             A += DILATION
             C += DILATION
-            opacity = np.float64(opacities[i])
             if antialiased:
                 opacity *= compensation(bare, dilated)
-            px = view[12] * (x / z) + view[14]
-            py = view[13] * (y / z) + view[15]
+                reach = 2.0 * math.log(max(opacity / alpha_min, 1.0))
             if not (opacity >= alpha_min and math.isfinite(dilated) and math.isfinite(px) and math.isfinite(py)):
+                bad += not finite_colour(i, sh0, shN, higher)
                 continue
             # opacity · exp(−½ d²) = alpha_min; a little more, so that rounding never takes a pixel away.
-            reach = math.sqrt(2.0 * math.log(opacity / alpha_min)) * (1.0 + 1e-6) + 1e-6
-            rx, ry = reach * math.sqrt(A), reach * math.sqrt(C)
+            reach = math.sqrt(reach) * (1.0 + 1e-6) + 1e-6
+            root_a, root_c = math.sqrt(A), math.sqrt(C)
+            rx, ry = reach * root_a, reach * root_c
             x0 = math.ceil(min(max(px - rx - 0.5, 0.0), np.float64(width)))
             x1 = math.floor(min(max(px + rx + 0.5, 0.0), np.float64(width)))
             y0 = math.ceil(min(max(py - ry - 0.5, 0.0), np.float64(height)))
             y1 = math.floor(min(max(py + ry + 0.5, 0.0), np.float64(height)))
             if x1 <= x0 or y1 <= y0:
+                bad += not finite_colour(i, sh0, shN, higher)
                 continue
-            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
-            shape[i, 0], shape[i, 1] = px, py
-            shape[i, 2], shape[i, 3], shape[i, 4] = C / dilated, -B / dilated, A / dilated
-            shape[i, 5] = opacity
-            extent[i, 0], extent[i, 1], extent[i, 2] = B / C, reach * math.sqrt(dilated / C), 1.0 / ry
-            extent[i, 3], extent[i, 4], extent[i, 5] = rx * (B / A), px, py
             dx, dy, dz, _ = direction(view, means[i])
             sh_basis(degree, dx, dy, dz, basis)
-            for c in range(3):
-                colour = 0.5 + basis[0] * sh0[i, c]
-                for k in range(higher):
-                    colour += basis[k + 1] * shN[i, k, c]
-                shape[i, 6 + c] = max(colour, 0.0)
+            red, green, blue = basis[0] * sh0[i, 0], basis[0] * sh0[i, 1], basis[0] * sh0[i, 2]
+            for k in range(higher):
+                red += basis[k + 1] * shN[i, k, 0]
+                green += basis[k + 1] * shN[i, k, 1]
+                blue += basis[k + 1] * shN[i, k, 2]
+            if not math.isfinite(red + green + blue):
+                bad += 1
+                continue
+            over, over_a, over_c = 1.0 / dilated, 1.0 / root_a, 1.0 / root_c
+            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
+            shape[i, 0], shape[i, 1] = px, py
+            shape[i, 2], shape[i, 3], shape[i, 4] = C * over, -B * over, A * over
+            shape[i, 5] = opacity
+            shape[i, 6], shape[i, 7], shape[i, 8] = max(red + 0.5, 0.0), max(green + 0.5, 0.0), max(blue + 0.5, 0.0)
             shape[i, 9] = z
+            extent[i, 0], extent[i, 1] = B * over_c * over_c, reach * math.sqrt(dilated) * over_c
+            extent[i, 2], extent[i, 3], extent[i, 4], extent[i, 5] = 1.0 / ry, reach * B * over_a, px, py
             near32 = np.float32(z)
             if math.isfinite(near32):
                 depth[i] = near32

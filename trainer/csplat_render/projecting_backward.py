@@ -155,19 +155,16 @@ def project_backward(
 
             # Opacity and its compensation; covariance (A, B; B, C).
             gA, gB, gC = 0.5 * sxx, sxy, 0.5 * syy
-            g_opacity = s0_ / shape[i, 5]
             if antialiased:
                 A, B, C = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
                 bare, dilated = determinants(pq, r, s0, s1, s2, A + C)
                 ratio = bare / dilated
-                factor = math.sqrt(max(ratio, COMPENSATION_MIN))
                 if ratio > COMPENSATION_MIN:
-                    g = g_opacity * np.float64(opacities[i]) * 0.5 / factor / dilated
+                    g = 0.5 * s0_ / bare
                     gA += g * (C - ratio * (C + DILATION))
                     gC += g * (A - ratio * (A + DILATION))
                     gB -= g * 2.0 * B * (1.0 - ratio)
-                g_opacity *= factor
-            g_opacities[i] = _clean(g_opacity)
+            g_opacities[i] = _clean(s0_ / np.float64(opacities[i]))
 
             # Half-axes on the picture, then standard deviations, axes, rows of the Jacobian.
             du0, dv0 = 2.0 * gA * u0 + gB * v0, 2.0 * gC * v0 + gB * u0

@@ -214,7 +214,7 @@ class Rasteriser:
         chunks = CHUNKS if tile_count < _LARGE else _CHUNKS_OF_A_LARGE_PICTURE
         counts = self._buffer("counts", (chunks, tile_count), np.int32)
         starts = self._buffer("starts", (tile_count + 1,), np.int64)
-        touched = self._buffer("touched", (n,), np.int32)
+        touched = self._buffer("touched", (n if self.gradients else 0,), np.int32)
         sorted_extent = self._buffer("sorted_extent", (len(order), 6), np.float64)
         sorted_box = self._buffer("sorted_box", (len(order), 4), np.int32)
         arrange(order, extent, box, sorted_extent, sorted_box)

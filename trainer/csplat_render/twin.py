@@ -64,6 +64,7 @@ def render_exact(
     background: ArrayLike = (0.0, 0.0, 0.0),
     antialiased: bool = False,
     sh_degree: int | None = None,
+    transmittance_min: float = TRANSMITTANCE_MIN,
     decisions: Decisions | None = None,
 ) -> RenderResult:
     """Render a picture as `Rasteriser.forward` does, from the equations.
@@ -74,6 +75,7 @@ def render_exact(
         background: red, green, blue behind everything.
         antialiased: scale opacities by what the dilation added.
         sh_degree: highest degree of the spherical harmonics; None for all there are.
+        transmittance_min: when a pixel is finished; 0 for never.
         decisions: records the outcomes of all comparisons; if it holds some, they are used.
 
     Returns:
@@ -84,7 +86,7 @@ def render_exact(
     degree = available if sh_degree is None else min(sh_degree, available)
     with np.errstate(all="ignore"):
         order, drawn, ignored = _project(splats, camera, degree, antialiased, decisions)
-        rgb, transmittance, depth = _blend(drawn, camera, decisions)
+        rgb, transmittance, depth = _blend(drawn, camera, transmittance_min, decisions)
     rgb += transmittance[..., None] * np.asarray(background, np.float64)
     radii = np.zeros(len(splats.means), np.float32)
     radii[order] = 3.0 * np.sqrt(np.linalg.eigvalsh(drawn["covariance"])[:, 1])
@@ -169,7 +171,9 @@ def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: De
     return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)
 
 
-def _blend(drawn: dict[str, Array], camera: Camera, decisions: Decisions) -> tuple[Array, Array, Array]:
+def _blend(
+    drawn: dict[str, Array], camera: Camera, transmittance_min: float, decisions: Decisions
+) -> tuple[Array, Array, Array]:
     """Colour, transmittance and depth of every pixel."""
     ys, xs = np.mgrid[: camera.H, : camera.W].reshape(2, -1) + 0.5
     before = np.ones(len(xs))
@@ -183,7 +187,7 @@ def _blend(drawn: dict[str, Array], camera: Camera, decisions: Decisions) -> tup
         alpha = np.where(decisions.ask(alpha < ALPHA_CAP), alpha, ALPHA_CAP)
         alpha = np.where(decisions.ask(alpha >= ALPHA_MIN), alpha, 0.0)
         after = before * np.cumprod(1.0 - alpha, axis=0)
-        seen = decisions.ask(going & (after >= TRANSMITTANCE_MIN))
+        seen = decisions.ask(going & (after >= transmittance_min))
         through = np.concatenate([before[None], after[:-1]])
         weight = np.where(seen, alpha * through, 0.0)
         rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])

@@ -16,7 +16,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from csplat_trainer.kernels import parallel_kernel, relaxed_kernel
+from csplat_render.similarity import C1, C2, CHANNELS, RADIUS, WINDOW, blur_across, blur_down, blur_products, blur_twin
+from csplat_trainer.kernels import parallel_kernel
 
 __all__ = ["LOSS_WEIGHTS", "LossValue", "PhotometricLoss", "photometric_loss_twin"]
 
@@ -26,20 +27,8 @@ F64 = NDArray[np.float64]
 #: Weights of L1 and of 1 − SSIM, by the name of the option.
 LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}
 
-_C1, _C2 = 0.01**2, 0.03**2
-_SIGMA = 1.5
-_RADIUS = 5
-_PAD = 3 * _RADIUS  # values on either side of a row; three channels lie beside each other
-
-
-def _window() -> F64:
-    taps = np.exp(-(np.arange(-_RADIUS, _RADIUS + 1) ** 2) / (2.0 * _SIGMA**2))
-    normalised: F64 = taps / taps.sum()
-    return normalised
-
-
-_WINDOW = _window()
-_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(tap) for tap in _WINDOW[_RADIUS:])  # centre, then outwards
+_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels lie beside each other
+_TAPS = WINDOW[RADIUS:].astype(np.float32)  # of the window, from its middle outwards
 
 
 @dataclass(frozen=True)
@@ -77,7 +66,7 @@ class PhotometricLoss:
     def __init__(self, height: int, width: int, l1_weight: float = 0.8, ssim_weight: float = 0.2) -> None:
         self.l1_weight, self.ssim_weight = float(l1_weight), float(ssim_weight)
         self._shape = (height, width, 3)
-        rows, row = height + 2 * _RADIUS, 3 * width
+        rows, row = height + 2 * RADIUS, 3 * width
         self._across = np.zeros((5, rows, row), np.float32)  # blurred along the rows; zeros above and below
         self._partial = np.zeros((3, height, row + 2 * _PAD), np.float32)  # zeros left and right
         self._partial_across = np.zeros((3, rows, row), np.float32)
@@ -102,7 +91,7 @@ class PhotometricLoss:
         count = x.size
         l1_step = np.float32(self.l1_weight / count)
         if self.ssim_weight != 0.0:
-            _blur_products(x, y, self._across)
+            blur_products(x, y, _TAPS, self._across)
             _ssim_partials(x, y, self._across, self._partial, self._sums)
             _blur_partials(self._partial, self._partial_across)
             _combine(x, y, self._partial_across, l1_step, np.float32(-self.ssim_weight / count), gradient)
@@ -113,47 +102,15 @@ class PhotometricLoss:
         return LossValue(loss, l1, ssim, mse), self._gradient
 
 
-@relaxed_kernel
-def _blur_across(row: F32, out: F32) -> None:
-    """Blur a row that has five pixels of zeros on either side; vectorises over its values."""
-    for i in range(out.shape[0]):
-        out[i] = (
-            _W0 * row[i + 15]
-            + _W1 * (row[i + 12] + row[i + 18])
-            + _W2 * (row[i + 9] + row[i + 21])
-            + _W3 * (row[i + 6] + row[i + 24])
-            + _W4 * (row[i + 3] + row[i + 27])
-            + _W5 * (row[i] + row[i + 30])
-        )
-
-
-@parallel_kernel(relaxed=True)
-def _blur_products(x: F32, y: F32, across: F32) -> None:
-    """Blur x, y, x², y², xy along each row; vectorises over the values of a row."""
-    height, width = x.shape
-    for r in prange(height):
-        rows = np.zeros((5, width + 2 * _PAD), np.float32)
-        a, b, aa, bb, ab = rows[0], rows[1], rows[2], rows[3], rows[4]
-        for i in range(width):
-            u, v = x[r, i], y[r, i]
-            a[i + _PAD] = u
-            b[i + _PAD] = v
-            aa[i + _PAD] = u * u
-            bb[i + _PAD] = v * v
-            ab[i + _PAD] = u * v
-        for f in range(5):
-            _blur_across(rows[f], across[f, r + _RADIUS])
-
-
 @parallel_kernel(relaxed=True)
 def _ssim_partials(x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
     """SSIM of each value, its derivatives by mean, square and product; vectorises over a row."""
     height, width = x.shape
-    c1, c2, two, one = np.float32(_C1), np.float32(_C2), np.float32(2.0), np.float32(1.0)
+    c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
     for r in prange(height):
         moments = np.empty((5, width), np.float32)
         for f in range(5):
-            _blur_down(across[f], r, moments[f])
+            blur_down(across[f], r, _TAPS, moments[f])
         m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
         p0, p1, p2 = partial[0, r], partial[1, r], partial[2, r]
         ssim_sum, l1_sum, square_sum = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -179,26 +136,12 @@ def _ssim_partials(x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None
         sums[r, 2] = square_sum
 
 
-@relaxed_kernel
-def _blur_down(field: F32, r: int, out: F32) -> None:
-    """Blur across the rows r .. r + 10 of a field; vectorises over the values of a row."""
-    for i in range(out.shape[0]):
-        out[i] = (
-            _W0 * field[r + 5, i]
-            + _W1 * (field[r + 4, i] + field[r + 6, i])
-            + _W2 * (field[r + 3, i] + field[r + 7, i])
-            + _W3 * (field[r + 2, i] + field[r + 8, i])
-            + _W4 * (field[r + 1, i] + field[r + 9, i])
-            + _W5 * (field[r, i] + field[r + 10, i])
-        )
-
-
 @parallel_kernel(relaxed=True)
 def _blur_partials(partial: F32, across: F32) -> None:
     """Blur the three derivatives along each row; vectorises over the values of a row."""
     for r in prange(partial.shape[1]):
         for f in range(3):
-            _blur_across(partial[f, r], across[f, r + _RADIUS])
+            blur_across(partial[f, r], _TAPS, across[f, r + RADIUS])
 
 
 @parallel_kernel(relaxed=True)
@@ -208,7 +151,7 @@ def _combine(x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.flo
     for r in prange(height):
         blurred = np.empty((3, width), np.float32)
         for f in range(3):
-            _blur_down(across[f], r, blurred[f])
+            blur_down(across[f], r, _TAPS, blurred[f])
         p0, p1, p2 = blurred[0], blurred[1], blurred[2]
         for i in range(width):
             difference = x[r, i] - y[r, i]
@@ -247,25 +190,14 @@ def photometric_loss_twin(
         The figures, and the gradient of `loss` by `rendered`, [H, W, 3].
     """
     x, y = rendered.astype(np.float64), photograph.astype(np.float64)
-    m1, m2 = _blur_twin(x), _blur_twin(y)
-    s11, s22, s12 = _blur_twin(x * x) - m1 * m1, _blur_twin(y * y) - m2 * m2, _blur_twin(x * y) - m1 * m2
-    a, b, c, d = 2 * m1 * m2 + _C1, 2 * s12 + _C2, m1 * m1 + m2 * m2 + _C1, s11 + s22 + _C2
+    m1, m2 = blur_twin(x), blur_twin(y)
+    s11, s22, s12 = blur_twin(x * x) - m1 * m1, blur_twin(y * y) - m2 * m2, blur_twin(x * y) - m1 * m2
+    a, b, c, d = 2 * m1 * m2 + C1, 2 * s12 + C2, m1 * m1 + m2 * m2 + C1, s11 + s22 + C2
     ssim = a * b / (c * d)
     by_square, by_product = -ssim / d, 2 * a / (c * d)
     by_mean = 2 * m2 * b / (c * d) - 2 * m1 * ssim / c - 2 * m1 * by_square - m2 * by_product
     # The window is symmetric, so that the transpose of the blur is the blur.
-    ssim_gradient = _blur_twin(by_mean) + 2 * x * _blur_twin(by_square) + y * _blur_twin(by_product)
+    ssim_gradient = blur_twin(by_mean) + 2 * x * blur_twin(by_square) + y * blur_twin(by_product)
     gradient = (l1_weight * np.sign(x - y) - ssim_weight * ssim_gradient) / x.size
     l1, mean_ssim, mse = float(np.abs(x - y).mean()), float(ssim.mean()), float(np.square(x - y).mean())
     return LossValue(l1_weight * l1 + ssim_weight * (1 - mean_ssim), l1, mean_ssim, mse), gradient
-
-
-def _blur_twin(image: F64) -> F64:
-    blurred = image
-    for axis in (0, 1):
-        widths = [(_RADIUS, _RADIUS) if one == axis else (0, 0) for one in range(3)]
-        padded = np.pad(blurred, widths)
-        blurred = np.zeros_like(image)
-        for k, tap in enumerate(_WINDOW):
-            blurred += tap * np.take(padded, np.arange(k, k + image.shape[axis]), axis)
-    return blurred

@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat_render.lpips import MIN_SIZE, Lpips
+from csplat_render.lpips import MIN_SIZE, SCALE, SHIFT, Lpips
 
 __all__ = ["PerceptualLoss"]
 
 F32 = NDArray[np.float32]
 
-_SHIFT = (-0.030, -0.088, -0.188)
-_SCALE = (0.458, 0.448, 0.450)
 _STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED = (1, 2)  # layers that a 3×3 pooling of stride 2 precedes
 _EPSILON = 1e-10
@@ -38,7 +36,7 @@ class PerceptualLoss:
         self._kernels = [torch.from_numpy(np.ascontiguousarray(one.transpose(3, 2, 0, 1))) for one in weights.kernels]
         self._biases = [torch.from_numpy(np.array(one)) for one in weights.biases]
         self._heads = [torch.from_numpy(np.array(one)).reshape(1, -1, 1, 1) for one in weights.heads]
-        self._shift, self._scale = (torch.tensor(one).reshape(1, 3, 1, 1) for one in (_SHIFT, _SCALE))
+        self._shift, self._scale = (torch.from_numpy(one.copy()).reshape(1, 3, 1, 1) for one in (SHIFT, SCALE))
 
     def distance(self, first: F32, second: F32) -> float:
         """LPIPS of two pictures, [H, W, 3] in 0..1."""

@@ -1,0 +1,108 @@
+"""The benchmarks of renderer and trainer: that they measure what they say, on little."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("scipy", reason="training wants the extra [render]")
+pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+
+from csplat.ply import read_ply
+from csplat_render import render
+from csplat_render.virtual import virtual_cameras
+
+BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+
+# They lie in the folder that is named above.
+from crowds import crowd, split  # noqa: E402
+from oracle import cropped, difference  # noqa: E402
+
+
+def run(script, *arguments):
+    command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def sample(sample_path):
+    return read_ply(sample_path)
+
+
+def test_a_crowd_has_as_many_splats_in_view_as_it_says(sample):
+    cameras = virtual_cameras(sample, 3, 160, 120)
+    count = 2 * len(sample)
+    found = crowd(sample, cameras, count)
+    drawn = np.median([render(found, camera).drawn for camera in cameras])
+    assert abs(drawn - count) <= 0.02 * count
+
+
+def test_split_splats_have_the_spread_of_the_whole(make_model):
+    model = make_model(1, 0, scales=np.log(np.array([[0.5, 0.1, 0.02]], np.float32)))
+    parts = split(model, 20_000, np.random.default_rng(0))
+    assert len(parts) == 20_000
+    w, x, y, z = model.quats[0].astype(np.float64)
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    local = (parts.means - model.means[0]) @ axes
+    total = np.sqrt(local.var(axis=0) + np.exp(2.0 * parts.scales[0]))
+    np.testing.assert_allclose(total, [0.5, 0.1, 0.02], rtol=0.03)
+
+
+def test_the_middle_of_a_picture_is_the_same_pixel_for_pixel(sample):
+    view = virtual_cameras(sample, 1, 160, 120)[0]
+    whole, middle = render(sample, view).rgb, render(sample, cropped(view, 40, 30)).rgb
+    off = difference(middle, whole[45:75, 60:100])
+    assert off.share <= 0.02  # splats whose centres lie far outside are linearised elsewhere
+    assert off.mean <= 1e-3
+
+
+def test_the_renderer_is_measured(tmp_path):
+    run("render.py", "--scenes", "sample", "--views", 1, "--rounds", 1, "--pairs", 1e6, "--json", tmp_path / "r.json")
+    results = json.loads((tmp_path / "r.json").read_text())["results"]
+    assert ["standard", "fast", "antialiased"] == [one["mode"] for one in results]
+    assert all(one["forward_ms"] > 0.0 and one["backward_ms"] > 0.0 for one in results)
+    assert results[0]["off"]["most"] <= 1 / 255
+    assert results[1]["off"]["mean"] > results[0]["off"]["mean"]
+
+
+def test_training_is_measured(data_dir, tmp_path):
+    folder = data_dir / "images" / "lego200"
+    if not folder.is_dir():
+        pytest.skip("the Lego pictures are absent")
+    run("training.py", folder, "--rows", "200:40x40", "--warm", 2, "--steps", 5, "--json", tmp_path / "t.json")
+    (result,) = json.loads((tmp_path / "t.json").read_text())["results"]
+    times = result["milliseconds"]
+    assert all(times[name] > 0.0 for name in ("forward", "loss", "backward", "Adam"))
+    assert result["bytes_per_splat"] == result["memory_bytes"] / 200
+
+
+def test_cameras_are_compared(data_dir, tmp_path):
+    if not (data_dir / "psnr_cameras" / "plane3.json").exists():
+        pytest.skip("plane3 is absent")
+    out = tmp_path / "v.json"
+    run(
+        "virtual_cameras.py",
+        "--scenes",
+        "plane3",
+        "--presets",
+        "fast",
+        "--seeds",
+        "0",
+        "--json",
+        out,
+        "--cache",
+        tmp_path,
+    )
+    (result,) = json.loads(out.read_text())["results"]
+    assert abs(result["own"] - result["given"]) <= 1.0

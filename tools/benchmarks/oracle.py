@@ -1,0 +1,241 @@
+"""What the rasteriser is checked against, for tests and benchmarks: random and adversarial splats, the exact twin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat_render import Camera
+from csplat_render.arrays import Gradients, HasSplats, RenderResult, Splats
+from csplat_render.rasterise import Rasteriser
+from csplat_render.twin import Decisions, render_exact
+
+__all__ = [
+    "GROUPS",
+    "VIEW",
+    "Case",
+    "Difference",
+    "adversarial",
+    "cropped",
+    "difference",
+    "extreme_splats",
+    "facing",
+    "finite_differences",
+    "float32_errors",
+    "gradients_of",
+    "random_gradients",
+    "random_splats",
+    "relative_error",
+]
+
+Array = NDArray[Any]
+Arrays = dict[str, Array]
+
+#: Groups of parameters, in the order of `Splats`.
+GROUPS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+# A turned camera with an unusual centre, near enough that some splats lie beyond the field of view.
+VIEW = Camera(
+    [[30.0, 0.0, 12.5], [0.0, 28.0, 9.0], [0.0, 0.0, 1.0]],
+    [[0.98006658, 0.0, 0.19866933, 0.05], [0.0, 1.0, 0.0, -0.03], [-0.19866933, 0.0, 0.98006658, 1.6], [0, 0, 0, 1.0]],
+    25,
+    19,
+)
+
+_STEP = 1e-5  # of finite differences: their error is about its square
+_FLIPPED = 1e-4  # colours differ by more where a comparison fell the other way
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How two pictures of the same splats differ.
+
+    Attributes:
+        most: largest difference of a colour.
+        share: of the pixels where a colour differs by more than 1/255.
+        mean: absolute difference of colours.
+    """
+
+    most: float
+    share: float
+    mean: float
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Splats that break rasterisers.
+
+    Attributes:
+        arrays: of the splats, float32.
+        view: where they are seen from.
+        antialiased: render so.
+        beyond: the gradients leave what float32 can hold: they are to be finite, no more.
+    """
+
+    arrays: Arrays
+    view: Camera
+    antialiased: bool = False
+    beyond: bool = False
+
+
+def difference(picture: Array, exact: Array) -> Difference:
+    """Compare two pictures, [H, W, 3]."""
+    error = np.abs(np.asarray(picture, np.float64) - exact)
+    return Difference(float(error.max()), float(np.mean(error.max(2) > 1 / 255)), float(error.mean()))
+
+
+def cropped(view: Camera, width: int, height: int) -> Camera:
+    """The middle of a picture, pixel for pixel: what the twin can render in seconds."""
+    K = view.K.copy()
+    K[0, 2] -= (view.W - width) // 2
+    K[1, 2] -= (view.H - height) // 2
+    return replace(view, K=K, W=width, H=height)
+
+
+def facing(focal: float = 40.0, near: float = 0.2, distance: float = 3.0, width: int = 50, height: int = 37) -> Camera:
+    """A camera on the z axis that looks at the origin."""
+    viewmat = np.eye(4)
+    viewmat[2, 3] = distance
+    return Camera([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], viewmat, width, height, near=near)
+
+
+def random_splats(count: int, degree: int, seed: int) -> Arrays:
+    """Splats of all shapes in front of `VIEW`, float64."""
+    rng = np.random.default_rng(seed)
+    return {
+        "means": rng.uniform((-1.1, -0.9, -0.6), (1.1, 0.9, 0.9), (count, 3)),
+        "quats": rng.standard_normal((count, 4)),
+        "scales": rng.uniform(-3.0, -0.8, (count, 3)),
+        "opacities": rng.uniform(0.2, 1.0, count),
+        "sh0": rng.standard_normal((count, 3)),
+        "shN": 0.4 * rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
+    }
+
+
+def random_gradients(view: Camera, seed: int) -> tuple[Array, Array, Array]:
+    """Gradients of some loss towards colours, alpha and depth of a picture."""
+    rng = np.random.default_rng(seed)
+    size = (view.H, view.W)
+    return rng.standard_normal((*size, 3)), rng.standard_normal(size), rng.standard_normal(size)
+
+
+def relative_error(value: Array, wanted: Array) -> float:
+    """Length of the difference over the length of what is wanted, which counts as 1e-30 at least: as no float32."""
+    off = np.linalg.norm(np.asarray(value, np.float64) - wanted)
+    return float(off / max(1e-30, float(np.linalg.norm(wanted))))
+
+
+def gradients_of(
+    splats: HasSplats, view: Camera, weights: tuple[Array, Array, Array], dtype: Any = np.float64, **options: Any
+) -> tuple[RenderResult, Gradients]:
+    """A picture, and the gradients of the sum of its values times weights."""
+    rasteriser = Rasteriser(dtype=dtype)
+    picture = rasteriser.forward(splats, view, **options)
+    return picture, rasteriser.backward(*(weight.astype(dtype) for weight in weights))
+
+
+def finite_differences(
+    arrays: Arrays, view: Camera, weights: tuple[Array, Array, Array], **options: Any
+) -> tuple[RenderResult, Arrays]:
+    """The twin's picture, and the slopes of the sum of its values times weights; comparisons do not change sides."""
+    decisions = Decisions()
+    picture = render_exact(Splats(**arrays), view, decisions=decisions, **options)
+
+    def loss(changed: Mapping[str, Array]) -> float:
+        decisions.replay()
+        result = render_exact(Splats(**changed), view, decisions=decisions, **options)
+        return float(sum(np.sum(a * b) for a, b in zip((result.rgb, result.alpha, result.depth), weights, strict=True)))
+
+    slopes = {}
+    for group in GROUPS:
+        slopes[group] = np.zeros_like(arrays[group])
+        for index in np.ndindex(arrays[group].shape):
+            values = []
+            for step in (_STEP, -_STEP):
+                moved = arrays[group].copy()
+                moved[index] += step
+                values.append(loss({**arrays, group: moved}))
+            slopes[group][index] = (values[0] - values[1]) / (2.0 * _STEP)
+    return picture, slopes
+
+
+def float32_errors(
+    splats: HasSplats, view: Camera, weights: tuple[Array, Array, Array], **options: Any
+) -> tuple[int, dict[str, float]]:
+    """Compare float32 gradients with float64 ones.
+
+    Where a comparison (alpha against 1/255, say) fell the other way in float32, a pixel gives one splat another
+    gradient: as many splats as there are such pixels are left out, those that differ most.
+
+    Returns:
+        The number of these pixels, and the relative error of each group of parameters.
+    """
+    pictures, found = zip(
+        *(gradients_of(splats, view, weights, dtype, **options) for dtype in (np.float32, np.float64)), strict=True
+    )
+    flipped = int(np.count_nonzero(np.abs(pictures[0].rgb - pictures[1].rgb).max(2) > _FLIPPED))
+    errors = {}
+    for group in GROUPS:
+        value, wanted = (np.asarray(getattr(one, group), np.float64).reshape(len(splats.means), -1) for one in found)
+        kept = np.argsort(np.square(value - wanted).sum(1))[: max(0, len(value) - flipped)]
+        errors[group] = relative_error(value[kept], wanted[kept])
+    return flipped, errors
+
+
+def extreme_splats(count: int = 64, degree: int = 1, seed: int = 0, **fields: Any) -> Arrays:
+    """Random splats around the origin, float32; `fields` are what all of them have."""
+    rng = np.random.default_rng(seed)
+    arrays: Arrays = {
+        "means": rng.uniform(-1.0, 1.0, (count, 3)),
+        "quats": rng.standard_normal((count, 4)),
+        "scales": rng.uniform(-4.0, -1.0, (count, 3)),
+        "opacities": rng.random(count),
+        "sh0": rng.standard_normal((count, 3)),
+        "shN": rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
+    }
+    arrays.update({name: np.broadcast_to(value, arrays[name].shape) for name, value in fields.items()})
+    return {name: np.array(value, np.float32) for name, value in arrays.items()}
+
+
+def adversarial() -> Iterator[tuple[str, Case]]:
+    """Named cases: long and thin, far and near, tiny and huge."""
+    shapes = {
+        "needle": (0.0, -13.8, -13.8),
+        "disc": (0.0, 0.0, -13.8),
+        "large needle": (4.0, -9.8, -9.8),
+        "large disc": (4.0, 4.0, -9.8),
+        "huge needle": (9.0, -4.8, -4.8),
+    }
+    for name, scales in shapes.items():
+        for antialiased in (False, True):
+            yield (
+                name + (", antialiased" if antialiased else ""),
+                Case(extreme_splats(scales=scales), facing(), antialiased),
+            )
+    yield "camera inside", Case(extreme_splats(scales=(1.0, 0.5, 0.2)), facing(distance=0.0))
+    for near in (1e-30, 1e-6, 0.2, 3.0):
+        arrays = extreme_splats(count=80)
+        arrays["means"][:, 2] = np.concatenate(
+            [np.float32(near) * np.linspace(0.5, 2.0, 40), np.linspace(-4.0, 4.0, 40)]
+        )
+        yield f"at a near plane of {near:g}", Case(arrays, facing(near=near, distance=0.0), beyond=near < 1e-20)
+    for alpha in (0.0, 1.0):
+        yield f"alpha {alpha:g}", Case(extreme_splats(opacities=alpha), facing())
+    for scale in (-60.0, 60.0):
+        arrays = extreme_splats()
+        arrays["scales"][:] = scale
+        yield f"log-scales {scale:g}", Case(arrays, facing())
+    mixed = extreme_splats()
+    mixed["scales"][:, 0], mixed["scales"][:, 1] = 60.0, -60.0
+    yield "log-scales 60 and -60", Case(mixed, facing(), antialiased=True, beyond=True)
+    for focal in (1e-6, 1e-2, 1e4, 1e9):
+        yield f"focal length {focal:g}", Case(extreme_splats(), facing(focal=focal))
+    for far in (1e-20, 1e20, 1e37):
+        arrays = extreme_splats()
+        arrays["means"] *= np.float32(far)
+        arrays["scales"] += np.float32(np.log(far))
+        yield f"{far:g} times as large", Case(arrays, facing(near=far * 1e-3, distance=3 * far), beyond=far > 1e30)

@@ -1,0 +1,123 @@
+"""The rasteriser's equations once more, in plain torch: what autograd makes of them is what gradients ought to be.
+
+Every splat at every pixel, float64, nothing clever: for a dozen splats and some hundred pixels.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from csplat_render import Camera
+from csplat_render.conventions import (
+    ALPHA_CAP,
+    ALPHA_MIN,
+    COMPENSATION_MIN,
+    DILATION,
+    FOV_MARGIN,
+    TRANSMITTANCE_MIN,
+)
+from csplat_render.harmonics import sh_basis
+from csplat_render.jit import python
+
+__all__ = ["autograd_gradients", "render_torch"]
+
+Array = NDArray[Any]
+Tensor = torch.Tensor
+
+
+def autograd_gradients(
+    arrays: dict[str, Array],
+    view: Camera,
+    weights: tuple[Array, Array, Array],
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialiased: bool = False,
+) -> tuple[Array, dict[str, Array]]:
+    """A picture, and autograd's gradients of the sum of its colours, alpha and depth times weights.
+
+    Args:
+        arrays: the six of the splats, float64.
+        view: from where.
+        weights: [H, W, 3], [H, W], [H, W].
+        background: behind everything.
+        antialiased: scale opacities by what the dilation added.
+    """
+    splats = {name: torch.tensor(array, requires_grad=True) for name, array in arrays.items()}
+    pictures = render_torch(splats, view, background, antialiased)
+    loss = sum((picture * torch.tensor(weight)).sum() for picture, weight in zip(pictures, weights, strict=True))
+    assert isinstance(loss, Tensor)
+    loss.backward()
+    gradients = {name: np.zeros(one.shape) if one.grad is None else one.grad.numpy() for name, one in splats.items()}
+    return pictures[0].detach().numpy(), gradients
+
+
+def render_torch(
+    splats: dict[str, Tensor], view: Camera, background: tuple[float, float, float], antialiased: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours, alpha and depth of a picture."""
+    centre, covariance, opacity, colour, depth = _project(splats, view, antialiased)
+    ys, xs = torch.meshgrid(torch.arange(view.H) + 0.5, torch.arange(view.W) + 0.5, indexing="ij")
+    offset = torch.stack([xs, ys], -1).double() - centre[:, None, None]  # splat, row, column, xy
+    power = -0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(covariance), offset)
+    alpha = torch.clamp(opacity[:, None, None] * torch.exp(power), max=ALPHA_CAP)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    after = torch.cumprod(1.0 - alpha, 0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    seen = (after >= TRANSMITTANCE_MIN).double().cumprod(0)
+    weight = seen * alpha * before
+    left = 1.0 - weight.sum(0)  # equals the product of 1 − alpha over what was seen
+    rgb = torch.einsum("nhw,nc->hwc", weight, colour) + left[..., None] * torch.tensor(background, dtype=torch.float64)
+    return rgb, 1.0 - left, torch.einsum("nhw,n->hw", weight, depth)
+
+
+def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tuple[Tensor, ...]:
+    """Centre, covariance, opacity, colour and depth of what is in front, nearest first."""
+    R, t = torch.tensor(view.viewmat[:3, :3]), torch.tensor(view.viewmat[:3, 3])
+    z = (splats["means"] @ R.T + t)[:, 2]
+    order = torch.argsort(z.detach().float(), stable=True)
+    order = order[z[order] > view.near]
+    means, quats, scales, opacity, sh0, shN = (splats[name][order] for name in splats)
+    x, y, z = (means @ R.T + t).T
+    fx, fy, cx, cy = (float(value) for value in (view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]))
+    tx, ty = _clamped(x / z, fx, cx, view.W), _clamped(y / z, fy, cy, view.H)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], 1
+    )
+    axes = jacobian @ R @ _rotation(quats) @ torch.diag_embed(torch.exp(scales))
+    bare = axes @ axes.mT
+    covariance = bare + DILATION * torch.eye(2).double()
+    if antialiased:
+        ratio = torch.linalg.det(bare) / torch.linalg.det(covariance)
+        opacity = opacity * torch.sqrt(torch.clamp(ratio, min=COMPENSATION_MIN))
+    direction = means - torch.tensor(view.position)
+    direction = direction / direction.norm(dim=1, keepdim=True)
+    coefficients = torch.cat([sh0[:, None], shN], 1)
+    basis: list[Any] = [torch.zeros(())] * coefficients.shape[1]
+    degree = int(np.sqrt(len(basis))) - 1
+    python(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
+    values = torch.stack([one * torch.ones_like(z) for one in basis], 1)
+    colour = torch.clamp(torch.einsum("nk,nkc->nc", values, coefficients) + 0.5, min=0.0)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], 1), covariance, opacity, colour, z
+
+
+def _clamped(tangent: Tensor, focal: float, centre: float, size: int) -> Tensor:
+    margin = FOV_MARGIN * 0.5 * size / focal
+    return torch.clamp(tangent, -centre / focal - margin, (size - centre) / focal + margin)
+
+
+def _rotation(quats: Tensor) -> Tensor:
+    """Columns are a splat's axes: the images of x, y, z under q v q⁻¹."""
+    w, v = quats[:, :1], quats[:, 1:]
+    length = quats.norm(dim=1, keepdim=True)
+    w, v = w / length, v / length
+    images = []
+    for axis in torch.eye(3).double():
+        u = axis.expand_as(v)
+        twice = 2.0 * torch.linalg.cross(v, u)
+        images.append(u + w * twice + torch.linalg.cross(v, twice))
+    return torch.stack(images, -1)

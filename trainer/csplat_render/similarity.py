@@ -1,0 +1,177 @@
+"""SSIM, with the window in two passes: along the rows, then across them.
+
+The window is a Gaussian of 11×11 pixels and σ 1.5, zeros lie beyond the border, C1 = 0.01² and
+C2 = 0.03²: the conventions of `csplat_render.metrics`, which the trainer's loss shares.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat_render.jit import parallel_kernel, relaxed_kernel, thread_count
+
+__all__ = [
+    "C1",
+    "C2",
+    "CHANNELS",
+    "RADIUS",
+    "WINDOW",
+    "blur_across",
+    "blur_down",
+    "blur_products",
+    "blur_twin",
+    "mean_ssim",
+    "mean_ssim_twin",
+]
+
+F64 = NDArray[np.float64]
+
+C1, C2 = 0.01**2, 0.03**2
+
+#: Pixels from the middle of the window to its edge.
+RADIUS = 5
+
+#: Values of a pixel, which lie beside each other in a row.
+CHANNELS = 3
+
+_SIGMA = 1.5
+_PAD = CHANNELS * RADIUS
+
+
+def _window() -> F64:
+    taps = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2.0 * _SIGMA**2))
+    normalised: F64 = taps / taps.sum()
+    return normalised
+
+
+#: [11] float64, its sum is 1; the window is the outer product with itself.
+WINDOW = _window()
+
+
+def mean_ssim(x: F64, y: F64) -> float:
+    """Mean SSIM over all pixels and channels.
+
+    Args:
+        x: [H, W, 3] float64, C-contiguous.
+        y: the same.
+    """
+    height, width = x.shape[0], CHANNELS * x.shape[1]
+    across = np.zeros((5, height + 2 * RADIUS, width), np.float64)
+    sums = np.empty(height, np.float64)
+    with thread_count(None):
+        blur_products(x.reshape(height, width), y.reshape(height, width), WINDOW[RADIUS:], across)
+        _similarities(across, WINDOW[RADIUS:], sums)
+    return float(sums.sum()) / x.size
+
+
+@relaxed_kernel
+def blur_across(row: Any, taps: Any, out: Any) -> None:
+    """Blur a row that has `RADIUS` pixels of zeros on either side; vectorises over its values.
+
+    Args:
+        row: [3·W + 30].
+        taps: [6], of the window, from its middle outwards; the dtype of the row.
+        out: [3·W], written.
+    """
+    w0, w1, w2, w3, w4, w5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
+    for i in range(out.shape[0]):
+        out[i] = (
+            w0 * row[i + 15]
+            + w1 * (row[i + 12] + row[i + 18])
+            + w2 * (row[i + 9] + row[i + 21])
+            + w3 * (row[i + 6] + row[i + 24])
+            + w4 * (row[i + 3] + row[i + 27])
+            + w5 * (row[i] + row[i + 30])
+        )
+
+
+@relaxed_kernel
+def blur_down(field: Any, r: int, taps: Any, out: Any) -> None:
+    """Blur across the rows r .. r + 10 of a field; vectorises over the values of a row.
+
+    Args:
+        field: [rows, 3·W].
+        r: the row above the window's middle by `RADIUS`.
+        taps: see `blur_across`.
+        out: [3·W], written.
+    """
+    w0, w1, w2, w3, w4, w5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
+    for i in range(out.shape[0]):
+        out[i] = (
+            w0 * field[r + 5, i]
+            + w1 * (field[r + 4, i] + field[r + 6, i])
+            + w2 * (field[r + 3, i] + field[r + 7, i])
+            + w3 * (field[r + 2, i] + field[r + 8, i])
+            + w4 * (field[r + 1, i] + field[r + 9, i])
+            + w5 * (field[r, i] + field[r + 10, i])
+        )
+
+
+@parallel_kernel(relaxed=True)
+def blur_products(x: Any, y: Any, taps: Any, across: Any) -> None:
+    """Blur x, y, x², y², xy along each row; parallel over rows, vectorised over the values of a row.
+
+    Args:
+        x: [H, 3·W].
+        y: [H, 3·W].
+        taps: [6], see `blur_across`.
+        across: [5, H + 10, 3·W], rows 5 .. H + 4 written.
+    """
+    height, width = x.shape
+    for r in numba.prange(height):
+        rows = np.zeros((5, width + 2 * _PAD), x.dtype)
+        a, b, aa, bb, ab = rows[0], rows[1], rows[2], rows[3], rows[4]
+        for i in range(width):
+            u, v = x[r, i], y[r, i]
+            a[i + _PAD] = u
+            b[i + _PAD] = v
+            aa[i + _PAD] = u * u
+            bb[i + _PAD] = v * v
+            ab[i + _PAD] = u * v
+        for f in range(5):
+            blur_across(rows[f], taps, across[f, r + RADIUS])
+
+
+@parallel_kernel(relaxed=True)
+def _similarities(across: Any, taps: Any, sums: Any) -> None:
+    """Sum of SSIM over each row; parallel over rows, vectorised over the values of a row.
+
+    Args:
+        across: [5, H + 10, 3·W], from `blur_products`.
+        taps: [6].
+        sums: [H], written.
+    """
+    width = across.shape[2]
+    for r in numba.prange(len(sums)):
+        moments = np.empty((5, width), across.dtype)
+        for f in range(5):
+            blur_down(across[f], r, taps, moments[f])
+        m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
+        total = 0.0
+        for i in range(width):
+            mx, my = m1[i], m2[i]
+            xx, yy, xy = e11[i] - mx * mx, e22[i] - my * my, e12[i] - mx * my
+            total += (2.0 * mx * my + C1) * (2.0 * xy + C2) / ((mx * mx + my * my + C1) * (xx + yy + C2))
+        sums[r] = total
+
+
+def mean_ssim_twin(x: F64, y: F64) -> float:
+    """The slow twin of `mean_ssim`: NumPy, one formula after the other."""
+    mx, my = blur_twin(x), blur_twin(y)
+    xx, yy, xy = blur_twin(x * x) - mx * mx, blur_twin(y * y) - my * my, blur_twin(x * y) - mx * my
+    return float(np.mean((2.0 * mx * my + C1) * (2.0 * xy + C2) / ((mx * mx + my * my + C1) * (xx + yy + C2))))
+
+
+def blur_twin(x: F64) -> F64:
+    """The window's weighted mean around each pixel of [H, W, 3]."""
+    for axis in (0, 1):
+        padded = np.pad(x, [(RADIUS, RADIUS) if i == axis else (0, 0) for i in range(3)])
+        x = sum(
+            (tap * np.take(padded, np.arange(k, k + x.shape[axis]), axis) for k, tap in enumerate(WINDOW)),
+            np.zeros_like(x),
+        )
+    return x
