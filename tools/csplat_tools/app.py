@@ -15,6 +15,7 @@ from csplat_tools.commands.encode import encode
 from csplat_tools.commands.info import info
 from csplat_tools.commands.lint import lint
 from csplat_tools.commands.render import render
+from csplat_tools.commands.simplify import simplify
 from csplat_tools.commands.train import train
 from csplat_tools.commands.verify import verify
 from csplat_tools.commands.view import export_html, view
@@ -63,6 +64,7 @@ app.command()(verify)
 app.command()(lint)
 app.command()(compare)
 app.command()(render)
+app.command()(simplify)
 app.command()(train)
 app.command()(view)
 app.command("export-html")(export_html)

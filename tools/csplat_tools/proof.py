@@ -7,8 +7,8 @@ source within the stated maxima; rms and counts are then not proved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ __all__ = ["MeasureProof", "Proof", "lattice_radii", "prove"]
 
 F64 = NDArray[np.float64]
 
+_COLOURS = ("sh0", "sh1", "sh2", "sh3")
+_REFITTED = "colours were fitted anew: renders are their judge, nothing is proved of them"
 _EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
 
 
@@ -91,19 +93,24 @@ def prove(
     """
     if stated is None:
         return Proof(failures=("the file states no errors",))
+    names = measure_names(source, decoded)
     if stated.refitted:
-        return Proof(
-            failures=("the file says that attributes were fitted anew: renders are its judge, not these bounds",)
-        )
-    failures = _compare_scenes(source, decoded, stated)
+        names = [name for name in names if name not in _COLOURS]
+        if not set(names) >= {record.measure for record in stated.records} or not stated.records:
+            return Proof(
+                failures=("the file says that attributes were fitted anew: renders are its judge, not these bounds",)
+            )
+    failures = _compare_scenes(source, decoded, stated, names)
     if failures:
         return Proof(failures=tuple(failures))
     if source_index is not None:
-        return _prove_pairs(source, decoded, stated, source_index)
-    return _prove_matches(source, decoded, header, stated, progress)
+        proof = _prove_pairs(source, decoded, stated, source_index, names)
+    else:
+        proof = _prove_matches(source, decoded, header, stated, names, progress)
+    return replace(proof, notes=(*proof.notes, _REFITTED)) if stated.refitted else proof
 
 
-def _compare_scenes(source: SplatModel, decoded: SplatModel, stated: StatedErrors) -> list[str]:
+def _compare_scenes(source: SplatModel, decoded: SplatModel, stated: StatedErrors, names: Sequence[str]) -> list[str]:
     """What must be equal before splats are compared at all."""
     failures = []
     if len(source) != stated.source_count:
@@ -115,11 +122,7 @@ def _compare_scenes(source: SplatModel, decoded: SplatModel, stated: StatedError
     if source.origin != decoded.origin:
         failures.append(f"the file's origin is {decoded.origin}, the source's {source.origin}")
     bounds = _bounds(stated)
-    failures += [
-        f"the file states no error of {name}"
-        for name in measure_names(source, decoded)
-        if name not in bounds and len(decoded)
-    ]
+    failures += [f"the file states no error of {name}" for name in names if name not in bounds and len(decoded)]
     return failures
 
 
@@ -127,8 +130,15 @@ def _bounds(stated: StatedErrors) -> dict[str, tuple[float, float]]:
     return {record.measure: (record.max, record.rms) for record in stated.records}
 
 
-def _prove_pairs(source: SplatModel, decoded: SplatModel, stated: StatedErrors, source_index: NDArray[Any]) -> Proof:
-    measured = measure_pairs(source, decoded, source_index)
+def _prove_pairs(
+    source: SplatModel,
+    decoded: SplatModel,
+    stated: StatedErrors,
+    source_index: NDArray[Any],
+    names: Sequence[str],
+) -> Proof:
+    every = measure_pairs(source, decoded, source_index)
+    measured = {name: every[name] for name in names}
     failures = []
     different = len(np.unique(source_index))
     if different != len(decoded):
@@ -163,9 +173,10 @@ def _prove_matches(
     decoded: SplatModel,
     header: SceneHeader,
     stated: StatedErrors,
+    names: Sequence[str],
     progress: Callable[[str, float], None] | None,
 ) -> Proof:
-    bounds = {record.measure: record.max for record in stated.records}
+    bounds = {"sh0": math.inf, **{record.measure: record.max for record in stated.records}}
     found = match(source, decoded, bounds, lattice_radii(decoded, header), progress=progress)
     unmatched = int(np.count_nonzero(found == UNMATCHED))
     undecided = int(np.count_nonzero(found == UNDECIDED))
@@ -175,8 +186,7 @@ def _prove_matches(
     if undecided:
         failures.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
     measures = tuple(
-        MeasureProof(name, *_bounds(stated).get(name, (0.0, 0.0)), None, None, not failures)
-        for name in measure_names(source, decoded)
+        MeasureProof(name, *_bounds(stated).get(name, (0.0, 0.0)), None, None, not failures) for name in names
     )
     return Proof(measures, tuple(failures), notes=("rms and counts are not proved without a source index",))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,10 +16,11 @@ from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
 from csplat.encoder.quantise import colour_integers
+from csplat.encoder.sparse import zero_book, zero_or_value_block
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
 
-__all__ = ["Books", "choose_sh"]
+__all__ = ["Books", "choose_sh", "with_zero_books"]
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -96,6 +97,15 @@ def choose_sh(
     if plan.sh_coding == "auto" and not _codebook_pays(model, weights, stages, books, sample[:_SAMPLE], plan):
         return scalar
     return books
+
+
+def with_zero_books(books: Books, used: Iterable[int]) -> Books:
+    """Add the codebooks of absent bands that tiles turned out to want."""
+    if books.records:
+        return books
+    bands = sorted(set(used))  # their ids are their bands
+    pairs = [zero_book(band, books.plan) for band in bands]
+    return replace(books, records=[record for record, _ in pairs], chunks=[chunk for _, chunk in pairs])
 
 
 def _reference(weights: F32 | None) -> float:
@@ -225,7 +235,11 @@ def _try_scalar(model: SplatModel, weights: F32, sample: Rows, plan: Plan) -> tu
     kept = (plan.sh_degree + 1) ** 2 - 1
     source = np.take(model.shN, sample, axis=0)[:, :kept]
     columns, _, decoded = quantise_rows(source, plan, None)
-    size = len(signed_stream(columns.reshape(-1), plan.coding))
+    size = 0
+    for band in range(1, plan.sh_degree + 1):
+        part = columns[:, band * band - 1 : (band + 1) ** 2 - 1]
+        if part.any():
+            size += len(zero_or_value_block(band, part.reshape(-1, len(sample)), 0, plan)[0])
     squares = np.square(source - decoded).sum(axis=(1, 2), dtype=np.float64)
     weight = weights[sample]
     return size / len(sample), float((squares * weight).sum() / (weight.sum(dtype=np.float64) or 1.0))

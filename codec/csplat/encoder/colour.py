@@ -20,6 +20,7 @@ from csplat.encoder.quantise import (
     lattice_step,
     lattice_values,
 )
+from csplat.encoder.sparse import zero_or_value_block
 from csplat.errors import InputError
 
 __all__ = ["Colour", "ShTables", "code_sh", "quantise_colour"]
@@ -65,11 +66,12 @@ class ShTables:
 
 @dataclass(frozen=True)
 class CodedSh:
-    """Blocks by layer (a band that is zero throughout has none), errors by measure, and the tile's exponent."""
+    """Blocks by layer (a band that is zero throughout has none), errors by measure, the tile's exponent, codebooks."""
 
     blocks: Mapping[int, bytes]
     errors: Mapping[str, tuple[float, float]]
     exponent: int
+    tables: tuple[int, ...] = ()
 
 
 def quantise_colour(rgb: F32, step: float, shift: int) -> Colour:
@@ -97,17 +99,19 @@ def code_sh(shN: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, coar
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
     exponent = 0
+    used: set[int] = set()
     if tables.entries:
         layers = _code_by_codebook(source[:, :kept], rows, plan, tables, sums)
+        used.update(tables.ids)
     elif kept:
         columns, exponent, decoded = quantise_rows(source[:, :kept], plan, coarse)
         sums.add(source[:, :kept], decoded, 0)
         for band in range(1, plan.sh_degree + 1):
             part = columns[:, _span(band)]
             if part.any():
-                flat = part.reshape(-1, len(rows))
-                layers[band] = blocks.signed_block(_spec.ATTRIBUTE_SH0 + band, flat, exponent, plan.coding)
-    return CodedSh(layers, sums.by_band(), exponent)
+                layers[band], wanted = zero_or_value_block(band, part.reshape(-1, len(rows)), exponent, plan)
+                used.update(wanted)
+    return CodedSh(layers, sums.by_band(), exponent, tuple(sorted(used)))
 
 
 def quantise_rows(source: F32, plan: Plan, coarse: I32 | None) -> tuple[Integers, int, F32]:

@@ -6,20 +6,22 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.codebook import choose_sh
+from csplat.encoder.between import Between
+from csplat.encoder.codebook import choose_sh, with_zero_books
 from csplat.encoder.colour import ShTables
 from csplat.encoder.container import write
+from csplat.encoder.geometry import quantised_geometry
 from csplat.encoder.importance import splat_weights
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress, make_plan
-from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene
+from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene, stated_errors
 from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile, cut
 from csplat.model import SplatModel
@@ -52,7 +54,8 @@ class EncodeResult:
 
     Attributes:
         data: the file.
-        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model.
+        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model, or of the model that
+            it was made from (`Between`).
         report: choices and errors.
     """
 
@@ -82,6 +85,7 @@ def encode_with_report(
     options: EncodeOptions | None = None,
     *,
     importance: NDArray[Any] | None = None,
+    between: Between | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Compress a scene and say how.
@@ -90,6 +94,7 @@ def encode_with_report(
         model: the scene.
         options: as in `encode`.
         importance: [N] weights >= 0 of the splats, in place of opacity × projected area.
+        between: what happened to the scene before, and who fits colours to its quantised geometry.
         progress: called with the stage's name and the share done, 0 to 1; from any thread.
 
     Raises:
@@ -101,6 +106,9 @@ def encode_with_report(
     plan = make_plan(model, options, importance_given=importance is not None)
     extras = extra_columns(model, options)
     tiles = cut(model.means, plan.lattice, plan.tile_splats)
+    if between is not None:
+        sh0, shN = between.colours(quantised_geometry(model, tiles, plan))
+        model = replace(model, sh0=sh0, shN=shN)
     needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
     weights = splat_weights(model, importance) if needs_weights else None
     sample = tiles[len(tiles) // 2].rows if tiles else np.zeros(0, np.intp)
@@ -109,12 +117,15 @@ def encode_with_report(
     plan = books.plan
     encoded = _encode_tiles(model, tiles, plan, books.tables, threads, report)
     errors = ErrorSums.total(part.errors for part in encoded)
-    settings = chosen_settings(plan, books.tables, options)
-    scene = file_scene(model, plan, books, extras, file_chunks(model, errors, settings, plan))
-    data = write(scene, [part.tile for part in encoded])
+    settings = chosen_settings(plan, books.tables, options, between)
+    chunks = file_chunks(model, errors, settings, plan, between)
+    books = with_zero_books(books, (id for part in encoded for id in part.tile.tables))
+    data = write(file_scene(model, plan, books, extras, chunks), [part.tile for part in encoded])
     rows = np.concatenate([part.rows for part in encoded]) if encoded else np.zeros(0, np.int64)
-    summary = EncodeReport(settings, errors.stated(), len(model), len(tiles), len(data), _notes(encoded))
-    return EncodeResult(data, rows.astype(np.int64, copy=False), summary)
+    rows = rows.astype(np.int64, copy=False)
+    stated = stated_errors(errors, between)
+    summary = EncodeReport(settings, stated, len(model), len(tiles), len(data), _notes(encoded))
+    return EncodeResult(data, rows if between is None else between.source_index[rows], summary)
 
 
 def _encode_tiles(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
+from csplat.encoder.between import Between
 from csplat.encoder.codebook import Books
 from csplat.encoder.colour import ShTables
 from csplat.encoder.container import FileChunk, Scene, json_payload
@@ -17,12 +18,19 @@ from csplat.encoder.plan import Plan
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
 
-__all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene"]
+__all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene", "stated_errors"]
 
 
-def chosen_settings(plan: Plan, tables: ShTables, options: EncodeOptions) -> dict[str, Any]:
+_COLOURS = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
+
+
+def chosen_settings(
+    plan: Plan, tables: ShTables, options: EncodeOptions, between: Between | None = None
+) -> dict[str, Any]:
     """Return what was asked and what followed, JSON-compatible; it becomes the OPTS chunk."""
+    said = {} if between is None else {"simplified": dict(between.said)}
     return {
+        **said,
         "asked": options.chosen(),
         "encoder": _versions(plan),
         "position_step": plan.lattice.step,
@@ -61,7 +69,15 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     return records
 
 
-def file_chunks(model: SplatModel, errors: ErrorSums, settings: dict[str, Any], plan: Plan) -> list[FileChunk]:
+def stated_errors(errors: ErrorSums, between: Between | None) -> dict[str, tuple[float, float]]:
+    """Return (max, rms) by measure; those of colours that were fitted anew say nothing, and are left out."""
+    stated = errors.stated()
+    return stated if between is None else {name: pair for name, pair in stated.items() if name not in _COLOURS}
+
+
+def file_chunks(
+    model: SplatModel, errors: ErrorSums, settings: dict[str, Any], plan: Plan, between: Between | None = None
+) -> list[FileChunk]:
     """Return the chunks of the whole file: metadata, cameras, options, stated errors."""
     chunks = []
     try:
@@ -72,7 +88,7 @@ def file_chunks(model: SplatModel, errors: ErrorSums, settings: dict[str, Any], 
     except (TypeError, ValueError) as problem:
         raise InputError(f"metadata or cameras are not JSON: {problem}") from None
     chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, plan.coding)))
-    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _stated_errors(model, errors)))
+    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _stated_errors(model, errors, between)))
     return chunks
 
 
@@ -101,10 +117,13 @@ def file_scene(
     )
 
 
-def _stated_errors(model: SplatModel, errors: ErrorSums) -> bytes:
+def _stated_errors(model: SplatModel, errors: ErrorSums, between: Between | None) -> bytes:
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
-    bounds = sorted((ids[name], *pair) for name, pair in errors.stated().items())
-    head = _spec.StatedErrorsHead(len(model), 0, model.sh_degree, 0, len(bounds))
+    bounds = sorted((ids[name], *pair) for name, pair in stated_errors(errors, between).items())
+    count, flags = len(model), 0
+    if between is not None:
+        count, flags = between.source_count, _spec.ERROR_FLAG_REFITTED
+    head = _spec.StatedErrorsHead(count, count - len(model), model.sh_degree, flags, len(bounds))
     records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
     return _spec.pack_stated_errors_head(head) + b"".join(records)
 

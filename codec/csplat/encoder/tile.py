@@ -12,20 +12,17 @@ from csplat import _spec
 from csplat.encoder import blocks
 from csplat.encoder.colour import ShTables, code_sh, quantise_colour
 from csplat.encoder.container import FileTile
-from csplat.encoder.gauge import fix_gauge
+from csplat.encoder.geometry import quantise_shape
 from csplat.encoder.measure import ErrorSums, covariance_errors, distance_errors, value_errors
 from csplat.encoder.morton import morton_codes
 from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import (
     check_finite,
-    lattice_exponent,
     lattice_step,
     lattice_values,
     opacity_levels,
     opacity_values,
     quantise_means,
-    quat_levels,
-    quat_values,
 )
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
@@ -81,9 +78,11 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
     _means(work, model, rows, q, corner, codes, lattice_step(plan.lattice.step, tile.exponent))
     _sh0(work, _take(model.sh0, rows))
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: work.blocks}
+    used: tuple[int, ...] = ()
     if model.sh_degree:
         coded = code_sh(model.shN, rows, plan, tables, _coarse(rows, plan, tables))
         layers |= {layer: [block] for layer, block in coded.blocks.items()}
+        used = coded.tables
         if coded.exponent:
             work.coarsened.add("shN")
         for measure, errors in coded.errors.items():
@@ -101,7 +100,7 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
         extent=(int(extent[0]), int(extent[1]), int(extent[2])),
         max_scale=max_scale,
         layers=layers,
-        tables=tuple(sorted(tables.ids)) if any(layer in layers for layer in tables.layers) else (),
+        tables=used,
     )
     return EncodedTile(file_tile, rows, ErrorSums(len(rows), work.largest, work.squares), frozenset(work.coarsened))
 
@@ -146,20 +145,14 @@ def _opacities(work: _Work, opacities: F32) -> None:
 def _shape(work: _Work, quats: F32, scales: F32) -> float:
     """Scales and rotations in their gauge. Returns the largest decoded scale."""
     plan = work.plan
-    rotation, sorted_scales = fix_gauge(quats, scales)
-    exponent = lattice_exponent(float(np.abs(sorted_scales).max()), plan.scale_step)
-    if exponent:
+    shape = quantise_shape(quats, scales, plan)
+    if shape.exponent:
         work.coarsened.add("scales")
-    step = lattice_step(plan.scale_step, exponent)
-    n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
-    decoded_scales = lattice_values(n, step)
-    check_finite("scales", decoded_scales)
-    work.blocks.append(blocks.offset_block(_spec.ATTRIBUTE_SCALES, n, exponent, plan.coding))
-    q = quat_levels(rotation, plan.quat_levels)
-    work.blocks.append(blocks.signed_block(_spec.ATTRIBUTE_QUATS, q, 0, plan.coding))
-    decoded_quats = quat_values(q, plan.quat_levels)
-    work.note("covariance", covariance_errors(quats.T, scales.T, decoded_quats, decoded_scales))
-    return float(decoded_scales.max())
+    check_finite("scales", shape.decoded_scales)
+    work.blocks.append(blocks.offset_block(_spec.ATTRIBUTE_SCALES, shape.scales, shape.exponent, plan.coding))
+    work.blocks.append(blocks.signed_block(_spec.ATTRIBUTE_QUATS, shape.quats, 0, plan.coding))
+    work.note("covariance", covariance_errors(quats.T, scales.T, shape.decoded_quats, shape.decoded_scales))
+    return float(shape.decoded_scales.max())
 
 
 def _means(

@@ -12,6 +12,7 @@ from csplat.errors import InputError
 from csplat_tools.console import format_bytes, format_table, guarded, note, progress_bar, say_json
 from csplat_tools.convert import Encoded, SceneFacts, encode_file
 from csplat_tools.inout import STANDARD_STREAM, check_output
+from csplat_tools.simplifying import DEFAULT_VIEWS, Simplifying
 
 __all__ = ["encode"]
 
@@ -19,6 +20,7 @@ _SCENE = "What the PLY may not say"
 _PRECISION = "Precision (the preset decides where nothing is given)"
 _COLOUR = "Spherical harmonics"
 _CODING = "Coding"
+_LESS = "Simplification (needs the render extra)"
 
 
 @guarded
@@ -124,6 +126,29 @@ def encode(
         int | None,
         typer.Option(min=1, rich_help_panel=_CODING, help="Threads, one per core by default; the bytes stay the same."),
     ] = None,
+    simplify: Annotated[
+        bool, typer.Option("--simplify", rich_help_panel=_LESS, help="Remove what pictures need least, fit colours.")
+    ] = False,
+    keep: Annotated[
+        float | None, typer.Option(metavar="SHARE", rich_help_panel=_LESS, help="Share of the splats that stay; or:")
+    ] = None,
+    max_loss: Annotated[
+        str | None, typer.Option(metavar="DB", rich_help_panel=_LESS, help="How far PSNR of photographs may fall; or:")
+    ] = None,
+    target_psnr: Annotated[
+        float | None,
+        typer.Option(metavar="DB", rich_help_panel=_LESS, help="PSNR of the file; the smallest of several."),
+    ] = None,
+    cameras: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.json", rich_help_panel=_LESS, help="Views that decide; else virtual ones."),
+    ] = None,
+    data: Annotated[
+        str | None, typer.Option(metavar="DATA", rich_help_panel=_LESS, help="A data set whose views decide.")
+    ] = None,
+    views: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_LESS, help="Virtual views at most.")
+    ] = DEFAULT_VIEWS,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report on standard output, for programs.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
@@ -138,6 +163,7 @@ def encode(
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
       csplat encode scene.ply scene.csplat --source-index scene.npy && \
         csplat verify scene.csplat --source scene.ply --source-index scene.npy
+      csplat encode scene.ply scene.csplat --simplify --keep 0.5
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
     try:
@@ -169,6 +195,14 @@ def encode(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
+    wanted = Simplifying(keep, max_loss, target_psnr, cameras, data, views, threads)
+    if not simplify and wanted.asked:
+        raise typer.BadParameter(
+            "--keep, --max-loss, --target-psnr, --cameras and --data say nothing without --simplify"
+        )
+    if simplify and importance is not None:
+        raise typer.BadParameter("--simplify measures the importance of splats itself")
+    encoder = wanted.encoder(quiet=quiet) if simplify else None
     if as_json and target == STANDARD_STREAM:
         raise typer.BadParameter("--json and - both want standard output")
     if source_index == STANDARD_STREAM:
@@ -185,6 +219,7 @@ def encode(
             strict=strict,
             importance=importance,
             source_index=source_index,
+            encoder=encoder,
             progress=progress,
         )
     if as_json:

@@ -1,0 +1,225 @@
+"""What splats are to pictures: the removal pass against its twin, and colours fitted to pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_render import render
+from csplat_render.cameras import intrinsics, load_cameras, look_at
+from csplat_render.refit import ColourOperator, fit_colours
+from csplat_render.removal import measure_removal, removal_exact
+
+
+def views(count=3, width=40, height=30, distance=4.0):
+    K = intrinsics(width, height, 60.0)
+    angles = np.arange(count) * 2.2
+    eyes = [(distance * np.sin(a), 0.7, distance * np.cos(a)) for a in angles]
+    return [look_at(eye, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), K, width, height) for eye in eyes]
+
+
+def scene(count=60, degree=3, seed=0):
+    rng = np.random.default_rng(seed)
+    quats = rng.standard_normal((count, 4))
+    return SplatModel(
+        means=rng.uniform(-1.0, 1.0, (count, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=rng.uniform(-3.5, -1.0, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.05, 1.0, count).astype(np.float32),
+        sh0=rng.standard_normal((count, 3)).astype(np.float32),
+        shN=(0.3 * rng.standard_normal((count, (degree + 1) ** 2 - 1, 3))).astype(np.float32),
+    )
+
+
+def relative(found, expected):
+    return np.abs(found - expected) / np.maximum(expected, 1e-12)
+
+
+# the pass
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
+    model = replace(scene(), antialiased=antialiased)
+    behind = (0.2, 0.5, 0.9)
+    expected = removal_exact(model, views(2), np.arange(60), background=behind, transmittance_min=0.0)
+    wide = measure_removal(model, views(2), background=behind, dtype=np.float64, transmittance_min=0.0)
+    assert relative(wide.error, expected).max() < 1e-9
+    narrow = measure_removal(model, views(2), background=behind, transmittance_min=0.0)
+    assert relative(narrow.error, expected)[expected > 1e-6].max() < 1e-4
+    assert expected.max() > 1.0
+
+
+@pytest.mark.parametrize("name", ["plane3", "lego60k", "fox60k_noreg"])
+def test_the_pass_agrees_on_real_scenes(data_dir, name):
+    path = data_dir / "ply" / f"{name}.ply"
+    if not path.exists():
+        pytest.skip(f"{name} is absent")
+    source = read_ply(path)
+    model = source.select(slice(0, None, max(1, len(source) // 1500)))
+    camera = load_cameras(data_dir / "psnr_cameras" / f"{name}.json")[1]
+    camera = replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48)
+    found = measure_removal(model, [camera], transmittance_min=0.0)
+    rows = np.argsort(-found.error)[:400:80]
+    expected = removal_exact(model, [camera], rows, transmittance_min=0.0)
+    assert relative(found.error[rows], expected).max() < 1e-4
+
+
+def test_finished_pixels_are_all_that_it_leaves_out():
+    model = scene(count=120)
+    model = replace(model, opacities=np.full(120, 0.97, np.float32), scales=model.scales + np.float32(1.0))
+    exact = removal_exact(model, views(1), np.arange(120))
+    found = measure_removal(model, views(1)).error
+    assert abs(found.sum() / exact.sum() - 1.0) < 2e-2
+    assert np.corrcoef(found, exact)[0, 1] > 0.999
+
+
+def test_the_picture_is_that_of_the_renderer():
+    model, seen = scene(count=200), []
+    measure_removal(model, views(2), background=(0.1, 0.2, 0.3), on_picture=lambda _n, picture: seen.append(picture))
+    for camera, picture in zip(views(2), seen, strict=True):
+        np.testing.assert_allclose(picture, render(model, camera, background=(0.1, 0.2, 0.3)).rgb, atol=2e-5)
+
+
+def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
+    model = scene(count=30)
+    wanted = [render(scene(count=30, seed=1), camera, mode="exact").rgb for camera in views(2)]
+    found = measure_removal(model, views(2), references=wanted, dtype=np.float64)
+
+    def error(rows):
+        pictures = [render(model.select(rows), camera, mode="exact").rgb for camera in views(2)]
+        return sum(float(np.sum((a - b) ** 2)) for a, b in zip(pictures, wanted, strict=True))
+
+    whole = error(np.arange(30))
+    row = int(np.argmax(found.error))
+    gain = error(np.delete(np.arange(30), row)) - whole
+    assert gain == pytest.approx(found.error[row] + 2.0 * found.product[row], rel=2e-3)
+
+
+def test_bands_and_weights_are_those_of_a_single_splat():
+    model = scene(count=1)
+    camera = views(1)[0]
+    found = measure_removal(model, [camera], dtype=np.float64)
+    alpha = render(model, camera, mode="exact").alpha
+    assert found.weight[0] == pytest.approx(alpha.sum(), rel=1e-6)
+    assert found.squared_weight[0] == pytest.approx((alpha**2).sum(), rel=1e-6)
+    shN = model.shN.copy()
+    shN[:, 3:8] = 0.0
+    with_band, without = (render(one, camera, mode="exact").rgb for one in (model, replace(model, shN=shN)))
+    if (with_band[alpha > 0.1] > 0.0).all() and (without[alpha > 0.1] > 0.0).all():  # no clamp
+        assert found.bands[0, 1] == pytest.approx(float(np.sum((with_band - without) ** 2)), rel=1e-4)
+
+
+def test_a_hidden_splat_and_one_out_of_view_are_unseen():
+    model = scene(count=3)
+    far = model.means.copy()
+    far[2] = 100.0
+    found = measure_removal(replace(model, means=far), views(1))
+    assert not found.seen[2]
+    assert found.error[2] == 0.0
+    assert found.seen[:2].all()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_change_nothing(threads):
+    model = scene(count=300)
+    found, other = measure_removal(model, views(2), threads=threads), measure_removal(model, views(2))
+    for name in ("error", "product", "weight", "squared_weight", "bands"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+
+
+def test_parts_add_up():
+    model, cameras = scene(count=50), views(3)
+    whole = measure_removal(model, cameras)
+    parts = measure_removal(model, cameras[:1]) + measure_removal(model, cameras[1:])
+    np.testing.assert_allclose(whole.error, parts.error, rtol=1e-12)
+    assert whole.value_count == parts.value_count
+    np.testing.assert_array_equal(whole.views, parts.views)
+
+
+def test_no_camera_and_too_few_references_are_refused():
+    with pytest.raises(InputError, match="camera"):
+        measure_removal(scene(), [])
+    with pytest.raises(InputError, match="1 reference pictures for 2"):
+        measure_removal(scene(), views(2), references=[np.zeros((30, 40, 3))])
+
+
+# colours
+
+
+def coefficients(model):
+    return np.concatenate([model.sh0[:, None], model.shN], axis=1)
+
+
+def test_the_operator_and_its_transpose_belong_together():
+    model = scene(count=80)
+    operator = ColourOperator(model, views(2))
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((80, 16, 3)).astype(np.float32)
+    y = rng.standard_normal((80, 16, 3)).astype(np.float32)
+    images = [np.zeros_like(x), np.zeros_like(x)]
+    length = operator.normal(x, images[0])
+    operator.normal(y, images[1])
+    assert np.sum(x * images[0], dtype=np.float64) == pytest.approx(length, rel=1e-4)
+    across = np.sum(y * images[0], dtype=np.float64)
+    assert across == pytest.approx(np.sum(x * images[1], dtype=np.float64), rel=1e-3, abs=1e-3 * length)
+
+
+def test_the_gradient_is_that_of_finite_differences_and_the_diagonal_that_of_the_matrix():
+    model = replace(scene(count=40), sh0=np.full((40, 3), 1.5, np.float32))  # bright: nothing is clamped
+    wanted = [np.full((30, 40, 3), 0.4, np.float32)] * 2
+    operator, x = ColourOperator(model, views(2)), coefficients(model)
+    gradient, diagonal = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
+    before = operator.error(x, wanted, gradient, diagonal)
+    row = int(np.argmax(np.abs(gradient[:, 2, 1])))
+    for step in (0.1, -0.1):
+        moved = x.copy()
+        moved[row, 2, 1] += step
+        after = operator.error(moved, wanted, np.zeros_like(x))
+        expected = 2.0 * step * gradient[row, 2, 1] + step**2 * diagonal[row, 2]
+        assert after - before == pytest.approx(expected, rel=2e-3, abs=1e-3)
+
+
+def test_fitting_finds_the_colours_that_pictures_were_made_of():
+    model = scene(count=25, degree=1)
+    model = replace(model, sh0=model.sh0 * np.float32(0.2) + np.float32(1.0), shN=model.shN * np.float32(0.3))
+    cameras = views(12)
+    wanted = [render(model, camera).rgb for camera in cameras]
+    wrong = replace(model, sh0=model.sh0 + np.float32(0.2), shN=np.zeros_like(model.shN))
+    x, errors = fit_colours(wrong, cameras, wanted, steps=40, ridge=1e-5, least_gain=0.0)
+    assert errors[-1] < 1e-3 * errors[0]
+    fitted = replace(model, sh0=np.ascontiguousarray(x[:, 0]), shN=np.ascontiguousarray(x[:, 1:]))
+    true = sum(float(np.sum((render(fitted, c).rgb - w) ** 2)) for c, w in zip(cameras, wanted, strict=True))
+    assert true < 2e-3 * errors[0]
+
+
+def test_what_is_not_free_and_what_is_not_seen_stays():
+    model, cameras = scene(count=40), views(2)
+    means = model.means.copy()
+    means[5] = 50.0
+    model = replace(model, means=means)
+    wanted = [np.full((30, 40, 3), 0.5, np.float32)] * 2
+    free = np.ones((40, 16), bool)
+    free[:, 9:] = False
+    x, _ = fit_colours(model, cameras, wanted, free=free)
+    np.testing.assert_array_equal(coefficients(model)[:, 9:], x[:, 9:])
+    np.testing.assert_array_equal(coefficients(model)[5], x[5])
+    assert np.abs(x - coefficients(model)).max() > 0.01
+
+
+def test_views_that_do_not_fit_the_cache_give_the_same_colours():
+    model, cameras = scene(count=60), views(3)
+    wanted = [np.full((30, 40, 3), 0.5, np.float32)] * 3
+    kept, _ = fit_colours(model, cameras, wanted, steps=3)
+    anew, _ = fit_colours(model, cameras, wanted, steps=3, cache_bytes=0)
+    np.testing.assert_array_equal(kept, anew)
+
+
+def test_as_many_pictures_as_cameras_are_wanted():
+    with pytest.raises(InputError, match="as many pictures"):
+        fit_colours(scene(), views(2), [np.zeros((30, 40, 3), np.float32)])

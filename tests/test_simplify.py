@@ -1,0 +1,265 @@
+"""Simplification: which splats go, how good the rest is, and the command."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="simplification wants the extra [render]")
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.ply import read_ply, write_ply
+from csplat_render.cameras import save_cameras
+from csplat_render.removal import Removal
+from csplat_tools.app import app
+from csplat_tools.simplify import SimplifyOptions, Target, simplify
+from csplat_tools.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.simplify.files import parse_target
+from csplat_tools.simplify.judge import Judge, loss_as_psnr, render_pictures
+from csplat_tools.simplify.order import removal_order
+from csplat_tools.simplify.views import camera_sequence, find_views, reduced, removal_keys, split_views
+
+SMALL = SimplifyOptions(views=12, view_size=(48, 36), steps=4, rounds=2)
+
+
+@pytest.fixture(scope="module")
+def source():
+    """A shell of opaque splats, inside of it as many that nobody sees, and ten that are too faint to be drawn."""
+    rng = np.random.default_rng(0)
+    n = 300
+    at = rng.standard_normal((n, 3))
+    at /= np.linalg.norm(at, axis=1, keepdims=True)
+    means = np.concatenate([at, 0.3 * rng.standard_normal((n // 2, 3))])
+    count = len(means)
+    quats = rng.standard_normal((count, 4))
+    opacities = rng.uniform(0.6, 1.0, count)
+    opacities[:10] = 0.003
+    scales = np.full((count, 3), -2.0) + rng.uniform(-0.3, 0.3, (count, 3))
+    return SplatModel(
+        means=means.astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=scales.astype(np.float32),
+        opacities=opacities.astype(np.float32),
+        sh0=(np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3))).astype(np.float32),
+        shN=(0.05 * rng.standard_normal((count, 8, 3))).astype(np.float32),
+    )
+
+
+# views
+
+
+def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
+    short, long = camera_sequence(source, 5, (40, 30)), camera_sequence(source, 9, (40, 30))
+    for one, other in zip(short, long, strict=False):
+        np.testing.assert_array_equal(one.viewmat, other.viewmat)
+    positions = np.array([camera.position for camera in long])
+    assert positions[:, 1].min() < 0.0 < positions[:, 1].max()  # from above and from below
+
+
+def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(source):
+    own = camera_sequence(source, 17, (200, 100))
+    small = reduced(own, (48, 36))
+    assert {(camera.W, camera.H) for camera in small} == {(59, 29)}
+    assert small[0].K[0, 0] == pytest.approx(own[0].K[0, 0] * 59 / 200)
+    used, check = split_views(small)
+    assert (len(used), len(check)) == (15, 2)
+    with pytest.raises(InputError, match="2 at least"):
+        split_views(own[:1])
+
+
+def test_views_are_added_until_others_agree(source):
+    many = find_views(source, None, 0.3, size=(48, 36), most=100)
+    assert len(many.used) in (40, 80, 100)
+    positions = {tuple(camera.position) for camera in many.used}
+    assert not positions & {tuple(camera.position) for camera in many.check}
+    assert len(many.check) == 16
+
+
+# order
+
+
+def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
+    found = find_views(source, camera_sequence(source, 9, (48, 36)), 0.5)
+    keys = removal_keys(source, found.removal)
+    assert (keys[:10] == -1.0).all()
+    unseen = ~found.removal.seen & (source.opacities > 0.01)
+    assert np.isinf(keys[unseen]).all()
+    assert (removal_keys(source, found.removal, keep_unseen=False)[unseen] < 0.0).all()
+    order = removal_order(source, found, SMALL, 0.5)
+    assert set(order.rows[:10]) == set(range(10))
+    assert len(order.rounds) == 2
+
+
+def test_exact_errors_choose_better_than_opacity(source):
+    check = camera_sequence(source, 6, (64, 48), seed=9)
+    judge = Judge.of_source(source, check, (0, 0, 0))
+    scores = {}
+    for method in ("opacity", "opacity-area", "exact", "rounds"):
+        options = replace(SMALL, method=method, refit=False, bands=False, views=40)
+        scores[method] = judge.psnr(simplify(source, target=Target(keep=0.8), options=options).model)
+    assert min(scores["exact"], scores["rounds"]) > max(scores["opacity"], scores["opacity-area"]) + 3.0
+
+
+# the whole
+
+
+def test_keeping_a_share_keeps_that_many_and_says_which(source):
+    result = simplify(source, target=Target(keep=0.5), options=SMALL)
+    assert len(result.model) == 225
+    np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
+    np.testing.assert_array_equal(source.opacities[result.source_index], result.model.opacities)
+    report = result.report
+    assert report["removed"]["invisible"] == 10
+    assert sum(report["removed"].values()) == 225
+    assert report["splats"] == 225
+    json.dumps(report, allow_nan=False)
+
+
+def test_a_refit_gains_on_views_that_it_did_not_see(source):
+    shell = source.select(slice(10, 300))
+    shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
+    options = replace(SMALL, views=40, steps=8)
+    report = simplify(shell, target=Target(keep=0.5), options=options).report
+    assert report["check_psnr"] > report["check_psnr_pruned"] + 0.5
+    errors = report["fit_errors"][0]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_a_refit_that_serves_its_own_views_alone_is_refused(source):
+    options = replace(SMALL, views=4, bands=False)
+    report = simplify(source, target=Target(keep=0.4), options=options).report
+    assert report["refit_refused"]
+    assert report["check_psnr"] == report["check_psnr_pruned"]
+
+
+@pytest.mark.parametrize("goal", [35.0, 28.0])
+def test_a_target_psnr_is_reached(source, goal):
+    judge_views = camera_sequence(source, 16, (48, 36), seed=3)
+    result = simplify(source, judge_views, target=Target(psnr=goal), options=replace(SMALL, bands=False))
+    assert result.report["psnr"] >= goal
+    assert len(result.model) < len(source)
+
+
+def test_more_loss_lets_more_splats_go(source):
+    cameras = camera_sequence(source, 8, (48, 36), seed=5)
+    rng = np.random.default_rng(1)
+    photographs = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
+    sizes = []
+    for loss in (0.05, 1.0):
+        result = simplify(
+            source, cameras, target=Target(max_loss=loss), options=replace(SMALL, bands=False),
+            photographs=(cameras, photographs),
+        )  # fmt: skip
+        assert Judge(cameras, photographs).psnr(result.model) >= Judge(cameras, photographs).psnr(source) - loss
+        sizes.append(len(result.model))
+    assert sizes[0] > sizes[1]
+
+
+def test_nothing_changes_where_everything_stays(source):
+    result = simplify(source, target=Target(keep=1.0), options=replace(SMALL, refit=False))
+    assert len(result.model) == len(source)
+    np.testing.assert_array_equal(source.shN, result.model.shN)
+
+
+def test_the_result_does_not_depend_on_threads(source):
+    one, two = (
+        simplify(source, target=Target(keep=0.5), options=replace(SMALL, threads=threads)) for threads in (1, 2)
+    )
+    np.testing.assert_array_equal(one.source_index, two.source_index)
+    np.testing.assert_array_equal(one.model.sh0, two.model.sh0)
+    np.testing.assert_array_equal(one.model.shN, two.model.shN)
+
+
+def test_a_loss_of_psnr_is_a_psnr_of_renders():
+    # At 30 dB, 0.3 dB are 7.15 % more squared error: 11.46 dB below the source's own.
+    assert loss_as_psnr(0.3, 30.0) == pytest.approx(41.46, abs=0.01)
+
+
+# bands
+
+
+def test_bands_that_are_worth_less_than_their_bits_go():
+    bands = np.array([[0.07, 0.07, 0.07], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
+    zeros = np.zeros(3)
+    removal = Removal(zeros, zeros, zeros, zeros, np.array([1, 0, 2]), bands, 1)
+    stays = band_mask(removal, 1.0)
+    np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
+    free = free_coefficients(stays)
+    assert [4, 16, 16] == free.sum(axis=1).tolist()
+
+
+def test_bands_without_worth_are_zero_and_others_are_not(source):
+    result = simplify(source, target=Target(keep=0.4), options=SMALL)
+    stays = result.stays
+    assert stays is not None
+    assert 0 < np.count_nonzero(~stays) < stays.size
+    np.testing.assert_array_equal(result.model.shN, without(result.model, stays).shN)
+    for band, count in result.report["zero_bands"].items():
+        span = slice(int(band) ** 2 - 1, (int(band) + 1) ** 2 - 1)
+        assert count == np.count_nonzero(~result.model.shN[:, span].any(axis=(1, 2)))
+
+
+# errors
+
+
+def test_a_target_is_one_of_three_and_in_range():
+    for wrong in ({}, {"keep": 0.5, "psnr": 40.0}, {"keep": 0.0}, {"keep": 1.5}, {"psnr": -1.0}, {"max_loss": 0.0}):
+        with pytest.raises(InputError, match=r"target|keep|loss"):
+            Target(**wrong)
+    for wrong in ({"method": "luck"}, {"rounds": 0}, {"steps": 0}, {"views": 0}, {"view_size": (0, 1)}):
+        with pytest.raises(InputError, match="wanted"):
+            SimplifyOptions(**wrong)
+
+
+def test_an_empty_scene_is_refused(source):
+    with pytest.raises(InputError, match="without splats"):
+        simplify(source.select(slice(0, 0)), target=Target(keep=0.5))
+
+
+def test_decibels_are_read_with_and_without_their_unit():
+    assert [0.3, 0.3, 0.3] == [parse_target(text) for text in ("0.3", "0.3dB", " 0.3 DB ")]
+    with pytest.raises(InputError, match="decibels"):
+        parse_target("much")
+
+
+# the command
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path):
+    scene, out, report = tmp_path / "scene.ply", tmp_path / "out.ply", tmp_path / "report.json"
+    write_ply(scene, source)
+    words = ("simplify", scene, out, "--keep", "0.5", "--views", "8", "--view-size", "48x36", "--rounds", "2")
+    result = invoke(*words, "--report", report, "--source-index", tmp_path / "index.npy")
+    assert result.exit_code == 0, result.output
+    assert "450 -> 225 splats" in result.stderr
+    kept = np.load(tmp_path / "index.npy")
+    np.testing.assert_array_equal(read_ply(scene).means[kept], read_ply(out).means)
+    assert json.loads(report.read_text())["splats"] == 225
+    again = invoke(*words)
+    assert again.exit_code == 1
+    assert "--force replaces it" in again.stderr
+
+
+def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
+    scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
+    write_ply(scene, source)
+    save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
+    words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--no-refit", "--cameras", cameras)
+    result = invoke(*words, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["psnr"] >= 30.0
+    assert report["views"]["used"] == 9
+
+
+@pytest.mark.parametrize("words", [(), ("--keep", "0.5", "--target-psnr", "40"), ("--keep", "2"), ("--max-loss", "x")])
+def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
+    write_ply(tmp_path / "scene.ply", source)
+    assert invoke("simplify", tmp_path / "scene.ply", tmp_path / "out.ply", *words).exit_code == 2

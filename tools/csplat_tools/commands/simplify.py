@@ -1,0 +1,166 @@
+"""`csplat simplify`."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from csplat.errors import InputError
+from csplat_tools.console import format_table, guarded, note, progress_bar, say_json
+from csplat_tools.extras import prepare_renderer
+from csplat_tools.inout import STANDARD_STREAM, check_output, write_array, write_bytes, write_model
+from csplat_tools.models import load_model
+from csplat_tools.parsing import parse_colour, parse_size
+
+__all__ = ["simplify"]
+
+_TARGET = "Target (one of them)"
+_VIEWS = "Views that decide"
+_HOW = "How"
+
+
+@guarded
+def simplify(
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY or .csplat file, or - for standard input.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or - for standard output.")],
+    keep: Annotated[
+        float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats that stay.")
+    ] = None,
+    max_loss: Annotated[
+        str | None,
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="How far PSNR against photographs may fall."),
+    ] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option(metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders.")
+    ] = None,
+    cameras: Annotated[
+        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own cameras.")
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views; its test pictures judge."
+        ),
+    ] = None,
+    views: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
+    ] = 160,
+    view_size: Annotated[
+        str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="About how large the pictures are.")
+    ] = "240x180",
+    background: Annotated[
+        str, typer.Option(metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, white, or 0..1.")
+    ] = "black",
+    photo_psnr: Annotated[
+        float,
+        typer.Option(metavar="DB", rich_help_panel=_VIEWS, help="What the source reaches, for --max-loss alone."),
+    ] = 30.0,
+    method: Annotated[
+        str,
+        typer.Option(metavar="rounds|exact|opacity|opacity-area", rich_help_panel=_HOW, help="What splats go by."),
+    ] = "rounds",
+    rounds: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_HOW, help="How often errors are measured anew.")
+    ] = 4,
+    refit: Annotated[
+        bool, typer.Option("--refit/--no-refit", rich_help_panel=_HOW, help="Fit the colours of what stays.")
+    ] = True,
+    bands: Annotated[
+        bool, typer.Option("--bands/--no-bands", rich_help_panel=_HOW, help="Set SH bands that hardly show to zero.")
+    ] = True,
+    drop_unseen: Annotated[
+        bool, typer.Option("--drop-unseen", rich_help_panel=_HOW, help="Remove what no view shows first.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, rich_help_panel=_HOW, help="Of the virtual views.")] = 0,
+    threads: Annotated[
+        int | None, typer.Option(min=1, rich_help_panel=_HOW, help="One per core by default; the result stays.")
+    ] = None,
+    source_index: Annotated[
+        str | None, typer.Option(metavar="FILE.npy", help="Write which splat of the source each one is.")
+    ] = None,
+    report: Annotated[str | None, typer.Option(metavar="FILE.json", help="Write what was removed and why.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The report on standard output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
+) -> None:
+    """Remove splats that no picture needs, and fit the colours of the others.
+
+    What the removal of each splat would change is measured exactly, in many
+    small views from all around, again and again as splats go. Then the colours
+    of the others are fitted to what the source looks like. No photographs are
+    needed; with --data, the test pictures judge a --max-loss. Needs the
+    packages of the render extra.
+
+    Examples:
+      csplat simplify scene.ply half.ply --keep 0.5
+      csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
+      csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
+    """
+    prepare_renderer(quiet=quiet)
+    from csplat_tools.simplify import SimplifyOptions, Target
+    from csplat_tools.simplify import simplify as simplified
+    from csplat_tools.simplify.files import find_sights, parse_target
+
+    try:
+        target = Target(keep, target_psnr, None if max_loss is None else parse_target(max_loss))
+        options = SimplifyOptions(
+            method=method,
+            rounds=rounds,
+            refit=refit,
+            bands=bands,
+            keep_unseen=not drop_unseen,
+            views=views,
+            view_size=parse_size(view_size),
+            background=parse_colour(background),
+            photo_psnr=photo_psnr,
+            seed=seed,
+            threads=threads,
+        )
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    if as_json and output == STANDARD_STREAM:
+        raise typer.BadParameter("--json and - both want standard output")
+    if STANDARD_STREAM in (report, source_index):
+        raise typer.BadParameter("--report and --source-index want names of files")
+    check_output(output, force=force, inputs=(source,))
+    for path in (report, source_index):
+        if path is not None:
+            check_output(path, force=force, inputs=(source, output))
+    model = load_model(source).model
+    sights = find_sights(model, cameras, data, judged=max_loss is not None, background=options.background)
+    with progress_bar(quiet=quiet) as progress:
+        result = simplified(
+            model, sights.cameras, target=target, options=options, photographs=sights.photographs, progress=progress
+        )
+    write_model(output, result.model, absolute=False)
+    if source_index is not None:
+        write_array(source_index, result.source_index)
+    if report is not None:
+        write_bytes(report, (json.dumps(result.report, indent=2, allow_nan=False) + "\n").encode())
+    if as_json:
+        say_json(result.report)
+    elif not quiet:
+        _tell(result.report)
+
+
+def _tell(report: dict[str, Any]) -> None:
+    removed, views = report["removed"], report["views"]
+    before, after = report["splats_before"], report["splats"]
+    note(
+        f"{before} -> {after} splats ({100.0 * after / before:.1f} %); gone: {removed['invisible']} too faint to be"
+        f" drawn, {removed['unseen']} unseen, {removed['least_error']} that pictures need least"
+    )
+    note(
+        f"decided by {views['used']} views of {views['size'][0]}x{views['size'][1]}, checked by {views['check']}"
+        f" others; {100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
+    )
+    rows = [("the other views, colours as they were", f"{report['check_psnr_pruned']:.2f}")]
+    rows.append(("the other views, colours fitted", f"{report['check_psnr']:.2f}"))
+    if "psnr" in report:
+        rows.append(("the target's views", f"{report['psnr']:.2f}"))
+    note(format_table(("PSNR", "dB"), rows))
+    if report["zero_bands"]:
+        shares = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]
+        note(f"splats without SH band {', '.join(shares)}")

@@ -1,0 +1,45 @@
+"""Which SH bands a splat needs: those whose loss would cost more than their bits are worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_render.removal import Removal
+
+__all__ = ["BAND_COST", "band_mask", "free_coefficients", "without"]
+
+Mask = NDArray[np.bool_]
+
+#: Bits of the bands 1, 2, 3 of a splat, as a share of the bits of all else of it (0.15, 0.25, 0.35), by 3: the errors
+#: of neighbours that lose a band add up to about three times what each one alone says.
+BAND_COST = (0.05, 0.08, 0.11)
+
+
+def band_mask(removal: Removal, threshold: float) -> Mask:
+    """Which bands stay, [N, d].
+
+    Args:
+        removal: of the scene that the bands belong to.
+        threshold: error up to which a whole splat is not worth its bits.
+
+    A band that no view saw anything of stays.
+    """
+    costs = np.array(BAND_COST[: removal.bands.shape[1]])
+    stays: Mask = (removal.bands > threshold * costs) | ~removal.seen[:, None]
+    return stays
+
+
+def free_coefficients(stays: Mask) -> Mask:
+    """Which coefficients belong to bands that stay, [N, (d + 1)²]; band 0 always does."""
+    columns = [np.ones((len(stays), 1), bool)]
+    columns += [np.repeat(stays[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, stays.shape[1] + 1)]
+    return np.concatenate(columns, axis=1)
+
+
+def without(model: SplatModel, stays: Mask) -> SplatModel:
+    """The scene with zeros in the bands that do not stay."""
+    return replace(model, shN=model.shN * free_coefficients(stays)[:, 1:, None].astype(np.float32))

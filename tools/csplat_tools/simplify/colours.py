@@ -1,0 +1,89 @@
+"""Colours of what stays, fitted to what the source looks like, and bands that stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_render import Camera
+from csplat_render.refit import fit_colours
+from csplat_render.removal import measure_removal
+from csplat_tools.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.simplify.options import SimplifyOptions
+
+__all__ = ["Fitted", "fit"]
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Progress = Callable[[str, float], None]
+
+_SECOND_STEPS = 4  # of the fit after bands have gone
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A scene with new colours.
+
+    Attributes:
+        model: the scene.
+        stays: [N, d], which SH bands are not zero; None where that was not asked.
+        errors: squared error over the views that were fitted, before the first and after every step; of the second
+            fit, after bands have gone, too.
+    """
+
+    model: SplatModel
+    stays: Mask | None
+    errors: tuple[tuple[float, ...], ...]
+
+
+def fit(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    threshold: float,
+    centre: SplatModel | None = None,
+    progress: Progress | None = None,
+) -> Fitted:
+    """Fit colours; then set bands to zero, and fit those that stay once more.
+
+    Args:
+        model: the scene, with the source's colours.
+        cameras: the views.
+        wanted: what the source looks like there.
+        options: whether to fit and to choose bands, steps, background.
+        threshold: error up to which a whole splat is not worth its bits: what bands are measured by.
+        centre: the scene to whose colours the ridge pulls; the same as `model` if left out.
+        progress: is told how much is done.
+    """
+    goal = _coefficients(model if centre is None else centre)
+    errors: list[tuple[float, ...]] = []
+
+    def fitted(scene: SplatModel, steps: int, free: Mask | None) -> SplatModel:
+        x, found = fit_colours(
+            scene, cameras, wanted, centre=goal, free=free, steps=steps, background=options.background,
+            antialiased=scene.antialiased, threads=options.threads, progress=progress,
+        )  # fmt: skip
+        errors.append(tuple(found))
+        return replace(scene, sh0=np.ascontiguousarray(x[:, 0]), shN=np.ascontiguousarray(x[:, 1:]))
+
+    if options.refit:
+        model = fitted(model, options.steps, None)
+    if not options.bands or not model.sh_degree:
+        return Fitted(model, None, tuple(errors))
+    removal = measure_removal(model, cameras, background=options.background, threads=options.threads, progress=progress)
+    stays = band_mask(removal, threshold)
+    if not stays.all():
+        model = without(model, stays)
+        if options.refit:
+            model = fitted(model, _SECOND_STEPS, free_coefficients(stays))
+    return Fitted(model, stays, tuple(errors))
+
+
+def _coefficients(model: SplatModel) -> F32:
+    return np.concatenate([model.sh0[:, None], model.shN], axis=1)

@@ -1,0 +1,197 @@
+"""Simplify and encode in one go: remove, quantise geometry, fit colours to what is left of it, quantise colours.
+
+What a decoder will see of the geometry is known before its colours are chosen. So they are fitted to that, which mends
+part of what quantisation did, and their bands are chosen then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
+from csplat.encoder.between import Between
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render import Camera
+from csplat_render.removal import measure_removal
+from csplat_tools.simplify.colours import fit
+from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
+from csplat_tools.simplify.judge import Judge
+from csplat_tools.simplify.options import SimplifyOptions, Target
+
+__all__ = ["SimplifiedFile", "encode_simplified"]
+
+F32 = NDArray[np.float32]
+Progress = Callable[[str, float], None]
+
+_MARGINS = (2.0, 5.0)  # dB above the target to which splats are removed, the rest being left to quantisation
+_QUALITIES = (30.0, 80.0)  # dB, between which the encoder's is looked for
+_TRIES = 5
+_NEAR = 0.15  # dB above the target that are good enough
+_SHORT = 3  # steps of a fit that begins where another one ended
+
+
+@dataclass(frozen=True, eq=False)
+class SimplifiedFile:
+    """A file, and what was done for it.
+
+    Attributes:
+        result: of the encoder; its source index is into the source.
+        report: JSON-compatible.
+    """
+
+    result: EncodeResult
+    report: dict[str, Any]
+
+
+def encode_simplified(
+    source: SplatModel,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    target: Target,
+    encoding: EncodeOptions | None = None,
+    options: SimplifyOptions | None = None,
+    photographs: tuple[Sequence[Camera], Sequence[F32]] | None = None,
+    judged_by: Sequence[Camera] | None = None,
+    progress: Progress | None = None,
+) -> SimplifiedFile:
+    """Simplify a scene and encode it.
+
+    Args:
+        source: the scene.
+        cameras: as for `simplify`.
+        target: `keep`: the encoder's own options decide the rest. `psnr` and `max_loss`: of the file against the
+            source or the photographs; number of splats and precision are chosen together, `encoding.quality` is not
+            looked at, and the smallest of several files is returned, that of the whole scene among them.
+        encoding: of the encoder.
+        options: of the simplification.
+        photographs: as for `simplify`.
+        judged_by: cameras from which a PSNR against the source is taken, instead of those of `simplify`.
+        progress: is told the stages.
+
+    Raises:
+        InputError: as `simplify` and the encoder; or no file reaches the target.
+    """
+    encoding, options = encoding or EncodeOptions(), options or SimplifyOptions()
+    if not len(source):
+        raise InputError("a scene without splats cannot be simplified")
+    session = prepare(source, cameras, target.keep, options, progress)
+    judge, goal = find_judge(source, cameras, target, options, session, photographs)
+    if judged_by is not None:
+        judge = Judge.of_source(source, judged_by, options.background, options.threads)
+    if target.keep is not None:
+        gone = min(len(source) - round(target.keep * len(source)), len(session.order.rows))
+        file = _Candidate(session, gone, progress).encoded(encoding, encoding.quality)
+        return replace(file, report={**file.report, "psnr": judge.psnr(decode(file.result.data))})
+    codings = [encoding.sh_coding]
+    if encoding.sh_coding == "auto" and source.sh_degree:
+        codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
+    choices = [replace(encoding, sh_coding=coding) for coding in codings]
+    found = [_at_quality(partial(_plain, source, choice, progress), judge.psnr, goal) for choice in choices]
+    for margin in _MARGINS:
+        gone = most_gone(session, judge, goal + margin)
+        if gone:
+            candidate = _Candidate(session, gone, progress)
+            found += [_at_quality(partial(candidate.encoded, choice), judge.psnr, goal) for choice in choices]
+    reached = [file for file in found if file is not None]
+    if not reached:
+        raise InputError(f"no file reaches {goal:.2f} dB: the target is too high for this scene")
+    best = min(reached, key=lambda file: len(file.result.data))
+    tried = [
+        {"splats": f.report["splats"], "size_bytes": len(f.result.data), "psnr": f.report["psnr"]} for f in reached
+    ]
+    return replace(best, report={**best.report, "goal": goal, "tried": tried})
+
+
+class _Candidate:
+    """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins."""
+
+    def __init__(self, session: Session, gone: int, progress: Progress | None) -> None:
+        self._session, self._progress = session, progress
+        self._rows, self._threshold = session.pruned(gone), session.threshold(gone)
+        self._pruned = session.source.select(self._rows)
+        self._last: SplatModel | None = None
+        options = session.options
+        self._weights = measure_removal(
+            self._pruned, session.views.used, background=options.background, threads=options.threads, progress=progress
+        ).squared_weight
+
+    def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
+        """Encode at a quality, the preset's if it is None."""
+        session = self._session
+        report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
+
+        def colours(seen: SplatModel) -> tuple[F32, F32]:
+            start, options = seen, session.options
+            if self._last is not None:
+                start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
+                options = replace(options, steps=_SHORT)
+            fitted = fit(
+                start, session.views.used, session.wanted, options, threshold=self._threshold, centre=self._pruned,
+                progress=self._progress,
+            )  # fmt: skip
+            self._last = fitted.model
+            if fitted.stays is not None:
+                report["zero_bands"] = (~fitted.stays).sum(axis=0).tolist()
+            report["check_psnr"] = session.checked.psnr(fitted.model)
+            return fitted.model.sh0, fitted.model.shN
+
+        said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
+        between = Between(len(session.source), self._rows, colours, said)
+        result = encode_with_report(
+            self._pruned,
+            replace(encoding, quality=quality),
+            importance=self._weights,
+            between=between,
+            progress=self._progress,
+        )
+        return SimplifiedFile(result, report)
+
+
+def _plain(source: SplatModel, encoding: EncodeOptions, progress: Progress | None, quality: float) -> SimplifiedFile:
+    """The file without simplification."""
+    result = encode_with_report(source, replace(encoding, quality=quality), progress=progress)
+    return SimplifiedFile(result, {"splats": len(source), "splats_before": len(source), "quality": quality})
+
+
+def _at_quality(
+    encoded: Callable[[float], SimplifiedFile], psnr: Callable[[SplatModel], float], goal: float
+) -> SimplifiedFile | None:
+    """The smallest file that reaches a PSNR: false position on the encoder's quality; None if none does."""
+    low, high = _QUALITIES
+    quality, best, points = goal + 6.0, None, list[tuple[float, float]]()
+    for number in range(_TRIES):
+        quality = high if number == _TRIES - 1 and best is None else min(max(quality, low), high)
+        file = encoded(quality)
+        reached = psnr(decode(file.result.data))
+        file = replace(file, report={**file.report, "psnr": reached})
+        if reached >= goal:
+            high = quality
+            if best is None or len(file.result.data) < len(best.result.data):
+                best = file
+            if reached < goal + _NEAR:
+                break
+        else:
+            low = quality
+        points.append((quality, reached))
+        quality = _next_quality(points, goal + 0.5 * _NEAR, low, high)
+        if high - low < 0.1:
+            break
+    return best
+
+
+def _next_quality(points: list[tuple[float, float]], goal: float, low: float, high: float) -> float:
+    """Where a straight line through the last two points reaches the goal; a slope of 1 through one."""
+    quality, reached = points[-1]
+    slope = 1.0
+    if len(points) > 1 and points[-2][0] != quality:
+        slope = (reached - points[-2][1]) / (quality - points[-2][0])
+    step = (goal - reached) / min(max(slope, 0.15), 1.5)
+    return min(max(quality + step, low + 0.05 * (high - low)), high - 0.05 * (high - low))

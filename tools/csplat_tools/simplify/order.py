@@ -1,0 +1,119 @@
+"""Which splats go, in which order: by the exact error of their removal, measured anew round after round."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_render.cloud import surface_areas
+from csplat_render.removal import measure_removal
+from csplat_tools.simplify.options import SimplifyOptions
+from csplat_tools.simplify.views import Views, removal_keys
+
+__all__ = ["Order", "Round", "removal_order"]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_LEAST_SHARE = 0.05  # of the splats that stay, at the end of an order that is made to be cut anywhere
+_ROUND_SHARE = 0.75  # of what is left stays after each round of such an order
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round.
+
+    Attributes:
+        removed: how many splats went.
+        largest: the largest error of one of them, as a sum over pixels, channels and views.
+        predicted: sum of their errors.
+    """
+
+    removed: int
+    largest: float
+    predicted: float
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """In which order splats go.
+
+    Attributes:
+        rows: [G] int64, source splats, the first to go first; those that never go are not among them.
+        errors: [G], error of each one's removal when its round came; 0 where the method does not know.
+        rounds: what each round took.
+    """
+
+    rows: I64
+    errors: F64
+    rounds: tuple[Round, ...]
+
+    def kept(self, splat_count: int, gone: int) -> I64:
+        """Source splats that are left when `gone` are removed, ascending."""
+        stays = np.ones(splat_count, bool)
+        stays[self.rows[:gone]] = False
+        return np.flatnonzero(stays)
+
+
+def removal_order(
+    model: SplatModel,
+    views: Views,
+    options: SimplifyOptions,
+    keep: float | None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Order:
+    """Find out in which order splats go.
+
+    Args:
+        model: the source.
+        views: cameras to decide by, and what they say of the source.
+        options: method, rounds.
+        keep: share of the splats that is to stay; None for an order that may be cut anywhere.
+        progress: is told how much is done.
+    """
+    count = len(model)
+    if options.method in ("opacity", "opacity-area"):
+        keys = model.opacities.astype(np.float64)
+        if options.method == "opacity-area":
+            keys = keys * surface_areas(model)
+        rows = np.argsort(keys, kind="stable")
+        return Order(rows, np.zeros(count), ())
+    targets = _targets(count, options, keep)
+    rows, removal, gone = np.arange(count), views.removal, []
+    errors: list[F64] = []
+    rounds = []
+    for number, target in enumerate(targets):
+        if number:
+            removal = measure_removal(
+                model.select(rows), views.used, background=options.background, threads=options.threads,
+                progress=progress,
+            )  # fmt: skip
+        keys = removal_keys(model.select(rows), removal, keep_unseen=options.keep_unseen)
+        order = np.argsort(keys, kind="stable")[: max(0, len(rows) - target)]
+        order = order[np.isfinite(keys[order])]
+        if not len(order):
+            break
+        gone.append(rows[order])
+        errors.append(np.maximum(keys[order], 0.0))
+        rounds.append(Round(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
+        rows = np.delete(rows, order)
+    if not gone:
+        return Order(np.zeros(0, np.int64), np.zeros(0), ())
+    return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
+
+
+def _targets(count: int, options: SimplifyOptions, keep: float | None) -> list[int]:
+    """How many splats are left after each round."""
+    last = round(count * (_LEAST_SHARE if keep is None else keep))
+    if options.method == "exact":
+        return [last]
+    if keep is not None:
+        return [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
+    targets = [count]
+    while targets[-1] > last:
+        targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
+    return targets[1:]

@@ -1,0 +1,66 @@
+"""What `csplat encode --simplify` asks for, without importing a renderer where none is wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import typer
+
+from csplat.encoder import EncodeOptions, EncodeResult
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_tools.convert import Encoder, Report
+from csplat_tools.extras import prepare_renderer
+
+__all__ = ["DEFAULT_VIEWS", "Simplifying"]
+
+#: Virtual views at most.
+DEFAULT_VIEWS = 160
+
+
+@dataclass(frozen=True)
+class Simplifying:
+    """What a command line says; see `csplat_tools.simplify.SimplifyOptions` and `Target`."""
+
+    keep: float | None
+    max_loss: str | None
+    target_psnr: float | None
+    cameras: str | None
+    data: str | None
+    views: int
+    threads: int | None
+
+    @property
+    def asked(self) -> bool:
+        """Whether anything is said at all."""
+        given = (self.keep, self.max_loss, self.target_psnr, self.cameras, self.data)
+        return any(value is not None for value in given)
+
+    def encoder(self, *, quiet: bool) -> Encoder:
+        """Return what makes a file of a scene.
+
+        Raises:
+            InputError: the renderer is not installed.
+            typer.BadParameter: the target is none, or several.
+        """
+        prepare_renderer(quiet=quiet)
+        from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
+        from csplat_tools.simplify.files import find_sights, parse_target
+
+        try:
+            loss = None if self.max_loss is None else parse_target(self.max_loss)
+            target = Target(self.keep, self.target_psnr, loss)
+            options = SimplifyOptions(views=self.views, threads=self.threads)
+        except InputError as error:
+            raise typer.BadParameter(str(error)) from None
+
+        def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> EncodeResult:
+            sights = find_sights(
+                model, self.cameras, self.data, judged=target.max_loss is not None, background=options.background
+            )
+            return encode_simplified(
+                model, sights.cameras, target=target, encoding=encoding, options=options,
+                photographs=sights.photographs, progress=progress,
+            ).result  # fmt: skip
+
+        return encode

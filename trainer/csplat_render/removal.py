@@ -1,0 +1,154 @@
+"""What the removal of each splat would change: the exact leave-one-out error of all splats in one pass over views.
+
+Exact for each splat alone, with everything else in place. Two things that the rasteriser decides by comparison are held
+fast: a pixel that was finished stays so, though without a splat in front of it it might have shown more of what is
+behind (at most a transmittance of 1e-4, times 1 / (1 − alpha)); and colours beyond 0 and 1 count as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.arrays import Array
+from csplat_render.camera import Camera
+from csplat_render.contributions import Contributions
+from csplat_render.conventions import TRANSMITTANCE_MIN
+from csplat_render.twin import render_exact
+
+__all__ = ["Removal", "measure_removal", "removal_exact"]
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Removal:
+    """Sums over the pixels, channels and views of a pass; they add up from pass to pass.
+
+    Attributes:
+        error: [N] float64, squared change of the pictures if the splat were not there.
+        product: [N] float64, that change times what the pictures have too much of the wanted ones: removal adds
+            `error + 2 · product` to the squared error of the pictures. 0 where the pictures themselves are wanted.
+        weight: [N] float64, the share of pixels that is the splat's, summed.
+        squared_weight: [N] float64, the same of its square.
+        views: [N] int64, how many views saw the splat.
+        bands: [N, d] float64, squared change of the pictures if the splat's SH band 1, … d were zero.
+        value_count: pixels times channels of all views.
+    """
+
+    error: Array
+    product: Array
+    weight: Array
+    squared_weight: Array
+    views: Array
+    bands: Array
+    value_count: int
+
+    @property
+    def seen(self) -> Array:
+        """[N] bool, which splats any view saw."""
+        seen: Array = self.views > 0
+        return seen
+
+    def __add__(self, other: Removal) -> Removal:
+        return Removal(
+            self.error + other.error,
+            self.product + other.product,
+            self.weight + other.weight,
+            self.squared_weight + other.squared_weight,
+            self.views + other.views,
+            self.bands + other.bands,
+            self.value_count + other.value_count,
+        )
+
+
+def measure_removal(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    *,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    references: Sequence[Array] | None = None,
+    on_picture: Callable[[int, Array], object] | None = None,
+    dtype: Any = np.float32,
+    transmittance_min: float = TRANSMITTANCE_MIN,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Removal:
+    """Measure what the removal of each splat, alone, would change in pictures of a scene.
+
+    Args:
+        model: the scene.
+        cameras: the views, at least one; relative to the scene's origin.
+        background: red, green, blue behind everything.
+        references: the wanted pictures, [H, W, 3] each; None for those of the scene itself.
+        on_picture: is shown each picture, [H, W, 3], and its number.
+        dtype: of pixels, float32 or float64 (which is for tests).
+        transmittance_min: when a pixel is finished; 0 for never.
+        threads: how many; None for all. The result does not depend on it.
+        progress: is told how much is done.
+
+    Raises:
+        InputError: there is no camera, or there are not as many references.
+        LimitError: a picture has more than `rasterise.MAX_INTERSECTIONS`.
+    """
+    if not cameras:
+        raise InputError("measuring removal wants a camera at least")
+    if references is not None and len(references) != len(cameras):
+        raise InputError(f"{len(references)} reference pictures for {len(cameras)} cameras")
+    drawing = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
+    coefficients = np.concatenate([model.sh0[:, None], model.shN], axis=1)
+    totals, bands = np.zeros((len(model), 5)), np.zeros((len(model), model.sh_degree))
+    behind = np.asarray(background, np.float64)
+    for number, camera in enumerate(cameras):
+        drawn = drawing.draw(model, camera, antialiased=model.antialiased)
+        reference = None if references is None else references[number]
+        picture = drawing.removal(drawn, coefficients, totals, bands, background=behind, reference=reference)
+        if on_picture is not None:
+            on_picture(number, picture)
+        if progress is not None:
+            progress("measuring splats", (number + 1) / len(cameras))
+    error, product, weight, squares, views = totals.T.copy()
+    count = sum(3 * camera.W * camera.H for camera in cameras)
+    return Removal(error, product, weight, squares, views.astype(np.int64), bands, count)
+
+
+def removal_exact(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    rows: ArrayLike,
+    *,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    transmittance_min: float = TRANSMITTANCE_MIN,
+) -> Array:
+    """The slow twin of `measure_removal`: take one splat away, render in float64, compare; and so on.
+
+    Args:
+        model: the scene.
+        cameras: the views.
+        rows: which splats are to be measured.
+        background: red, green, blue behind everything.
+        transmittance_min: when a pixel is finished; 0 for never, which is what the pass is exact for.
+
+    Returns:
+        Squared change of the pictures, one number per row of `rows`, float64.
+    """
+    rows = np.asarray(rows, np.int64)
+    errors = np.zeros(len(rows))
+
+    def picture(splats: SplatModel, camera: Camera) -> Array:
+        return render_exact(
+            splats, camera, background=background, antialiased=model.antialiased, transmittance_min=transmittance_min
+        ).rgb
+
+    for camera in cameras:
+        whole = picture(model, camera)
+        for place, row in enumerate(rows):
+            rest = model.select(np.delete(np.arange(len(model)), row))
+            errors[place] += float(np.sum((picture(rest, camera) - whole) ** 2))
+    return errors
