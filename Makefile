@@ -38,7 +38,7 @@ format: $(VENV)/.dev ## bring the code into its one layout
 spec: $(VENV)/.dev ## write constants and tables from the registry
 	$(BIN)/python spec/generate.py
 
-sample: $(VENV)/.core ## make the sample scene again
+sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, train; some minutes
 	$(BIN)/python tools/sample/make_sample.py
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats

@@ -430,7 +430,7 @@ def test_tables_save_most_of_the_memory(viewer, sample):
     viewer.page.evaluate("engine.requestFrame(), engine.settled()")
     stats = viewer.stats()
     assert 236 == stats["expandedBytesPerSplat"]
-    assert stats["gpuBytesPerSplat"] < 40  # of 9,000 splats; rows of textures are whole
+    assert stats["gpuBytesPerSplat"] < 40  # of few splats; rows of textures are whole
 
 
 def test_nothing_is_left_after_closing(viewer, sample):
