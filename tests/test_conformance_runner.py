@@ -258,3 +258,13 @@ def test_a_level_that_is_none_is_one_line():
     result = invoke("--level", "9")
 
     assert (1, 1) == (result.exit_code, len(result.stderr.splitlines()))
+
+
+@pytest.mark.parametrize("place", ["-", "same.txt"])
+def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    command = f"touch {tmp_path / 'ran'}"
+    result = invoke("--cmd", command + " {input} {outdir}", "--json", place, "--junit", place)
+    assert 1 == result.exit_code
+    assert "only one report" in result.stderr
+    assert [] == list(tmp_path.iterdir())

@@ -236,6 +236,20 @@ def test_damaged_files_are_refused_before_they_are_served(scene_path):
     assert "E_TRUNCATED" in refused(scene_path)
 
 
+@pytest.mark.parametrize(("begin", "code"), [(b"", "E_TRUNCATED"), (b"\0", "E_MAGIC")])
+def test_a_file_that_is_damaged_from_its_first_byte_is_known_by_its_name(scene_path, begin, code):
+    data = scene_path.read_bytes()
+    scene_path.write_bytes(begin and begin + data[1:])
+    assert code in refused(scene_path)
+
+
+def test_a_ply_is_one_whatever_its_name(tmp_path, make_model):
+    path = tmp_path / "scene.csplat"
+    write_ply(path, make_model(20, 1))
+    with open_scene(str(path), preset="fast") as scene:
+        assert 20 == scene.header.splat_count
+
+
 def test_a_profile_that_browsers_do_not_read_is_refused(tmp_path, make_model):
     path = tmp_path / "scene.csplat"
     path.write_bytes(encode(make_model(2000), EncodeOptions(profile="archive")))

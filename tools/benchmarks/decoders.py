@@ -26,9 +26,10 @@ from machine import describe_machine
 from scenes import ROOT
 
 from csplat import EncodeOptions, decoder, encode, read_ply
-from csplat._spec import ERROR_UNSUPPORTED, MAGIC, PROFILE_ARCHIVE
+from csplat._spec import ERROR_UNSUPPORTED, PROFILE_ARCHIVE
 from csplat.errors import CsplatError
 from csplat_tools.console import format_table
+from csplat_tools.inout import is_csplat
 
 _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
 _PRESETS = "fast,balanced,small"
@@ -142,9 +143,7 @@ def _refusal(said: dict[str, Any]) -> str:
 
 def _files(path: Path, presets: list[str]) -> Iterator[tuple[str, bytes]]:
     """A .csplat file as it is, a PLY once per preset."""
-    with path.open("rb") as stream:
-        is_csplat = stream.read(len(MAGIC)) == MAGIC
-    if is_csplat or path.suffix == ".csplat":  # also one whose first bytes are damaged
+    if is_csplat(path):
         yield path.name, path.read_bytes()
         return
     try:

@@ -111,7 +111,9 @@ def ply_path(path: str) -> Iterator[Path]:
 
 
 def is_csplat(path: Path) -> bool:
-    """Whether a file begins as .csplat files do; a folder (an unbundled SOG) does not.
+    """Whether a file is one for the decoder, by its first bytes, or by its name where they are damaged.
+
+    A PLY is not, whatever its name; nor is a folder (an unbundled SOG).
 
     Raises:
         OSError: it cannot be read.
@@ -119,7 +121,8 @@ def is_csplat(path: Path) -> bool:
     if path.is_dir():
         return False
     with path.open("rb") as stream:
-        return stream.read(len(MAGIC)) == MAGIC
+        begin = stream.read(max(len(MAGIC), 4))
+    return begin.startswith(MAGIC) or (path.suffix.lower() == ".csplat" and not begin.startswith(_PLY_MAGICS))
 
 
 @contextmanager

@@ -82,10 +82,7 @@ def decoder(
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
-    outputs = [path for path in (json_file, junit_file) if path is not None]
-    for path in outputs:
-        if path != STANDARD_STREAM:
-            check_output(path, force=force)
+    check_reports(json_file, junit_file, force=force)
     with progress_bar() as bar:
         # A renderer alone is tested at L4 alone.
         usual = "3" if render_command is None else "4"
@@ -102,6 +99,21 @@ def decoder(
         raise typer.Exit(FAILED)
 
 
+def check_reports(json_file: str | None, junit_file: str | None, *, force: bool) -> None:
+    """Refuse the places of reports before anything is run; arguments as those of `publish`.
+
+    Raises:
+        InputError: a file exists and `force` is not given, or both reports go to the same place.
+        OSError: a folder does not exist.
+    """
+    if json_file is not None and json_file == junit_file:
+        both = "standard output" if json_file == STANDARD_STREAM else json_file
+        raise InputError(f"only one report can go to {both}")
+    for path in (json_file, junit_file):
+        if path is not None and path != STANDARD_STREAM:
+            check_output(path, force=force)
+
+
 def publish(report: Report, json_file: str | None, junit_file: str | None, *, verbose: bool) -> None:
     """Print a report as a table, and write it as JSON and JUnit XML where that is wanted.
 
@@ -111,8 +123,6 @@ def publish(report: Report, json_file: str | None, junit_file: str | None, *, ve
         junit_file: likewise.
         verbose: a line for each check.
     """
-    if json_file == STANDARD_STREAM and junit_file == STANDARD_STREAM:
-        raise InputError("only one report can go to standard output")
     if json_file == STANDARD_STREAM:
         say_json(to_json(report))
     elif json_file is not None:

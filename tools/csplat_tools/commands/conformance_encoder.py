@@ -15,10 +15,9 @@ from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder
 from csplat_conformance.encoders.judge import PictureJudge
 from csplat_conformance.encoders.run import TIMEOUT_SECONDS
 from csplat_conformance.runner import parse_levels
-from csplat_tools.commands.conformance import conformance, publish
+from csplat_tools.commands.conformance import check_reports, conformance, publish
 from csplat_tools.console import FAILED, guarded, note, progress_bar
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.inout import STANDARD_STREAM, check_output
 
 __all__ = ["conformance", "encoder"]
 
@@ -68,9 +67,7 @@ def encoder(
       csplat conformance encoder --cmd 'my-encoder --small {ply} {out}' --min-psnr 28 --junit report.xml
       csplat conformance encoder --cmd 'my-encoder {ply} {out}' --filter 'nasty/*' --level 1 --keep tried
     """
-    for path in (json_file, junit_file):
-        if path is not None and path != STANDARD_STREAM:
-            check_output(path, force=force)
+    check_reports(json_file, junit_file, force=force)
     levels = tuple(f"L{number}" for number in parse_levels(level))
     folder = _checked_folder(keep, force=force)
     pictures, reason = _picture_judge() if f"L{_PICTURES_LEVEL}" in levels else (None, "")
