@@ -1,6 +1,8 @@
 """What splats are to pictures: the removal pass against its twin, and colours fitted to pictures."""
 
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,12 +10,19 @@ import pytest
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
 from csplat.errors import InputError
-from csplat.model import SplatModel
+from csplat.model import SplatModel, sh_degree_of
 from csplat.ply import read_ply
 from csplat_render import render
+from csplat_render.arrays import Splats
 from csplat_render.cameras import intrinsics, load_cameras, look_at
+from csplat_render.contributions import Contributions
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.removal import measure_removal, removal_exact
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
+
+# It lies in the folder that is named above.
+from oracle import adversarial, extreme_splats, facing
 
 
 def views(count=3, width=40, height=30, distance=4.0):
@@ -133,6 +142,72 @@ def test_threads_change_nothing(threads):
         np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_splats_at_a_slant_lose_no_row(antialiased):
+    model = scene(count=150, seed=4)
+    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (150, 1))  # needles: most rows of their boxes are empty
+    model = replace(model, scales=scales, antialiased=antialiased)
+    expected = removal_exact(model, views(1), np.arange(150), transmittance_min=0.0)
+    found = measure_removal(model, views(1), dtype=np.float64, transmittance_min=0.0)
+    assert relative(found.error, expected)[expected > 0.0].max() < 1e-9
+    assert np.count_nonzero(expected) > 100
+
+
+@pytest.mark.parametrize("name", [name for name, _ in adversarial()])
+def test_totals_of_adversarial_splats_are_finite(name):
+    case = dict(adversarial())[name]
+    assert_finite(case.arrays, case.view, antialiased=case.antialiased)
+
+
+@pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
+def test_totals_of_tiny_and_huge_splats_are_finite(log_scale):
+    assert_finite(extreme_splats(scales=log_scale), facing())
+    assert_finite(extreme_splats(scales=(log_scale, -2.0, -2.0)), facing())
+
+
+@pytest.mark.parametrize("field", ["sh0", "shN"])
+@pytest.mark.parametrize("size", [1e12, 1e25, 3e38])
+def test_totals_of_colours_beyond_all_measure_are_finite(field, size):
+    arrays = extreme_splats()
+    arrays[field] = np.where(arrays[field] > 0.0, size, -size).astype(np.float32)
+    assert_finite(arrays, facing())
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_rows_that_hold_nan_are_unseen_and_change_nothing(field, bad):
+    arrays = extreme_splats(count=30)
+    clean = measured({name: value[3:] for name, value in arrays.items()}, facing())
+    arrays[field].reshape(30, -1)[:3, -1] = bad
+    found = measured(arrays, facing())
+    assert not found.seen[:3].any()
+    for name in ("error", "weight", "squared_weight", "bands"):
+        np.testing.assert_array_equal(getattr(clean, name), getattr(found, name)[3:])
+
+
+def measured(arrays, view, *, antialiased=False):
+    """Measure what a `SplatModel` would refuse."""
+    degree = sh_degree_of(arrays["shN"].shape[1])
+    return measure_removal(Loose(**arrays, sh_degree=degree, antialiased=antialiased), [view])
+
+
+def assert_finite(arrays, view, *, antialiased=False):
+    found = measured(arrays, view, antialiased=antialiased)
+    for name in ("error", "product", "weight", "squared_weight", "bands"):
+        assert np.isfinite(getattr(found, name)).all(), name
+
+
+@dataclass(frozen=True)
+class Loose(Splats):
+    """What `measure_removal` reads of a model, unchecked."""
+
+    sh_degree: int
+    antialiased: bool
+
+    def __len__(self):
+        return len(self.means)
+
+
 def test_parts_add_up():
     model, cameras = scene(count=50), views(3)
     whole = measure_removal(model, cameras)
@@ -218,6 +293,34 @@ def test_views_that_do_not_fit_the_cache_give_the_same_colours():
     kept, _ = fit_colours(model, cameras, wanted, steps=3)
     anew, _ = fit_colours(model, cameras, wanted, steps=3, cache_bytes=0)
     np.testing.assert_array_equal(kept, anew)
+
+
+@pytest.mark.parametrize("opacity", [0.05, 0.3, 0.97])
+def test_leaving_out_what_has_no_weight_changes_no_bit(opacity):
+    model = scene(count=400)
+    model = replace(model, opacities=np.full(400, opacity, np.float32), scales=model.scales + np.float32(0.5))
+    drawing, x = Contributions(), coefficients(model)
+    whole = drawing.draw(model, views(1, 70, 50)[0])
+    active, black, wanted = np.ones((len(whole.rows), 3), bool), np.zeros(3, np.float32), np.float32(0.5)
+    reference = np.full((50, 70, 3), wanted, np.float32)
+
+    def answer(view, mask):
+        sums = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
+        rgb = drawing.colours(view, x, mask, *sums, offset=0.5, background=black, reference=reference)
+        return rgb, *sums
+
+    first = answer(whole, active)
+    less, left = drawing.trimmed(whole)
+    assert len(less.ids) < len(whole.ids)
+    for expected, actual in zip(first, answer(less, active[left]), strict=True):
+        np.testing.assert_array_equal(expected, actual)
+
+
+def test_a_fit_of_colours_beyond_all_measure_ends_without_nan():
+    model = scene(count=40)
+    model = replace(model, sh0=np.full((40, 3), 1e30, np.float32))
+    x, _ = fit_colours(model, views(2), [np.full((30, 40, 3), 0.5, np.float32)] * 2)
+    assert np.isfinite(x).all()
 
 
 def test_as_many_pictures_as_cameras_are_wanted():

@@ -20,8 +20,14 @@ def need_renderer() -> None:
     _need("numba")
 
 
-def prepare_renderer(*, quiet: bool) -> None:
+def prepare_renderer(*, quiet: bool, simplify: bool = False, ssim: bool = False, lpips: bool = False) -> None:
     """Compile the renderer, or load what was compiled before; say so on a terminal if it takes its time.
+
+    Args:
+        quiet: say nothing.
+        simplify: what simplification runs too.
+        ssim: what SSIM runs too.
+        lpips: what LPIPS runs too.
 
     Raises:
         InputError: numba is not installed.
@@ -29,7 +35,8 @@ def prepare_renderer(*, quiet: bool) -> None:
     need_renderer()
     from csplat_render.warmup import warm_up
 
-    warm_up(None if quiet or not sys.stderr.isatty() else note, gradients=False)
+    announce = None if quiet or not sys.stderr.isatty() else note
+    warm_up(announce, gradients=False, simplify=simplify, ssim=ssim, lpips=lpips)
 
 
 def need_trainer(*, plots: bool = False) -> None:

@@ -43,7 +43,7 @@ class Simplifying:
             InputError: the renderer is not installed.
             typer.BadParameter: the target is none, or several.
         """
-        prepare_renderer(quiet=quiet)
+        prepare_renderer(quiet=quiet, simplify=True)
         from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
         from csplat_tools.simplify.files import find_sights, parse_target
 

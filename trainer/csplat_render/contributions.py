@@ -7,58 +7,30 @@ colours, with the way back from pixels to colours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat.model import sh_degree_of
 from csplat_render.arrays import Array, HasSplats, Splats
 from csplat_render.binning import TILE
-from csplat_render.blending_sums import SUMS, blend_counted, sum_back
+from csplat_render.blending import blend
+from csplat_render.blending_colours import COLOUR_SUMS, sum_colours
+from csplat_render.blending_sums import SUMS, blend_counted, sum_removal
 from csplat_render.camera import Camera
 from csplat_render.conventions import TRANSMITTANCE_MIN, view_vector
-from csplat_render.harmonics import sh_basis
-from csplat_render.jit import parallel_kernel, thread_count
-from csplat_render.projecting import BLOCK, direction, project
+from csplat_render.drawn_view import DrawnView, add_gradient, add_removal, basis_of_view, set_colours
+from csplat_render.jit import thread_count
+from csplat_render.projecting import BLOCK, project
 from csplat_render.rasterise import Rasteriser
 
-__all__ = ["Contributions", "DrawnView"]
+__all__ = ["Contributions"]
 
+# Colours are taken for no brighter: squares of their differences, summed over a tile, stay within float32.
+_BRIGHTEST = 1e15
 
-@dataclass(frozen=True, eq=False)
-class DrawnView:
-    """One view of fixed geometry: V splats that may be seen in it, nearest first.
-
-    Attributes:
-        rows: [V] int32, which splats of the scene they are.
-        shape: [V, 10] float64, see `project`; columns 6 to 8 are colours and may be replaced.
-        box: [V, 4] int32, see `project`.
-        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)².
-        starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
-        ids: [intersections] int32, places in `rows`, tile by tile, nearest first.
-        slots: [intersections] int32, the record of each of `ids`.
-        first: [V + 1] int64, where the records of each splat begin.
-        width, height: of the picture, pixels.
-    """
-
-    rows: Array
-    shape: Array
-    box: Array
-    basis: Array
-    starts: Array
-    ids: Array
-    slots: Array
-    first: Array
-    width: int
-    height: int
-
-    @property
-    def size_bytes(self) -> int:
-        """Memory that the arrays take."""
-        arrays = (self.rows, self.shape, self.box, self.basis, self.starts, self.ids, self.slots, self.first)
-        return sum(array.nbytes for array in arrays)
+# Of an exponent, for rounding: far from the centre of a splat it is a small difference of large numbers, at most 1e4.
+_MARGIN = 0.05
 
 
 class Contributions(Rasteriser):
@@ -109,13 +81,27 @@ class Contributions(Rasteriser):
             )  # fmt: skip
             order = self._depth_order(near)
             starts, _ = self._sort_into_tiles(order, near, extent, box, tiles_x, tiles_x * tiles_y)
-            rows = order.copy()
+            # In the order of the scene, not of depth: what is read and written per splat then lies in a row.
+            rows = np.flatnonzero(near > 0.0).astype(np.int32)
             basis = np.empty((len(rows), (degree + 1) ** 2), np.float32)
-            _basis_of_view(arrays.means, rows, view, degree, basis)
-        return _without_unseen(
-            rows, shape, box, basis, starts.copy(), self._buffers["ids"], self._buffers["slots"],
-            self._buffers["offsets"], width, height,
-        )  # fmt: skip
+            basis_of_view(arrays.means, rows, view, degree, basis)
+        offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
+        place[rows] = np.arange(len(rows), dtype=np.int32)
+        drawn = np.take(shape, rows, axis=0)
+        np.minimum(drawn[:, 6:9], _BRIGHTEST, out=drawn[:, 6:9])
+        drawn[:, 9] = np.log2(self.settings.alpha_min / drawn[:, 5]) - _MARGIN
+        return DrawnView(
+            rows=rows,
+            shape=drawn,
+            box=np.take(box, rows, axis=0),
+            basis=basis,
+            starts=starts.copy(),
+            ids=np.take(place, self._buffers["ids"]),
+            slots=self._buffers["slots"].copy(),
+            first=np.append(offsets[rows], offsets[-1]),  # what is not drawn has no records
+            width=width,
+            height=height,
+        )
 
     def removal(
         self,
@@ -141,9 +127,9 @@ class Contributions(Rasteriser):
         Returns:
             [H, W, 3], the picture.
         """
-        rgb, records = self._summed(drawn, background, reference, removal=True)
+        rgb, records = self._removal(drawn, background, reference)
         with thread_count(self.threads):
-            _add_removal(drawn.rows, drawn.first, records, drawn.basis, coefficients, totals, bands)
+            add_removal(drawn.rows, drawn.first, records, drawn.basis, coefficients, totals, bands)
         return rgb
 
     def colours(
@@ -176,18 +162,22 @@ class Contributions(Rasteriser):
             [H, W, 3], the picture, before the subtraction.
         """
         with thread_count(self.threads):
-            _set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
-        if reference is None:
-            reference = np.zeros((drawn.height, drawn.width, 3), self.dtype)
-        rgb, records = self._summed(drawn, background, reference, removal=False)
+            set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
+        rgb, records = self._colours(drawn, background, reference)
         with thread_count(self.threads):
-            _add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
+            add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
         return rgb
 
-    def _summed(
-        self, drawn: DrawnView, background: Array, reference: Array | None, *, removal: bool
-    ) -> tuple[Array, Array]:
-        """Run the loops over pixels: the picture, and a record for every splat in every tile."""
+    def trimmed(self, drawn: DrawnView) -> tuple[DrawnView, Array]:
+        """Leave out what the last `colours`, of this view, found without any weight: pictures stay the same to the bit.
+
+        Returns:
+            The view, and which of the V splats are left.
+        """
+        return drawn.with_records(self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)[:, 3] > 0.0)
+
+    def _removal(self, drawn: DrawnView, background: Array, reference: Array | None) -> tuple[Array, Array]:
+        """Run the loops over pixels, front to back and again back to front: the picture, and the records."""
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
         records = self._buffer("sums", (len(drawn.ids), SUMS), self.dtype)
         transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
@@ -199,112 +189,27 @@ class Contributions(Rasteriser):
                 rgb, transmittance, last,
             )  # fmt: skip
             error = np.zeros_like(rgb) if reference is None else rgb - reference
-            sum_back(
+            sum_removal(
                 drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, lanes, self._limits, behind,
-                error.astype(self.dtype, copy=False), transmittance, last, removal, records,
+                error.astype(self.dtype, copy=False), transmittance, last, records,
             )  # fmt: skip
         return rgb, records
 
-
-def _without_unseen(
-    rows: Array, shape: Array, box: Array, basis: Array, starts: Array, ids: Array, slots: Array, offsets: Array,
-    width: int, height: int,
-) -> DrawnView:  # fmt: skip
-    """Renumber: a splat is its place in the order of depth, and records follow that order."""
-    place = np.empty(len(shape), np.int32)
-    place[rows] = np.arange(len(rows), dtype=np.int32)
-    count = offsets[rows + 1] - offsets[rows]
-    first = np.zeros(len(rows) + 1, np.int64)
-    np.cumsum(count, out=first[1:])
-    moved = place[ids]
-    shift = (first[:-1] - offsets[rows]).astype(np.int32)
-    return DrawnView(
-        rows=rows,
-        shape=np.take(shape, rows, axis=0),
-        box=np.take(box, rows, axis=0),
-        basis=basis,
-        starts=starts,
-        ids=moved,
-        slots=slots + shift[moved],
-        first=first,
-        width=width,
-        height=height,
-    )
-
-
-@parallel_kernel()
-def _basis_of_view(means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
-    """Spherical harmonics in the direction of each splat that is drawn; parallel over blocks of them."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
-        values = np.empty(16, np.float64)
-        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
-            x, y, z, _ = direction(view, means[rows[j]])
-            sh_basis(degree, x, y, z, values)
-            for k in range(basis.shape[1]):
-                basis[j, k] = values[k]
-
-
-@parallel_kernel()
-def _set_colours(rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any) -> None:
-    """Write offset + Y · coefficients into the shapes, 0 where not active; parallel over blocks of splats."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
-        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
-            i = rows[j]
-            for c in range(3):
-                colour = np.float64(offset)
-                for k in range(basis.shape[1]):
-                    colour += np.float64(basis[j, k]) * coefficients[i, k, c]
-                shape[j, 6 + c] = colour if active[j, c] else 0.0
-
-
-@parallel_kernel()
-def _add_removal(rows: Any, first: Any, records: Any, basis: Any, coefficients: Any, totals: Any, bands: Any) -> None:
-    """Add the records of one view up, splat by splat, see `Contributions.removal`; parallel over blocks of splats."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
-        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
-            i = rows[j]
-            error, product, weight, squares = 0.0, 0.0, 0.0, 0.0
-            for r in range(first[j], first[j + 1]):
-                error += records[r, 0]
-                product += records[r, 1]
-                weight += records[r, 2]
-                squares += records[r, 3]
-            if weight <= 0.0:
-                continue
-            totals[i, 0] += error
-            totals[i, 1] += product
-            totals[i, 2] += weight
-            totals[i, 3] += squares
-            totals[i, 4] += 1.0
-            for band in range(1, bands.shape[1] + 1):
-                energy = 0.0
-                for c in range(3):
-                    part = 0.0
-                    for k in range(band * band, (band + 1) * (band + 1)):
-                        part += np.float64(basis[j, k]) * coefficients[i, k, c]
-                    energy += part * part
-                bands[i, band - 1] += squares * energy
-
-
-@parallel_kernel()
-def _add_gradient(rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any) -> None:
-    """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
-    with_diagonal = diagonal.shape[0] > 0
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
-        sums = np.empty(3, np.float64)
-        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
-            i = rows[j]
-            sums[:] = 0.0
-            squares = 0.0
-            for r in range(first[j], first[j + 1]):
-                sums[0] += records[r, 0]
-                sums[1] += records[r, 1]
-                sums[2] += records[r, 2]
-                squares += records[r, 3]
-            for c in range(3):
-                if active[j, c]:
-                    for k in range(basis.shape[1]):
-                        gradient[i, k, c] += basis[j, k] * sums[c]
-            if with_diagonal:
-                for k in range(basis.shape[1]):
-                    diagonal[i, k] += squares * basis[j, k] * basis[j, k]
+    def _colours(self, drawn: DrawnView, background: Array, reference: Array | None) -> tuple[Array, Array]:
+        """Run the loops over pixels, front to back twice: the picture, and the records."""
+        size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
+        records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
+        used = self._buffer("used", (len(drawn.starts) - 1,), np.int64)
+        rgb = np.empty((*size, 3), self.dtype)
+        with thread_count(self.threads) as lanes:
+            blend(
+                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, lanes, self._limits,
+                np.ascontiguousarray(background, self.dtype), rgb, self._buffer("through", size, self.dtype),
+                self._buffer("depth", size, self.dtype), used,
+            )  # fmt: skip
+            error = rgb if reference is None else rgb - reference
+            sum_colours(
+                drawn.starts, used, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, lanes, self._limits,
+                error.astype(self.dtype, copy=False), records,
+            )  # fmt: skip
+        return rgb, records

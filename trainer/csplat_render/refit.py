@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat_render.arrays import Array, HasSplats
 from csplat_render.camera import Camera
-from csplat_render.contributions import Contributions, DrawnView
+from csplat_render.contributions import Contributions
+from csplat_render.drawn_view import DrawnView
 
 __all__ = ["ColourOperator", "fit_colours"]
 
@@ -86,7 +87,8 @@ class ColourOperator:
                 drawn, coefficients, active, gradient, unwanted if diagonal is None else diagonal,
                 offset=0.5, background=self._background, reference=references[number],
             )  # fmt: skip
-            total += float(np.sum(np.square(rgb - references[number]), dtype=np.float64))
+            self._keep(number, drawn, active)
+            total += float(np.sum(np.square(rgb - references[number], dtype=np.float64)))
         return total
 
     def normal(self, vector: Floats, result: Floats) -> float:
@@ -101,7 +103,8 @@ class ColourOperator:
         for number in range(len(self.cameras)):
             drawn, active = self._view(number)
             rgb = self._drawing.colours(drawn, vector, active, result, unwanted, offset=0.0, background=self._black)
-            total += float(np.sum(np.square(rgb), dtype=np.float64))
+            self._keep(number, drawn, active)
+            total += float(np.sum(np.square(rgb, dtype=np.float64)))
         return total
 
     def _view(self, number: int) -> tuple[DrawnView, Array]:
@@ -109,10 +112,15 @@ class ColourOperator:
         if kept is None:
             drawn = self._drawing.draw(self._splats, self.cameras[number], antialiased=self.antialiased)
             kept = (drawn, drawn.shape[:, 6:9] > 0.0)
-            if drawn.size_bytes <= self._cache_left:
-                self._cache_left -= drawn.size_bytes
-                self._kept[number] = kept
         return kept
+
+    def _keep(self, number: int, drawn: DrawnView, active: Array) -> None:
+        """Keep a view whose weights have just been summed, if there is room: what has none is not looked at again."""
+        if number in self._kept or drawn.size_bytes > self._cache_left:
+            return
+        trimmed, left = self._drawing.trimmed(drawn)
+        self._cache_left -= trimmed.size_bytes
+        self._kept[number] = (trimmed, active[left])
 
 
 def fit_colours(
@@ -178,8 +186,8 @@ def fit_colours(
         operator.normal(direction, image)
         image *= mask[..., None]
         curvature = _dot(direction, image)
-        if not curvature > 0.0:
-            break  # nothing that is free is seen, or the fit is exact
+        if not 0.0 < curvature < np.inf:
+            break  # nothing that is free is seen, or the fit is exact, or colours are beyond all measure
         length = product / curvature
         x += np.float32(length) * direction
         residual -= np.float32(length) * image

@@ -9,26 +9,34 @@ from typing import Any
 
 import numpy as np
 
+from csplat_render.arrays import Array
 from csplat_render.camera import Camera
 from csplat_render.rasterise import Rasteriser, Splats
 
 __all__ = ["warm_up"]
 
 _SILENT_SECONDS = 1.0  # what loading compiled kernels from the cache may take
+_SIZE = 16  # pixels on each side of what is rendered
 
 
 def warm_up(
     announce: Callable[[str], object] | None = None,
     *,
     gradients: bool = True,
+    simplify: bool = False,
+    ssim: bool = False,
+    lpips: bool = False,
     dtype: Any = np.float32,
 ) -> float:
-    """Compile the kernels, or load them from numba's cache, by rendering a splat.
+    """Compile kernels, or load them from numba's cache, by putting them to a single splat.
 
     Args:
         announce: called with one line if it takes longer than a second, and with another at its end.
-        gradients: the backward pass too.
-        dtype: see `Rasteriser`.
+        gradients: the backward pass of the renderer too.
+        simplify: what `measure_removal` and `fit_colours` run.
+        ssim: what `metrics.ssim` runs.
+        lpips: what `lpips.Lpips` runs.
+        dtype: of pixels and gradients, see `Rasteriser`; the other groups have one each.
 
     Returns:
         Seconds that it took.
@@ -38,24 +46,51 @@ def warm_up(
     timer.daemon = True
     timer.start()
     try:
-        one = np.ones(1, dtype)
-        splats = Splats(
-            np.zeros((1, 3), dtype), np.ones((1, 4), dtype), np.zeros((1, 3), dtype), one, np.ones((1, 3), dtype),
-            np.zeros((1, 0, 3), dtype),
-        )  # fmt: skip
         viewmat = np.eye(4)
         viewmat[2, 3] = 5.0
-        camera = Camera(np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, 16, 16)
+        camera = Camera(np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _SIZE, _SIZE)
         rasteriser = Rasteriser(dtype=dtype, gradients=gradients)
-        picture = rasteriser.forward(splats, camera)
+        picture = rasteriser.forward(_one_splat(dtype), camera)
         if gradients:
             rasteriser.backward(np.ones_like(picture.rgb))
+        if simplify:
+            _warm_up_simplifying(camera)
+        if ssim or lpips:
+            _warm_up_metrics(picture.rgb, ssim=ssim, lpips=lpips)
     finally:
         timer.cancel()
     seconds = time.perf_counter() - started
     if announce is not None and seconds > _SILENT_SECONDS:
         announce(f"the renderer is compiled, in {seconds:.0f} s")
     return seconds
+
+
+def _warm_up_simplifying(camera: Camera) -> None:
+    from csplat.model import SplatModel
+    from csplat_render.refit import fit_colours
+    from csplat_render.removal import measure_removal
+
+    model = SplatModel(**vars(_one_splat(np.float32)))
+    measure_removal(model, [camera])
+    fit_colours(model, [camera], [np.zeros((_SIZE, _SIZE, 3), np.float32)], steps=1)
+
+
+def _warm_up_metrics(picture: Array, *, ssim: bool, lpips: bool) -> None:
+    if ssim:
+        from csplat_render import metrics
+
+        metrics.ssim(picture, picture)
+    if lpips:
+        from csplat_render.convolving import convolve
+
+        kernel = np.ones((3, 3, 3, 4), np.float32)
+        convolve(picture.astype(np.float32), kernel, np.zeros(4, np.float32), 1, 1)
+
+
+def _one_splat(dtype: Any) -> Splats:
+    quat, shN = np.array([[1.0, 0.0, 0.0, 0.0]], dtype), np.zeros((1, 0, 3), dtype)
+    zeros = np.zeros((1, 3), dtype)
+    return Splats(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)
 
 
 def _say(announce: Callable[[str], object] | None) -> None:

@@ -105,7 +105,7 @@ def compare(
             background=colour,
             mode=chosen,
             force=force,
-            prepare=partial(prepare_renderer, quiet=quiet),
+            prepare=partial(prepare_renderer, quiet=quiet, ssim=True, lpips=lpips is not None),
             progress=progress,
         )
     if as_json:

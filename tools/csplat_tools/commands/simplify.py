@@ -98,7 +98,7 @@ def simplify(
       csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
-    prepare_renderer(quiet=quiet)
+    prepare_renderer(quiet=quiet, simplify=True)
     from csplat_tools.simplify import SimplifyOptions, Target
     from csplat_tools.simplify import simplify as simplified
     from csplat_tools.simplify.files import find_sights, parse_target
