@@ -329,6 +329,6 @@ def test_blas_keeps_its_own_thread_count():
     if control is None:
         pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
     before = control[0]()
-    with nearest._one_blas_thread():
+    with nearest.one_blas_thread():
         assert control[0]() == 1
     assert control[0]() == before

@@ -12,9 +12,11 @@ from csplat_tools.commands.compare import compare
 from csplat_tools.commands.conformance_encoder import conformance
 from csplat_tools.commands.decode import decode
 from csplat_tools.commands.encode import encode
+from csplat_tools.commands.finetune import finetune
 from csplat_tools.commands.info import info
 from csplat_tools.commands.lint import lint
 from csplat_tools.commands.render import render
+from csplat_tools.commands.sensitivity import sensitivity
 from csplat_tools.commands.simplify import simplify
 from csplat_tools.commands.train import train
 from csplat_tools.commands.verify import verify
@@ -65,7 +67,9 @@ app.command()(lint)
 app.command()(compare)
 app.command()(render)
 app.command()(simplify)
+app.command()(sensitivity)
 app.command()(train)
+app.command()(finetune)
 app.command()(view)
 app.command("export-html")(export_html)
 app.add_typer(conformance, name="conformance")

@@ -7,13 +7,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
+from csplat.encoder.between import Between
+from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_tools.inout import mapped_csplat, ply_path, read_array, write_array, write_bytes, write_model
+from csplat_tools.importances import read_importance
+from csplat_tools.inout import mapped_csplat, ply_path, write_array, write_bytes, write_model
 from csplat_tools.models import without_bands
+from csplat_trainer.sensitivity_file import StoredSensitivity
 
 __all__ = [
     "Encoded",
@@ -103,6 +109,7 @@ def encode_file(
     facts: SceneFacts | None = None,
     strict: bool = False,
     importance: str | None = None,
+    prune_unseen: bool = False,
     source_index: str | None = None,
     encoder: Encoder | None = None,
     progress: Report | None = None,
@@ -115,7 +122,8 @@ def encode_file(
         options: of the encoder; `keep_extra` holds for reading too.
         facts: what the PLY does not say.
         strict: refuse what would be repaired.
-        importance: a .npy file with one weight per splat of the PLY as read.
+        importance: a .npy file with one weight per splat of the PLY as read, or what `csplat sensitivity` wrote.
+        prune_unseen: leave out the splats that no view of the sensitivities saw.
         source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
         encoder: does more than to encode; `importance` is not for it.
         progress: is told the stages.
@@ -125,7 +133,6 @@ def encode_file(
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
-    weights = None if importance is None else read_array(importance)
     findings: list[Finding] = []
     if progress is not None:
         progress("reading", 0.0)
@@ -138,11 +145,33 @@ def encode_file(
     if encoder is not None:
         result = encoder(model, options, progress)
     else:
-        result = encode_with_report(model, options, importance=weights, progress=progress)
+        result = _encoded(model, options, importance, prune_unseen, progress)
     write_bytes(target, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
     return Encoded(result, tuple(findings), source_bytes, time.perf_counter() - start)
+
+
+def _encoded(
+    model: SplatModel, options: EncodeOptions, importance: str | None, prune_unseen: bool, progress: Report | None
+) -> EncodeResult:
+    found = None if importance is None else read_importance(importance, model)
+    stored = found if isinstance(found, StoredSensitivity) else None
+    if prune_unseen and stored is None:
+        raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
+    weights = found if not isinstance(found, StoredSensitivity) else found.importance()
+    if not prune_unseen or stored is None or stored.seen.all():
+        return encode_with_report(model, options, importance=weights, progress=progress)
+    rows = np.flatnonzero(stored.seen)
+    between = Between(
+        len(model),
+        rows,
+        said={"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source},
+        key="pruned",
+        refitted=False,
+    )
+    chosen = stored.importance().select(rows)
+    return encode_with_report(model.select(rows), options, importance=chosen, between=between, progress=progress)
 
 
 def decode_file(

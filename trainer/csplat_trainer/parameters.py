@@ -33,7 +33,8 @@ class Parameters:
     """The state of an optimisation. Arrays are replaced when the number of splats changes.
 
     Attributes:
-        values: means [N, 3], quats [N, 4], scales [N, 3] (log), logits [N], sh0 [N, 3], shN [N, K, 3].
+        values: means [N, 3], quats [N, 4], scales [N, 3] (log), logits [N], sh0 [N, 3], shN [N, K, 3]; fine-tuning
+            has a group more, and as many rows as its file holds.
         first: Adam's running mean of the gradients, the same shapes.
         second: Adam's running mean of their squares.
         step: how many steps Adam has made.
@@ -47,7 +48,7 @@ class Parameters:
     @classmethod
     def starting_at(cls, values: Splats) -> Parameters:
         """Parameters that have not moved yet."""
-        first, second = ({name: np.zeros_like(values[name]) for name in GROUPS} for _ in range(2))
+        first, second = ({name: np.zeros_like(array) for name, array in values.items()} for _ in range(2))
         return cls(values, first, second)
 
     def __len__(self) -> int:
@@ -125,8 +126,7 @@ def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]
     parameters.step += 1
     correction1 = 1.0 - _BETA1**parameters.step
     correction2 = math.sqrt(1.0 - _BETA2**parameters.step)
-    for name in GROUPS:
-        value = parameters.values[name]
+    for name, value in parameters.values.items():
         if value.size:
             _adam(
                 value.reshape(-1),
@@ -167,6 +167,8 @@ def _adam(value: F32, gradient: F32, first: F32, second: F32, rate: np.float32, 
 def _constrain(quats: F32, logits: F32) -> None:
     """Bring quaternions to unit length and logits into their bounds, one splat after the other."""
     limit = np.float32(_LOGIT_LIMIT)
+    for i in range(len(logits)):
+        logits[i] = min(max(logits[i], -limit), limit)
     for i in range(quats.shape[0]):
         w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         length = np.sqrt(w * w + x * x + y * y + z * z)
@@ -179,4 +181,3 @@ def _constrain(quats: F32, logits: F32) -> None:
         else:
             quats[i, 0] = np.float32(1.0)
             quats[i, 1] = quats[i, 2] = quats[i, 3] = np.float32(0.0)
-        logits[i] = min(max(logits[i], -limit), limit)

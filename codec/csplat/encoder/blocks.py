@@ -44,11 +44,7 @@ def axis_block(q: Integers, coding: Coding) -> bytes:
 
 def offset_block(attribute: int, integers: Integers, exponent: int, coding: Coding) -> bytes:
     """OFFSET: integers [C, n], any sign, at most 2**32 - 1 apart in each column."""
-    offsets = integers.min(axis=1).astype("<i8")
-    elements = integers - offsets.astype(integers.dtype)[:, None]
-    head = _head(attribute, _spec.CODING_OFFSET) + _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0))
-    stored: bytes = offsets.tobytes()
-    return head + stored + smooth_stream(elements.reshape(-1), coding)
+    return _head(attribute, _spec.CODING_OFFSET) + _offset_columns(integers, exponent, coding)
 
 
 def signed_block(attribute: int, integers: Integers, exponent: int, coding: Coding) -> bytes:
@@ -64,6 +60,7 @@ def codebook_block(
     escape_count: int,
     escape: bytes,
     coding: Coding,
+    summand: Integers | None = None,
 ) -> bytes:
     """CODEBOOK.
 
@@ -74,9 +71,12 @@ def codebook_block(
         escape_count: splats with the index "escaped".
         escape: their block, empty where there are none.
         coding: how to code the indices.
+        summand: [n], for scales of the kind SHAPE: what is added to all three.
     """
     params = _spec.pack_codebook_params(_spec.CodebookParams(codebook_id, 0, escape_count))
     streams = b"".join(unsigned_stream(index, coding) for index in indices)
+    if summand is not None:
+        streams += _offset_columns(summand[None], 0, coding)
     return _head(attribute, _spec.CODING_CODEBOOK) + params + streams + escape
 
 
@@ -86,6 +86,13 @@ def raw_block(column: int, values: NDArray[Any], coding: Coding) -> bytes:
     params = _spec.pack_raw_params(_spec.RawParams(column, 0))
     stream = unsigned_stream(bits, coding, fixed_width=values.itemsize)
     return _head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + params + stream
+
+
+def _offset_columns(integers: Integers, exponent: int, coding: Coding) -> bytes:
+    offsets = integers.min(axis=1).astype("<i8")
+    elements = integers - offsets.astype(integers.dtype)[:, None]
+    stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
+    return stored + smooth_stream(elements.reshape(-1), coding)
 
 
 def _head(attribute: int, coding: int) -> bytes:

@@ -13,6 +13,7 @@ from csplat import _spec
 from csplat.encoder.colour import ShTables, quantise_rows
 from csplat.encoder.container import CodebookTable, FileChunk
 from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
+from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
 from csplat.encoder.quantise import colour_integers
@@ -20,7 +21,7 @@ from csplat.encoder.sparse import zero_book, zero_or_value_block
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
 
-__all__ = ["Books", "choose_sh", "with_zero_books"]
+__all__ = ["Books", "books_of", "choose_sh", "with_zero_books"]
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -34,6 +35,7 @@ _LEAST = 256  # splats for which a codebook may pay
 _MANY = 4096  # entries from which on searching near groups saves more than it loses
 _ENOUGH = 1 << 15  # splats whose share of entries a smaller scene gets too, if it has users for them
 _USERS = 6  # splats per entry below which an entry does not pay for itself
+_TRIED = 4  # times as many splats are tried as escapes as escape
 _IMPORTANT = 0.95  # quantile of the weights from which on a splat is quantised on the full lattice
 _CODEBOOK_ID = 0
 
@@ -72,6 +74,9 @@ def choose_sh(
     options: EncodeOptions,
     threads: int,
     report: Progress,
+    metric: Metric | None = None,
+    *,
+    measured: bool = False,
 ) -> Books:
     """Decide how SH is coded, and train the codebook if there is to be one.
 
@@ -84,6 +89,8 @@ def choose_sh(
         options: `codebook_size`, `codebook_stages`, `escape_fraction`, `seed`.
         threads: how many to use; the result does not depend on it.
         report: progress.
+        metric: how errors of the coefficients of all bands weigh together; None: each for itself, by `weights`.
+        measured: the weights were; otherwise they are a guess.
     """
     tables = ShTables(weights, _reference(weights), extras=extras)
     scalar = Books(replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), tables)
@@ -92,9 +99,11 @@ def choose_sh(
     if plan.sh_coding == "auto" and len(model) < _LEAST:
         return scalar
     fine = replace(plan, sh_coding="codebook", sh_step=plan.codebook_step)
-    stages = _train(model, weights, fine, options, threads, report)
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    judge = _Judge(weights, None if metric is None else metric.first(kept), measured)
+    stages = _train(model, judge, fine, options, threads, report)
     books = _books(tables, stages, fine)
-    if plan.sh_coding == "auto" and not _codebook_pays(model, weights, stages, books, sample[:_SAMPLE], plan):
+    if plan.sh_coding == "auto" and not _codebook_pays(model, judge, stages, books, sample[:_SAMPLE], plan):
         return scalar
     return books
 
@@ -118,9 +127,26 @@ def _reference(weights: F32 | None) -> float:
     return float(np.quantile(positive, _IMPORTANT)) if len(positive) else 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """How errors weigh: by splat, and where there is a metric by coefficient too."""
+
+    weights: F32
+    metric: Metric | None
+    measured: bool
+
+    def errors(self, difference: F32, rows: Rows | slice) -> NDArray[np.float64]:
+        """[n] weighted squared errors of differences [n, 3K]."""
+        if self.metric is not None:
+            return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
+        squares = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
+        return np.asarray(squares * self.weights[rows])
+
+
 def _train(
-    model: SplatModel, weights: F32, plan: Plan, options: EncodeOptions, threads: int, report: Progress
+    model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions, threads: int, report: Progress
 ) -> _Stages:
+    weights = judge.weights
     points = _lattice_points(model.shN, plan)
     sizes = _sizes(len(model), plan, options)
     effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if sizes[0] >= _MANY else {}
@@ -130,22 +156,32 @@ def _train(
             report("codebook", done / steps)
 
         first = cluster(points, weights, sizes[0], seed=options.seed, threads=threads, progress=steps_done, **effort)
-        found = [first]
+        found = [first if judge.metric is None else _refined(model.shN, points, judge.metric, first, plan, threads)]
     else:
         found = cluster_residual(points, weights, sizes, seed=options.seed, threads=threads, **effort)
         report("codebook", 1.0)
     ranked = [rank_by_frequency(index, entries) for entries, index in found]
     indices = [index.astype(np.int32) for index, _ in ranked]
     entries = [entry for _, entry in ranked]
-    errors = _errors(model.shN, indices, entries, plan)
-    np.multiply(errors, weights, out=errors, where=np.isfinite(errors))  # infinity × 0 would be NaN
-    escaped = _escapes(errors, plan, options)
+    errors = _errors(model.shN, indices, entries, plan, judge)
+    escaped = _escapes(model.shN, errors, plan, options, judge)
     errors[escaped] = 0.0
     indices[0][escaped] = len(entries[0])
     for stage in indices[1:]:
         stage[escaped] = 0
     total = float(weights.sum(dtype=np.float64)) or 1.0
     return _Stages(indices, entries, float(errors.sum()) / total)
+
+
+def _refined(
+    shN: F32, points: I16, metric: Metric, found: tuple[I32, NDArray[np.uint32]], plan: Plan, threads: int
+) -> tuple[I32, NDArray[np.uint32]]:
+    """Go on from a codebook by what errors weigh together."""
+    entries, index = found
+    count, shape = points.shape[1] // 3, (-1, points.shape[1] // 3, 3)
+    wanted = np.clip(shN[:, :count] * np.float32(1.0 / plan.sh_step), -_CLIP, _CLIP)
+    entries, places = refine(wanted, metric, entries.reshape(shape), index.astype(np.int64), threads)
+    return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), places.astype(np.uint32)
 
 
 def _lattice_points(shN: F32, plan: Plan) -> I16:
@@ -168,8 +204,8 @@ def _sizes(count: int, plan: Plan, options: EncodeOptions) -> tuple[int, ...]:
     return (size,) * (options.codebook_stages or 1)
 
 
-def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan) -> NDArray[np.float64]:
-    """[N] squared error of each splat; infinite where a coefficient was clipped."""
+def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan, judge: _Judge) -> NDArray[np.float64]:
+    """[N] weighted squared error of each splat; infinite where a coefficient was clipped."""
     kept = (plan.sh_degree + 1) ** 2 - 1
     tables = [entry.astype(np.float32) * np.float32(plan.sh_step) for entry in entries]
     errors = np.empty(len(shN))
@@ -179,16 +215,31 @@ def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan
         clipped = np.abs(difference).max(axis=1) > (_CLIP - 1) * plan.sh_step
         for table, index in zip(tables, indices, strict=True):
             difference -= table[index[part]]
-        errors[part] = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
+        errors[part] = judge.errors(difference, part)
         errors[part][clipped] = np.inf
     return errors
 
 
-def _escapes(errors: NDArray[np.float64], plan: Plan, options: EncodeOptions) -> Rows:
-    """Return the splats that are coded directly: those with the largest weighted error, and all that were clipped."""
+def _escapes(shN: F32, errors: NDArray[np.float64], plan: Plan, options: EncodeOptions, judge: _Judge) -> Rows:
+    """Return the splats that are coded directly: those with the largest weighted error, and all that were clipped.
+
+    Where weights were measured, those that gain most by it, and none that gains nothing: what weighs most may well lie
+    near its entry, and direct values are coarser than entries.
+    """
     fraction = plan.escape_fraction if options.escape_fraction is None else options.escape_fraction
-    count = max(int(len(errors) * fraction), int(np.count_nonzero(~np.isfinite(errors))))
-    return np.sort(np.argsort(-errors, kind="stable")[:count])
+    clipped = int(np.count_nonzero(~np.isfinite(errors)))
+    count = max(int(len(errors) * fraction), clipped)
+    worst = np.argsort(-errors, kind="stable")
+    if not judge.measured or not count:
+        return np.sort(worst[:count])
+    tried = worst[: _TRIED * count]
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    source = shN[tried, :kept]
+    own = quantise_rows(source, plan, np.full(len(tried), plan.escape_coarse, np.int32))[2]
+    gain = errors[tried] - judge.errors((source - own).reshape(len(tried), -1), tried)
+    if options.escape_fraction is None:
+        count = max(min(count, int(np.count_nonzero(gain > 0.0))), clipped)
+    return np.sort(tried[np.argsort(-gain, kind="stable")[:count]])
 
 
 def _books(tables: ShTables, stages: _Stages, plan: Plan) -> Books:
@@ -196,6 +247,12 @@ def _books(tables: ShTables, stages: _Stages, plan: Plan) -> Books:
     for stage in stages.entries:
         rgb = stage.reshape(len(stage), -1, 3).transpose(2, 1, 0).astype(np.float32)
         columns.append(colour_integers(np.ascontiguousarray(rgb), plan.chroma_shift))
+    return books_of(replace(tables, index=stages.indices, entries=columns), plan)
+
+
+def books_of(tables: ShTables, plan: Plan) -> Books:
+    """What a file says of a codebook, whose indices and entries the tables hold."""
+    columns = tables.entries
     bands = range(1, plan.sh_degree + 1)
     chunks = []
     for band in bands:
@@ -206,11 +263,10 @@ def _books(tables: ShTables, stages: _Stages, plan: Plan) -> Books:
     record = CodebookTable(
         _CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, plan.sh_degree), tuple(stage.shape[2] for stage in columns)
     )
-    full = replace(tables, index=stages.indices, entries=columns, ids=(_CODEBOOK_ID,), layers=tuple(bands))
-    return Books(plan, full, (record,), tuple(chunks))
+    return Books(plan, replace(tables, ids=(_CODEBOOK_ID,), layers=tuple(bands)), (record,), tuple(chunks))
 
 
-def _codebook_pays(model: SplatModel, weights: F32, stages: _Stages, books: Books, sample: Rows, plan: Plan) -> bool:
+def _codebook_pays(model: SplatModel, judge: _Judge, stages: _Stages, books: Books, sample: Rows, plan: Plan) -> bool:
     """Compare bytes at equal error with scalar coding, tried on a sample at two steps.
 
     Between the two, scalar coding trades bytes for the logarithm of the error in a straight line.
@@ -220,8 +276,8 @@ def _codebook_pays(model: SplatModel, weights: F32, stages: _Stages, books: Book
     for index in stages.indices:
         shares = np.bincount(index) / count
         spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
-    fine_bytes, fine_error = _try_scalar(model, weights, sample, plan)
-    coarse_bytes, coarse_error = _try_scalar(model, weights, sample, replace(plan, sh_step=2 * plan.sh_step))
+    fine_bytes, fine_error = _try_scalar(model, judge, sample, plan)
+    coarse_bytes, coarse_error = _try_scalar(model, judge, sample, replace(plan, sh_step=2 * plan.sh_step))
     escaped = float((stages.indices[0] == len(stages.entries[0])).mean())
     spent += escaped * fine_bytes
     if not 0.0 < fine_error < coarse_error:
@@ -230,7 +286,7 @@ def _codebook_pays(model: SplatModel, weights: F32, stages: _Stages, books: Book
     return spent + per_halving * math.log2(max(stages.error, 1e-30) / fine_error) < fine_bytes
 
 
-def _try_scalar(model: SplatModel, weights: F32, sample: Rows, plan: Plan) -> tuple[float, float]:
+def _try_scalar(model: SplatModel, judge: _Judge, sample: Rows, plan: Plan) -> tuple[float, float]:
     """Return bytes per splat and weighted mean squared error of scalar coding."""
     kept = (plan.sh_degree + 1) ** 2 - 1
     source = np.take(model.shN, sample, axis=0)[:, :kept]
@@ -240,6 +296,5 @@ def _try_scalar(model: SplatModel, weights: F32, sample: Rows, plan: Plan) -> tu
         part = columns[:, band * band - 1 : (band + 1) ** 2 - 1]
         if part.any():
             size += len(zero_or_value_block(band, part.reshape(-1, len(sample)), 0, plan)[0])
-    squares = np.square(source - decoded).sum(axis=(1, 2), dtype=np.float64)
-    weight = weights[sample]
-    return size / len(sample), float((squares * weight).sum() / (weight.sum(dtype=np.float64) or 1.0))
+    errors = judge.errors((source - decoded).reshape(len(sample), -1), sample)
+    return size / len(sample), float(errors.sum() / (judge.weights[sample].sum(dtype=np.float64) or 1.0))

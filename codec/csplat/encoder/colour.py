@@ -23,7 +23,7 @@ from csplat.encoder.quantise import (
 from csplat.encoder.sparse import zero_or_value_block
 from csplat.errors import InputError
 
-__all__ = ["Colour", "ShTables", "code_sh", "quantise_colour"]
+__all__ = ["Colour", "ShTables", "code_sh", "quantise_colour", "quantise_rows", "served_rows"]
 
 Integers = NDArray[Any]
 I32 = NDArray[np.int32]
@@ -149,7 +149,7 @@ def _code_by_codebook(
 ) -> dict[int, bytes]:
     """Write index streams in band 1, and the escaped splats' own values in every band."""
     index = [stage[rows] for stage in tables.index]
-    decoded = _served(index, plan, tables)
+    decoded = served_rows(index, plan, tables)
     escaped = np.flatnonzero(index[0] == tables.entries[0].shape[2])
     coarse = np.full(len(escaped), plan.escape_coarse, np.int32)
     columns, exponent, own = quantise_rows(source[escaped], plan, coarse)
@@ -169,7 +169,7 @@ def _code_by_codebook(
     return layers
 
 
-def _served(index: Sequence[Integers], plan: Plan, tables: ShTables) -> F32:
+def served_rows(index: Sequence[Integers], plan: Plan, tables: ShTables) -> F32:
     """[n, K, 3] float32, what the codebook's entries decode to; nonsense for escaped splats."""
     tables_rgb = []
     for entries in tables.entries:

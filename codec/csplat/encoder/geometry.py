@@ -21,10 +21,11 @@ from csplat.encoder.quantise import (
     quat_levels,
     quat_values,
 )
+from csplat.encoder.shape_tables import ShapePart, ShapeTables
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
 
-__all__ = ["Shape", "quantise_shape", "quantised_geometry"]
+__all__ = ["Shape", "quantise_shape", "quantised_geometry", "seen_means", "seen_opacities", "seen_shapes"]
 
 Integers = NDArray[Any]
 F32 = NDArray[np.float32]
@@ -41,33 +42,66 @@ class Shape:
     decoded_quats: F32
 
 
-def quantise_shape(quats: F32, scales: F32, plan: Plan) -> Shape:
-    """Quantise rotations [n, 4] and log scales [n, 3] of a tile in their gauge."""
-    rotation, sorted_scales = fix_gauge(quats, scales)
+def quantise_shape(quats: F32, scales: F32, plan: Plan, part: ShapePart | None = None) -> Shape:
+    """Quantise rotations [n, 4] and log scales [n, 3] of a tile in their gauge, which they may be in already.
+
+    Args:
+        quats: w x y z.
+        scales: logarithms.
+        plan: the lattices.
+        part: what a codebook says of these splats; those that it serves take its integers.
+    """
+    rotation, sorted_scales = (quats.T, scales.T) if plan.gauged else fix_gauge(quats, scales)
     exponent = lattice_exponent(float(np.abs(sorted_scales).max()), plan.scale_step)
     step = lattice_step(plan.scale_step, exponent)
     n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
     q = quat_levels(rotation, plan.quat_levels)
+    if part is not None:
+        n[:, part.served], q[:, part.served] = part.scales, part.quats
     return Shape(n, exponent, q, lattice_values(n, step), quat_values(q, plan.quat_levels))
 
 
-def quantised_geometry(model: SplatModel, tiles: Sequence[Tile], plan: Plan) -> SplatModel:
+def quantised_geometry(
+    model: SplatModel, tiles: Sequence[Tile], plan: Plan, shapes: ShapeTables | None = None
+) -> SplatModel:
     """The scene with means, rotations, scales and opacities as a decoder will see them, colours as they are.
 
     Args:
         model: the scene.
         tiles: how it is cut: a tile's lattice may be coarser than the file's.
         plan: the lattices.
+        shapes: the codebook of shapes, if there is one.
 
     Returns:
         The scene, in the same order.
     """
-    means, quats, scales = np.empty_like(model.means), np.empty_like(model.quats), np.empty_like(model.scales)
-    for tile in tiles:
-        rows, step = tile.rows, lattice_step(plan.lattice.step, tile.exponent)
-        means[rows] = lattice_values(quantise_means(np.ascontiguousarray(model.means[rows].T), step), step).T
-        shape = quantise_shape(model.quats[rows], model.scales[rows], plan)
-        quats[rows], scales[rows] = shape.decoded_quats.T, shape.decoded_scales.T
-    levels = plan.opacity_levels
-    opacities = opacity_values(opacity_levels(model.opacities, levels, square=True), levels, square=True)
+    quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, shapes)
+    means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, plan)
     return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
+
+
+def seen_means(means: F32, tiles: Sequence[Tile], plan: Plan) -> F32:
+    """Centres [N, 3] as a decoder will see them."""
+    seen = np.empty_like(means)
+    for tile in tiles:
+        step = lattice_step(plan.lattice.step, tile.exponent)
+        seen[tile.rows] = lattice_values(quantise_means(np.ascontiguousarray(means[tile.rows].T), step), step).T
+    return seen
+
+
+def seen_shapes(
+    quats: F32, scales: F32, tiles: Sequence[Tile], plan: Plan, shapes: ShapeTables | None = None
+) -> tuple[F32, F32]:
+    """Rotations [N, 4] and log scales [N, 3] as a decoder will see them."""
+    seen = np.empty_like(quats), np.empty_like(scales)
+    for tile in tiles:
+        part = None if shapes is None else shapes.part(tile.rows)
+        shape = quantise_shape(quats[tile.rows], scales[tile.rows], plan, part)
+        seen[0][tile.rows], seen[1][tile.rows] = shape.decoded_quats.T, shape.decoded_scales.T
+    return seen
+
+
+def seen_opacities(opacities: F32, plan: Plan) -> F32:
+    """Alpha [N] as a decoder will see it."""
+    levels = plan.opacity_levels
+    return opacity_values(opacity_levels(opacities, levels, square=True), levels, square=True)

@@ -2,23 +2,95 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.metric import Metric
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
-__all__ = ["splat_weights"]
+__all__ = ["Importance", "sh_metric", "shape_metric", "shape_weights", "splat_weights"]
 
 F32 = NDArray[np.float32]
 
 _BLOCK = 1 << 16
+_RIDGE = 0.2  # share of the plain norm in the metric: other views than those that were measured see other directions
+_SHAPE = 6  # entries of a covariance
 _LARGEST_LOG = 80.0  # log sizes beyond ± this are not told apart: float32 holds the weights
 
 
-def splat_weights(model: SplatModel, importance: NDArray[Any] | None) -> F32:
+@dataclass(frozen=True, eq=False)
+class Importance:
+    """What pictures depend on, by attribute: weights of squared errors, of which only ratios matter.
+
+    Attributes:
+        sh: [N], finite, >= 0, of an SH coefficient.
+        shape: [N], of the covariance divided by its trace; `None`: as `sh`.
+        sh_metric: [N, K (K + 1) / 2], by how much the errors of two coefficients of bands 1 to d weigh together: the
+            upper triangle, row by row, of a matrix that is positive semidefinite, the mean of whose diagonal is 1 for
+            what was seen; `None`: all weigh alike, each for itself.
+        shape_metric: [N, 21], the same for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
+    """
+
+    sh: NDArray[Any]
+    shape: NDArray[Any] | None = None
+    sh_metric: NDArray[Any] | None = None
+    shape_metric: NDArray[Any] | None = None
+
+    def select(self, rows: NDArray[Any]) -> Importance:
+        """The same for some of the splats."""
+        rest = (None if array is None else array[rows] for array in (self.shape, self.sh_metric, self.shape_metric))
+        return Importance(self.sh[rows], *rest)
+
+
+def shape_weights(model: SplatModel, importance: NDArray[Any] | Importance | None) -> F32:
+    """Return the weight of the squared error of each splat's covariance over its trace, as `splat_weights` does."""
+    if isinstance(importance, Importance):
+        importance = importance.sh if importance.shape is None else importance.shape
+    return splat_weights(model, importance)
+
+
+def sh_metric(model: SplatModel, weights: F32 | None, importance: NDArray[Any] | Importance | None) -> Metric | None:
+    """Return how errors of SH coefficients weigh together, if that is known.
+
+    Args:
+        model: the scene.
+        weights: [N], as `splat_weights` returns them.
+        importance: what the caller knows.
+
+    Raises:
+        InputError: matrices of another number or size, or not finite.
+    """
+    if weights is None or not isinstance(importance, Importance) or importance.sh_metric is None:
+        return None
+    size = model.shN.shape[1]
+    metric = _metric("SH matrices", weights, importance.sh_metric, size)
+    rows, columns = np.triu_indices(size)
+    triangles = metric.triangles.astype(np.float32) * np.float32(1.0 - _RIDGE)
+    triangles[:, rows == columns] += np.float32(_RIDGE)
+    return Metric(weights, triangles)
+
+
+def shape_metric(weights: F32, importance: NDArray[Any] | Importance | None) -> Metric | None:
+    """Return how errors of a covariance's entries weigh together, if that is known; as `sh_metric`."""
+    if not isinstance(importance, Importance) or importance.shape_metric is None:
+        return None
+    return _metric("shape matrices", weights, importance.shape_metric, _SHAPE)
+
+
+def _metric(name: str, weights: F32, found: NDArray[Any], size: int) -> Metric:
+    wanted = (len(weights), size * (size + 1) // 2)
+    if found.shape != wanted or found.dtype.kind != "f":
+        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, wanted floats {list(wanted)}")
+    if not np.isfinite(found).all():
+        raise InputError(f"importance has {name} that are not finite")
+    return Metric(weights, found)
+
+
+def splat_weights(model: SplatModel, importance: NDArray[Any] | Importance | None) -> F32:
     """Return the weight of each splat's squared error, [N] float32, >= 0; only ratios matter.
 
     The cheap weight is alpha · √(σ1 σ2) with the two larger standard deviations, alpha times the size of its shadow:
@@ -27,11 +99,13 @@ def splat_weights(model: SplatModel, importance: NDArray[Any] | None) -> F32:
 
     Args:
         model: the scene.
-        importance: [N], finite, >= 0, or None.
+        importance: [N], finite, >= 0, or None; of an `Importance` that of SH.
 
     Raises:
         InputError: an importance of another shape or type, negative or not finite.
     """
+    if isinstance(importance, Importance):
+        importance = importance.sh
     if importance is None:
         weights = np.empty(len(model), np.float32)
         for at in range(0, len(model), _BLOCK):

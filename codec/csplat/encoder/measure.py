@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
-__all__ = ["ErrorSums", "covariance_errors", "distance_errors", "measure_errors", "value_errors"]
+__all__ = [
+    "ErrorSums",
+    "covariance_entries",
+    "covariance_errors",
+    "distance_errors",
+    "measure_errors",
+    "measured_sums",
+    "value_errors",
+]
 
 Floats = NDArray[Any]
 F64 = NDArray[np.float64]
@@ -109,8 +117,8 @@ def covariance_errors(
         reference -= top
         variances = np.exp(2.0 * reference)
         decoded = np.exp(np.minimum(2.0 * (scales[:, part] - top), 600.0))
-        difference = _covariance(quats[:, part], decoded)
-        difference -= _covariance(source_quats[:, part], variances)
+        difference = covariance_entries(quats[:, part], decoded)
+        difference -= covariance_entries(source_quats[:, part], variances)
         with np.errstate(over="ignore"):  # infinity is what `stated` refuses
             difference *= difference
             difference[3:] *= 2.0  # each entry beside the diagonal stands twice
@@ -138,6 +146,11 @@ def measure_errors(
     Raises:
         InputError: an index of another length, or that leaves the source.
     """
+    return measured_sums(source, decoded, source_index).bounds()
+
+
+def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]) -> ErrorSums:
+    """Return what `measure_errors` makes its bounds of."""
     index = np.asarray(source_index)
     if index.shape != (len(decoded),):
         raise InputError(f"source index has shape {index.shape}, wanted ({len(decoded)},)")
@@ -147,7 +160,7 @@ def measure_errors(
     for at in range(0, len(decoded), 4 * _BLOCK):
         part = slice(at, at + 4 * _BLOCK)
         parts.append(_errors_of_rows(source, decoded, index[part], part))
-    return ErrorSums.total(parts).bounds()
+    return ErrorSums.total(parts)
 
 
 def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any], part: slice) -> ErrorSums:
@@ -172,7 +185,7 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
     )
 
 
-def _covariance(quats: Floats, variances: F64) -> F64:
+def covariance_entries(quats: Floats, variances: F64) -> F64:
     """Return Σ's entries xx, yy, zz, xy, xz, yz, [6, n]."""
     w, x, y, z = quats.astype(np.float64)
     two = 2.0 / (w * w + x * x + y * y + z * z)

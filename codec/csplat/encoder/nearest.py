@@ -78,7 +78,7 @@ def search(
             error[part] = (norm - 2.0 * best) * 4.0**shift
 
     workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
-    with _one_blas_thread(), ThreadPoolExecutor(workers) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(workers) as pool:
         jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
         list(pool.map(work, jobs))
     return index, error
@@ -181,7 +181,7 @@ def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
 
 
 @contextmanager
-def _one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> Iterator[None]:
     """Let each product run on one thread, where NumPy's BLAS is an OpenBLAS that lets us.
 
     Our threads already fill the processors. OpenBLAS's wait for each other by spinning:

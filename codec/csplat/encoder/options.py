@@ -35,6 +35,11 @@ class EncodeOptions:
         codebook_size: entries of the SH codebook's first stage.
         codebook_stages: residual stages, 1 to 4.
         escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
+        shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); by
+            default there is none. It is made only where the file becomes smaller.
+        shape_escape_fraction: share of the splats, those with the largest weighted error, that keep shapes of their
+            own; by default those whose error would grow by more than the bits are worth, where an importance holds
+            matrices of shapes, and a twentieth where not.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). By default only where an importance is given.
         tile_splats: splats per tile at most, 1 to 65536.
@@ -62,6 +67,8 @@ class EncodeOptions:
     codebook_size: int | None = None
     codebook_stages: int | None = None
     escape_fraction: float | None = None
+    shape_codebook_size: int | None = None
+    shape_escape_fraction: float | None = None
     adaptive: float | None = None
     tile_splats: int = _spec.TILE_SPLATS_MAX
     effort: int | None = None
@@ -147,6 +154,8 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
     "codebook_stages": (int, 1, _spec.STAGES_MAX),
     "escape_fraction": (float, 0, 1),
+    "shape_codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
+    "shape_escape_fraction": (float, 0, 1),
     "adaptive": (float, 0, 1),
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
     "effort": (int, 1, 12),

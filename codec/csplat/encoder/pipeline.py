@@ -12,21 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.encoder.between import Between
-from csplat.encoder.codebook import choose_sh, with_zero_books
-from csplat.encoder.colour import ShTables
+from csplat.encoder.codebook import Books, choose_sh, with_zero_books
 from csplat.encoder.container import write
 from csplat.encoder.geometry import quantised_geometry
-from csplat.encoder.importance import splat_weights
+from csplat.encoder.importance import Importance, sh_metric, shape_metric, shape_weights, splat_weights
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Plan, Progress, make_plan
+from csplat.encoder.plan import Progress, make_plan
 from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene, stated_errors
+from csplat.encoder.shape_codebook import choose_shapes
+from csplat.encoder.shape_tables import SHAPE_BOOK, ShapeTables, shape_book
 from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile, cut
 from csplat.model import SplatModel
 
-__all__ = ["EncodeReport", "EncodeResult", "encode", "encode_with_report"]
+__all__ = ["Decisions", "EncodeReport", "EncodeResult", "decide", "encode", "encode_with_report", "write_decided"]
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def encode_with_report(
     model: SplatModel,
     options: EncodeOptions | None = None,
     *,
-    importance: NDArray[Any] | None = None,
+    importance: NDArray[Any] | Importance | None = None,
     between: Between | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
@@ -93,34 +95,104 @@ def encode_with_report(
     Args:
         model: the scene.
         options: as in `encode`.
-        importance: [N] weights >= 0 of the splats, in place of opacity × projected area.
+        importance: [N] weights >= 0 of the splats, in place of opacity × projected area; or more than that.
         between: what happened to the scene before, and who fits colours to its quantised geometry.
         progress: called with the stage's name and the share done, 0 to 1; from any thread.
 
     Raises:
         InputError: as `encode`; or an importance of another shape, or negative, or not finite.
     """
+    decided = decide(model, options, importance=importance, between=between, progress=progress)
+    return write_decided(decided, between=between, progress=progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """What is decided once for a scene, before its tiles are coded.
+
+    Attributes:
+        model: the scene that is coded; its colours are those of `Between`.
+        options: what was asked.
+        tiles: which rows of the model, on which lattice.
+        books: plan, weights and codebooks.
+        extras: records of the extra columns that are carried.
+        shapes: the codebook of shapes, if there is one.
+    """
+
+    model: SplatModel
+    options: EncodeOptions
+    tiles: Sequence[Tile]
+    books: Books
+    extras: Sequence[_spec.ExtraRecord]
+    shapes: ShapeTables | None = None
+
+
+def decide(
+    model: SplatModel,
+    options: EncodeOptions | None = None,
+    *,
+    importance: NDArray[Any] | Importance | None = None,
+    between: Between | None = None,
+    progress: Progress | None = None,
+) -> Decisions:
+    """The first half of `encode_with_report`, with the same arguments: everything but the coding of tiles."""
     options = options or EncodeOptions()
-    report = progress or _silent
-    threads = options.threads or os.cpu_count() or 1
     plan = make_plan(model, options, importance_given=importance is not None)
     extras = extra_columns(model, options)
     tiles = cut(model.means, plan.lattice, plan.tile_splats)
+    shapes = None
+    if options.shape_codebook_size is not None and len(model):
+        by_shape = shape_weights(model, importance)
+        together = shape_metric(by_shape, importance)
+        shapes = choose_shapes(model, by_shape, together, tiles, plan, options, _threads(options), progress or _silent)
     if between is not None:
-        sh0, shN = between.colours(quantised_geometry(model, tiles, plan))
+        sh0, shN = between.colours(quantised_geometry(model, tiles, plan, shapes))
         model = replace(model, sh0=sh0, shN=shN)
     needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
     weights = splat_weights(model, importance) if needs_weights else None
     sample = tiles[len(tiles) // 2].rows if tiles else np.zeros(0, np.intp)
     carried = tuple(model.extra) if options.keep_extra else ()
-    books = choose_sh(model, weights, carried, sample, plan, options, threads, report)
+    metric = sh_metric(model, weights, importance)
+    books = choose_sh(
+        model, weights, carried, sample, plan, options, _threads(options), progress or _silent, metric,
+        measured=importance is not None,
+    )  # fmt: skip
+    return Decisions(model, options, tiles, books, extras, shapes)
+
+
+def write_decided(
+    decided: Decisions,
+    *,
+    between: Between | None = None,
+    measured: ErrorSums | None = None,
+    progress: Progress | None = None,
+) -> EncodeResult:
+    """The second half of `encode_with_report`: code the tiles, write the file.
+
+    Args:
+        decided: by `decide`.
+        between: as given to `decide`.
+        measured: errors to state, of a scene that is not `decided.model`; `None`: those of the coding.
+        progress: as in `encode_with_report`.
+    """
+    model, options, tiles, books = decided.model, decided.options, decided.tiles, decided.books
     plan = books.plan
-    encoded = _encode_tiles(model, tiles, plan, books.tables, threads, report)
-    errors = ErrorSums.total(part.errors for part in encoded)
-    settings = chosen_settings(plan, books.tables, options, between)
-    chunks = file_chunks(model, errors, settings, plan, between)
-    books = with_zero_books(books, (id for part in encoded for id in part.tile.tables))
-    data = write(file_scene(model, plan, books, extras, chunks), [part.tile for part in encoded])
+    encoded = _encode_tiles(decided, _threads(options), progress or _silent)
+    errors = measured or ErrorSums.total(part.errors for part in encoded)
+    settings = chosen_settings(plan, books.tables, options, between, decided.shapes)
+    books = with_zero_books(books, (id for part in encoded for id in part.tile.tables if id != SHAPE_BOOK))
+    if decided.shapes is not None:
+        record, chunk = shape_book(decided.shapes, plan.coding)
+        books = replace(books, records=[*books.records, record], chunks=[*books.chunks, chunk])
+
+    def written() -> bytes:
+        chunks = file_chunks(model, errors, settings, plan, between)
+        return write(file_scene(model, plan, books, decided.extras, chunks), [part.tile for part in encoded])
+
+    data = written()
+    if between is not None and between.figures is not None:
+        settings[between.key] |= between.figures(data)
+        data = written()
     rows = np.concatenate([part.rows for part in encoded]) if encoded else np.zeros(0, np.int64)
     rows = rows.astype(np.int64, copy=False)
     stated = stated_errors(errors, between)
@@ -128,14 +200,13 @@ def encode_with_report(
     return EncodeResult(data, rows if between is None else between.source_index[rows], summary)
 
 
-def _encode_tiles(
-    model: SplatModel, tiles: Sequence[Tile], plan: Plan, tables: ShTables, threads: int, report: Progress
-) -> list[EncodedTile]:
+def _encode_tiles(decided: Decisions, threads: int, report: Progress) -> list[EncodedTile]:
+    model, tiles, books = decided.model, decided.tiles, decided.books
     done = 0
 
     def one(tile: Tile) -> EncodedTile:
         nonlocal done
-        encoded = encode_tile(model, tile, plan, tables)
+        encoded = encode_tile(model, tile, books.plan, books.tables, decided.shapes)
         done += len(tile.rows)
         report("tiles", done / max(1, len(model)))
         return encoded
@@ -153,6 +224,10 @@ def _notes(encoded: Sequence[EncodedTile]) -> tuple[str, ...]:
         f"{name}: huge values coarsen {count} of {len(encoded)} tiles; remove them, or see the stated errors"
         for name, count in sorted(counts.items())
     )
+
+
+def _threads(options: EncodeOptions) -> int:
+    return options.threads or os.cpu_count() or 1
 
 
 def _silent(stage: str, done: float) -> None:

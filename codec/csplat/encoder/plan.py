@@ -41,6 +41,8 @@ class Plan:
         escape_fraction: share of the splats that are coded directly.
         escape_coarse: their values are multiples of 2**escape_coarse steps.
         coding: how streams are coded.
+        gauged: rotations and scales are in their gauge, and are to stay as they are, though they may have left it a
+            little: the integers that the tuning of a frozen scene saw are those that are written.
     """
 
     lattice: Lattice
@@ -61,6 +63,7 @@ class Plan:
     tile_splats: int
     coding: Coding
     profile: int
+    gauged: bool = False
 
     def attribute_records(self) -> list[_spec.AttributeRecord]:
         """Return the file's attribute records (spec 4.3.1)."""

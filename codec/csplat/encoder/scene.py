@@ -15,6 +15,7 @@ from csplat.encoder.container import FileChunk, Scene, json_payload
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan
+from csplat.encoder.shape_tables import ShapeTables
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
 
@@ -22,13 +23,18 @@ __all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene", "sta
 
 
 _COLOURS = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
+_SHAPES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
 
 def chosen_settings(
-    plan: Plan, tables: ShTables, options: EncodeOptions, between: Between | None = None
+    plan: Plan,
+    tables: ShTables,
+    options: EncodeOptions,
+    between: Between | None = None,
+    shapes: ShapeTables | None = None,
 ) -> dict[str, Any]:
     """Return what was asked and what followed, JSON-compatible; it becomes the OPTS chunk."""
-    said = {} if between is None else {"simplified": dict(between.said)}
+    said = {} if between is None else {between.key: dict(between.said)}
     return {
         **said,
         "asked": options.chosen(),
@@ -46,10 +52,17 @@ def chosen_settings(
         "chroma_shift": plan.chroma_shift,
         "adaptive": plan.adaptive if plan.sh_coding == "scalar" else 0.0,
         "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
+        **_of_shapes(shapes),
         "effort": plan.coding.effort,
         "deflate": plan.coding.library,
         "seed": options.seed,
     }
+
+
+def _of_shapes(shapes: ShapeTables | None) -> dict[str, Any]:
+    if shapes is None:
+        return {}
+    return {"shape_codebook_size": shapes.size, "shape_escape_fraction": float(shapes.escaped.mean())}
 
 
 def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.ExtraRecord]:
@@ -70,9 +83,12 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
 
 
 def stated_errors(errors: ErrorSums, between: Between | None) -> dict[str, tuple[float, float]]:
-    """Return (max, rms) by measure; those of colours that were fitted anew say nothing, and are left out."""
+    """Return (max, rms) by measure; those of what was fitted anew say nothing, and are left out."""
     stated = errors.stated()
-    return stated if between is None else {name: pair for name, pair in stated.items() if name not in _COLOURS}
+    if between is None or not between.refitted:
+        return stated
+    fitted = (*_COLOURS, *_SHAPES) if between.adjusted else _COLOURS
+    return {name: pair for name, pair in stated.items() if name not in fitted}
 
 
 def file_chunks(
@@ -122,7 +138,7 @@ def _stated_errors(model: SplatModel, errors: ErrorSums, between: Between | None
     bounds = sorted((ids[name], *pair) for name, pair in stated_errors(errors, between).items())
     count, flags = len(model), 0
     if between is not None:
-        count, flags = between.source_count, _spec.ERROR_FLAG_REFITTED
+        count, flags = between.source_count, _spec.ERROR_FLAG_REFITTED if between.refitted else 0
     head = _spec.StatedErrorsHead(count, count - len(model), model.sh_degree, flags, len(bounds))
     records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
     return _spec.pack_stated_errors_head(head) + b"".join(records)

@@ -24,10 +24,11 @@ from csplat.encoder.quantise import (
     opacity_values,
     quantise_means,
 )
+from csplat.encoder.shape_tables import SHAPE_BOOK, ShapePart, ShapeTables, shape_blocks
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
 
-__all__ = ["EncodedTile", "encode_tile"]
+__all__ = ["EncodedTile", "coarseness", "encode_tile", "tile_order"]
 
 _COARSEST = 6  # powers of two
 
@@ -59,7 +60,9 @@ class _Work:
         self.largest[measure], self.squares[measure] = errors
 
 
-def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> EncodedTile:
+def encode_tile(
+    model: SplatModel, tile: Tile, plan: Plan, tables: ShTables, shapes: ShapeTables | None = None
+) -> EncodedTile:
     """Encode one tile.
 
     Args:
@@ -67,22 +70,24 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
         tile: which rows, on which lattice.
         plan: the file's lattices and codings.
         tables: what the SH stage decided for the whole file.
+        shapes: what the shape stage decided, if it made a codebook.
 
     Returns:
         The tile; its rows are the model's, in the order in which a decoder returns them.
     """
     work = _Work(plan, [], {}, {}, set())
-    rows, q, corner, codes = _order(model, tile, plan)
+    rows, q, corner, codes = tile_order(model, tile, plan)
     _opacities(work, _take(model.opacities, rows))
-    max_scale = _shape(work, _take(model.quats, rows), _take(model.scales, rows))
+    part = None if shapes is None else shapes.part(rows)
+    max_scale = _shape(work, _take(model.quats, rows), _take(model.scales, rows), part)
     _means(work, model, rows, q, corner, codes, lattice_step(plan.lattice.step, tile.exponent))
     _sh0(work, _take(model.sh0, rows))
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: work.blocks}
-    used: tuple[int, ...] = ()
+    used: tuple[int, ...] = () if part is None else (SHAPE_BOOK,)
     if model.sh_degree:
-        coded = code_sh(model.shN, rows, plan, tables, _coarse(rows, plan, tables))
+        coded = code_sh(model.shN, rows, plan, tables, coarseness(rows, plan, tables))
         layers |= {layer: [block] for layer, block in coded.blocks.items()}
-        used = coded.tables
+        used = (*coded.tables, *used)
         if coded.exponent:
             work.coarsened.add("shN")
         for measure, errors in coded.errors.items():
@@ -105,7 +110,9 @@ def encode_tile(model: SplatModel, tile: Tile, plan: Plan, tables: ShTables) -> 
     return EncodedTile(file_tile, rows, ErrorSums(len(rows), work.largest, work.squares), frozenset(work.coarsened))
 
 
-def _order(model: SplatModel, tile: Tile, plan: Plan) -> tuple[NDArray[np.intp], Integers, Integers, Integers | None]:
+def tile_order(
+    model: SplatModel, tile: Tile, plan: Plan
+) -> tuple[NDArray[np.intp], Integers, Integers, Integers | None]:
     """Quantise the centres and sort the splats by Morton code.
 
     Returns:
@@ -126,7 +133,7 @@ def _order(model: SplatModel, tile: Tile, plan: Plan) -> tuple[NDArray[np.intp],
     return tile.rows[order], np.take(q, order, axis=1), corner, (keys >> np.uint64(16)).astype(np.int64)
 
 
-def _coarse(rows: NDArray[np.intp], plan: Plan, tables: ShTables) -> NDArray[np.int32] | None:
+def coarseness(rows: NDArray[np.intp], plan: Plan, tables: ShTables) -> NDArray[np.int32] | None:
     """Return by which power of two the SH of each splat may be coarser than the lattice, or None."""
     if tables.weights is None or plan.adaptive == 0.0:
         return None
@@ -142,15 +149,14 @@ def _opacities(work: _Work, opacities: F32) -> None:
     work.note("opacities", value_errors(opacities, opacity_values(q, levels, square=True)))
 
 
-def _shape(work: _Work, quats: F32, scales: F32) -> float:
+def _shape(work: _Work, quats: F32, scales: F32, part: ShapePart | None) -> float:
     """Scales and rotations in their gauge. Returns the largest decoded scale."""
     plan = work.plan
-    shape = quantise_shape(quats, scales, plan)
+    shape = quantise_shape(quats, scales, plan, part)
     if shape.exponent:
         work.coarsened.add("scales")
     check_finite("scales", shape.decoded_scales)
-    work.blocks.append(blocks.offset_block(_spec.ATTRIBUTE_SCALES, shape.scales, shape.exponent, plan.coding))
-    work.blocks.append(blocks.signed_block(_spec.ATTRIBUTE_QUATS, shape.quats, 0, plan.coding))
+    work.blocks.extend(shape_blocks(shape.scales, shape.exponent, shape.quats, part, plan.coding))
     work.note("covariance", covariance_errors(quats.T, scales.T, shape.decoded_quats, shape.decoded_scales))
     return float(shape.decoded_scales.max())
 

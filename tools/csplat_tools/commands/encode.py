@@ -19,6 +19,7 @@ __all__ = ["encode"]
 _SCENE = "What the PLY may not say"
 _PRECISION = "Precision (the preset decides where nothing is given)"
 _COLOUR = "Spherical harmonics"
+_SHAPE = "Codebook of shapes (wants --importance of `csplat sensitivity`)"
 _CODING = "Coding"
 _LESS = "Simplification (needs the render extra)"
 
@@ -43,9 +44,13 @@ def encode(
     importance: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.npy", help="Weights of the splats, without dropped rows, instead of opacity x size."
+            metavar="FILE",
+            help="What `csplat sensitivity` wrote; or weights (.npy), without dropped rows. Instead of opacity x size.",
         ),
     ] = None,
+    prune_unseen: Annotated[
+        bool, typer.Option("--prune-unseen", help="Leave out splats that no view of --importance saw.")
+    ] = False,
     axes: Annotated[
         str | None,
         typer.Option(metavar="RDF", rich_help_panel=_SCENE, help="Directions of +x, +y, +z: R/L, U/D, F/B."),
@@ -108,6 +113,12 @@ def encode(
         float | None,
         typer.Option(metavar="0..1", rich_help_panel=_COLOUR, help="Share of splats that bypass the codebook."),
     ] = None,
+    shape_codebook_size: Annotated[
+        int | None, typer.Option(metavar="1..65536", rich_help_panel=_SHAPE, help="Entries at most; none by default.")
+    ] = None,
+    shape_escape_fraction: Annotated[
+        float | None, typer.Option(metavar="0..1", rich_help_panel=_SHAPE, help="Share with a shape of its own.")
+    ] = None,
     profile: Annotated[
         str, typer.Option(metavar="base|archive", rich_help_panel=_CODING, help="Base is read everywhere.")
     ] = "base",
@@ -163,6 +174,8 @@ def encode(
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
       csplat encode scene.ply scene.csplat --source-index scene.npy && \
         csplat verify scene.csplat --source scene.ply --source-index scene.npy
+      csplat sensitivity scene.ply scene.npz --data photographs && \
+        csplat encode scene.ply scene.csplat --importance scene.npz
       csplat encode scene.ply scene.csplat --simplify --keep 0.5
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
@@ -185,6 +198,8 @@ def encode(
             codebook_size=codebook_size,
             codebook_stages=codebook_stages,
             escape_fraction=escape_fraction,
+            shape_codebook_size=shape_codebook_size,
+            shape_escape_fraction=shape_escape_fraction,
             adaptive=adaptive,
             tile_splats=tile_splats,
             effort=effort,
@@ -202,6 +217,8 @@ def encode(
         )
     if simplify and importance is not None:
         raise typer.BadParameter("--simplify measures the importance of splats itself")
+    if prune_unseen and importance is None:
+        raise typer.BadParameter("--prune-unseen wants --importance, which says what was seen")
     encoder = wanted.encoder(quiet=quiet) if simplify else None
     if as_json and target == STANDARD_STREAM:
         raise typer.BadParameter("--json and - both want standard output")
@@ -218,6 +235,7 @@ def encode(
             facts=SceneFacts(axes, unit_metres, antialiased, licence),
             strict=strict,
             importance=importance,
+            prune_unseen=prune_unseen,
             source_index=source_index,
             encoder=encoder,
             progress=progress,

@@ -1,0 +1,260 @@
+"""A scene whose coding is decided and whose values may still move: what fine-tuning tunes is what is written.
+
+`freeze` (freezing.py) lets the encoder decide everything that is decided once: lattices, tiles, codebooks and who uses
+which entry, who bypasses them, who lacks an SH band. `Frozen.seen` then says, for any values, what a decoder of the
+file will see, by the functions that code the tiles; `encode_frozen` writes the file of these values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.codebook import books_of
+from csplat.encoder.colour import ShTables, quantise_colour, quantise_rows, served_rows
+from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
+from csplat.encoder.pipeline import Decisions
+from csplat.encoder.plan import Plan
+from csplat.encoder.quantise import colour_integers, colour_lifted, lattice_values, quat_levels, quat_values
+from csplat.encoder.shape_tables import ShapeTables
+from csplat.encoder.tile import coarseness
+from csplat.model import SplatModel
+
+__all__ = ["Frozen", "Held", "Seen"]
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Held:
+    """Values of a frozen scene before they are quantised, float32; whoever tunes them changes them in place.
+
+    Attributes:
+        means: [N, 3].
+        quats: [S, 4] and
+        scales: [S, 3], log, the shapes that the file holds, in their gauge: one per splat; or, with a codebook, its
+            entries and then one for each escaped splat.
+        opacities: [N], alpha.
+        sh0: [N, 3].
+        sh: [R, K, 3], the rows of SH that the file holds: one per splat; or, with a codebook, the entries of its
+            stages and then one for each escaped splat. K is that of the degree that is kept.
+        sizes: [N], what a splat adds to the log scales of its entry, 0 if it is escaped; [0] without a codebook.
+    """
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    sh: F32
+    sizes: F32
+
+    def copy(self) -> Held:
+        """The same values in arrays of their own."""
+        return Held(*(getattr(self, one.name).copy() for one in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a decoder will see: the arrays of a `SplatModel`, unchecked, SH up to the degree that is kept."""
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    shN: F32
+
+
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """What the encoder decided.
+
+    Attributes:
+        decided: by the encoder, with the scene in the order of its tiles and in its gauge.
+        source: the scene that errors are stated against.
+        source_index: [N] int64, which splat of the source each one is.
+        low, high: [N, 3] float32, the box of each splat's tile: centres stay within, for the lattice holds no more.
+        zero: [N, K] bool, SH coefficients that are zero and stay so, where every splat has its own; else None.
+        said: what the file's options say was done before.
+    """
+
+    decided: Decisions
+    source: SplatModel
+    source_index: I64
+    low: F32
+    high: F32
+    zero: NDArray[np.bool_] | None
+    said: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def plan(self) -> Plan:
+        """Lattices and codings."""
+        return self.decided.books.plan
+
+    @property
+    def stages(self) -> Sequence[I32]:
+        """By stage of the codebook [N], which row of its part of `Held.sh` each splat uses; empty without a codebook.
+
+        The size of the first stage says "escaped".
+        """
+        return [np.asarray(index, np.int32) for index in self.decided.books.tables.index]
+
+    @property
+    def stage_sizes(self) -> tuple[int, ...]:
+        """Entries of the codebook's stages."""
+        return tuple(int(stage.shape[2]) for stage in self.decided.books.tables.entries)
+
+    @property
+    def escaped(self) -> I64:
+        """Splats that bypass the codebook, ascending."""
+        if not self.stage_sizes:
+            return np.zeros(0, np.int64)
+        return np.flatnonzero(self.stages[0] == self.stage_sizes[0])
+
+    @property
+    def shapes(self) -> ShapeTables | None:
+        """The codebook of shapes, if there is one."""
+        return self.decided.shapes
+
+    def start(self) -> Held:
+        """Values as the encoder found them."""
+        model, plan = self.decided.model, self.plan
+        kept = (plan.sh_degree + 1) ** 2 - 1
+        sh = np.ascontiguousarray(model.shN[:, :kept])
+        if self.stage_sizes:
+            entries = [_as_values(stage, plan) for stage in self.decided.books.tables.entries]
+            sh = np.concatenate([*entries, sh[self.escaped]])
+        quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
+        if self.shapes is not None:
+            shared, own = self.shapes.entries, self.shapes.escaped
+            quats = np.concatenate([quat_values(shared[3:], plan.quat_levels).T, quats[own]])
+            scales = np.concatenate([lattice_values(shared[:3], plan.scale_step).T, scales[own]])
+            sizes = lattice_values(self.shapes.summand, plan.scale_step)
+        held = Held(model.means, quats, scales, model.opacities, model.sh0, sh, sizes).copy()
+        self.constrain(held)
+        return held
+
+    def constrain(self, held: Held) -> None:
+        """Bring values that moved back to where the file can hold them: into their tiles, w >= 0, zeros to zero."""
+        np.clip(held.means, self.low, self.high, out=held.means)
+        turned = held.quats[:, 0] < 0.0
+        if turned.any():
+            held.quats[turned] *= np.float32(-1.0)
+        if self.zero is not None:
+            np.copyto(held.sh, np.float32(0.0), where=self.zero[:, :, None])
+        if self.shapes is not None:
+            held.sizes[self.shapes.escaped] = 0.0
+
+    def seen(self, held: Held) -> Seen:
+        """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""
+        tiles, plan = self.decided.tiles, self.plan
+        if self.decided.options.threads == 1:
+            shN, (quats, scales) = self.seen_sh(held.sh), self._seen_shapes(held)
+            means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
+        else:
+            with ThreadPoolExecutor(2) as pool:  # NumPy lets go of the interpreter; the three take about as long
+                later_sh, later_shapes = pool.submit(self.seen_sh, held.sh), pool.submit(self._seen_shapes, held)
+                means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
+                shN, (quats, scales) = later_sh.result(), later_shapes.result()
+        return Seen(means, quats, scales, seen_opacities(held.opacities, plan), sh0, shN)
+
+    def seen_sh0(self, sh0: F32) -> F32:
+        """Degree-0 colours [N, 3] as a decoder will see them."""
+        plan, seen = self.plan, np.empty_like(sh0)
+        for tile in self.decided.tiles:
+            columns = np.ascontiguousarray(sh0[tile.rows].T)
+            seen[tile.rows] = quantise_colour(columns, plan.sh0_step, plan.chroma_shift).decoded.T
+        return seen
+
+    def seen_sh(self, sh: F32) -> F32:
+        """SH of all splats [N, K, 3] as a decoder will see it, from the rows that the file holds."""
+        plan, tables = self.plan, self.decided.books.tables
+        if self.stage_sizes:
+            tables = self._tables(sh)
+            seen = served_rows(list(tables.index), plan, tables)
+            seen[self.escaped] = self._seen_escapes(sh)
+            return seen
+        seen = np.empty_like(sh)
+        for tile in self.decided.tiles:
+            seen[tile.rows] = quantise_rows(sh[tile.rows], plan, coarseness(tile.rows, plan, tables))[2]
+        return seen
+
+    def seen_rows(self, sh: F32) -> F32:
+        """The rows of SH that the file holds [R, K, 3] as a decoder will see them: entries by themselves."""
+        if not self.stage_sizes:
+            return self.seen_sh(sh)
+        entries = [_as_values(stage, self.plan) for stage in self._tables(sh).entries]
+        return np.concatenate([*entries, self._seen_escapes(sh)])
+
+    def seen_shape_rows(self, held: Held, seen: Seen) -> tuple[F32, F32, F32]:
+        """Rotations, scales and sizes of `held` as their streams hold them; `seen` is what a decoder makes of them."""
+        shapes = self._shapes(held)[0]
+        if shapes is None:
+            return seen.quats, seen.scales, held.sizes
+        own = shapes.escaped
+        quats = np.concatenate([quat_values(shapes.entries[3:], self.plan.quat_levels).T, seen.quats[own]])
+        scales = np.concatenate([lattice_values(shapes.entries[:3], self.plan.scale_step).T, seen.scales[own]])
+        return quats, scales, lattice_values(shapes.summand, self.plan.scale_step)
+
+    def _seen_shapes(self, held: Held) -> tuple[F32, F32]:
+        shapes, quats, scales = self._shapes(held)
+        return seen_shapes(quats, scales, self.decided.tiles, self.plan, shapes)
+
+    def _seen_escapes(self, sh: F32) -> F32:
+        coarse = np.full(len(self.escaped), self.plan.escape_coarse, np.int32)
+        return quantise_rows(sh[sum(self.stage_sizes) :], self.plan, coarse)[2]
+
+    def decisions(self, held: Held) -> Decisions:
+        """The same decisions with these values: what is written."""
+        shapes, quats, scales = self._shapes(held)
+        model, kept = self.decided.model, held.sh.shape[1]
+        shN, books = np.zeros_like(model.shN), self.decided.books
+        if self.stage_sizes:
+            shN[self.escaped, :kept] = held.sh[sum(self.stage_sizes) :]
+            books = books_of(self._tables(held.sh), self.plan)
+        else:
+            shN[:, :kept] = held.sh
+        model = replace(
+            model, means=held.means, quats=quats, scales=scales, opacities=held.opacities, sh0=held.sh0, shN=shN
+        )
+        return replace(self.decided, model=model, books=books, shapes=shapes)
+
+    def _shapes(self, held: Held) -> tuple[ShapeTables | None, F32, F32]:
+        """The codebook of shapes with these values, and rotations and scales by splat, which it stands in for."""
+        if self.shapes is None:
+            return None, held.quats, held.scales
+        plan, size, own = self.plan, self.shapes.size, self.shapes.escaped
+        scales = np.rint(held.scales[:size].T / plan.scale_step)
+        entries = np.concatenate([scales.astype(np.int32), quat_levels(held.quats[:size].T, plan.quat_levels)])
+        summand = np.rint(held.sizes / plan.scale_step).astype(np.int32)
+        by_splat = np.zeros_like(self.decided.model.quats), np.zeros_like(self.decided.model.scales)
+        by_splat[0][:, 0] = 1.0
+        by_splat[0][own], by_splat[1][own] = held.quats[size:], held.scales[size:]
+        return ShapeTables(entries, self.shapes.index, summand), *by_splat
+
+    def _tables(self, sh: F32) -> ShTables:
+        entries, first = [], 0
+        for size in self.stage_sizes:
+            entries.append(_as_integers(sh[first : first + size], self.plan))
+            first += size
+        return replace(self.decided.books.tables, entries=entries)
+
+
+def _as_values(entries: I32, plan: Plan) -> F32:
+    """[size, K, 3] float32 of Y, Co, Cg integers [3, K, size] on the SH lattice."""
+    rgb = colour_lifted(entries, plan.chroma_shift).transpose(2, 1, 0)
+    return np.ascontiguousarray(rgb * plan.sh_step, np.float32)
+
+
+def _as_integers(values: F32, plan: Plan) -> I32:
+    """Y, Co, Cg integers [3, K, size] on the SH lattice of values [size, K, 3]."""
+    rgb = np.ascontiguousarray(values.transpose(2, 1, 0)) * np.float32(1.0 / plan.sh_step)
+    return colour_integers(rgb, plan.chroma_shift).astype(np.int32, copy=False)

@@ -1,0 +1,539 @@
+"""Fine-tuning: what it learns, that it repeats itself, resumes, stops, and what the command says and writes."""
+
+import inspect
+import json
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="fine-tuning needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from csplat import EncodeOptions, decode, encode, write_ply  # noqa: E402
+from csplat.decoder import read_options, read_stated_errors  # noqa: E402
+from csplat.encoder.freezing import encode_frozen, freeze  # noqa: E402
+from csplat.errors import InputError  # noqa: E402
+from csplat_render import render  # noqa: E402
+from csplat_render.cameras import intrinsics, look_at, save_cameras  # noqa: E402
+from csplat_render.rasterise import Rasteriser, Splats  # noqa: E402
+from csplat_tools.app import app  # noqa: E402
+from csplat_tools.commands.finetune import finetune as finetune_command  # noqa: E402
+from csplat_tools.finetune_report import PLY_SPLAT_BYTES  # noqa: E402
+from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views  # noqa: E402
+from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes  # noqa: E402
+from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin  # noqa: E402
+from csplat_trainer.loss import PhotometricLoss  # noqa: E402
+
+W, H = 48, 40
+BLACK = np.zeros(3, np.float32)
+QUICK = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, log_every=10)
+COARSE = EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16)
+
+
+def cameras(count):
+    K, angles = intrinsics(W, H, 60.0), np.linspace(0.2, 5.9, count)
+    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1), K, W, H) for a in angles]
+
+
+@pytest.fixture(scope="module")
+def source():
+    """A shell of 300 overlapping splats, whose colours vary smoothly."""
+    from csplat.model import SplatModel, normalise_quats
+
+    rng = np.random.default_rng(0)
+    means = rng.standard_normal((300, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    return SplatModel(
+        means=means.astype(np.float32),
+        quats=normalise_quats(rng.standard_normal((300, 4))),
+        scales=rng.uniform(-2.5, -1.3, (300, 3)).astype(np.float32),
+        opacities=rng.uniform(0.1, 0.95, 300).astype(np.float32),
+        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
+        shN=(0.1 * rng.standard_normal((300, 8, 3))).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def views(source):
+    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, aside=3)
+
+
+def psnr(model, views):
+    error = [np.square(render(model, view.camera).rgb - view.wanted).mean() for view in views]
+    return -10.0 * math.log10(float(np.mean(error)))
+
+
+# learning
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        COARSE,
+        EncodeOptions(quality=28.0, sh_coding="scalar"),
+        EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, codebook_stages=2, shape_codebook_size=32),
+        EncodeOptions(quality=28.0, sh_coding="none", tile_splats=80),
+    ],
+    ids=["codebook", "scalar", "shapes and stages", "no SH"],
+)
+def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
+    frozen = freeze(source, encoding)
+    before = encode_frozen(frozen, frozen.start()).data
+    tuned = finetune(frozen, views, replace(QUICK, iterations=300))
+    after = encode_frozen(frozen, tuned.held).data
+    assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 1.0
+    assert len(after) < 1.1 * len(before)
+
+
+def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
+    frozen = freeze(source, COARSE)
+    tuned = finetune(frozen, views, QUICK)
+    decoded = decode(encode_frozen(frozen, tuned.held).data)
+    rasteriser, error = Rasteriser(), []
+    rows = np.argsort(frozen.source_index)
+    order = np.argsort(encode_frozen(frozen, tuned.held).source_index)
+    seen = frozen.seen(tuned.held)
+    for name in ("means", "shN"):
+        assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
+    splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    for view in views.validation:
+        picture = rasteriser.forward(splats, view.camera, background=BLACK).rgb
+        error.append(np.square(np.clip(picture, 0, 1) - np.clip(view.wanted, 0, 1)).mean(dtype=np.float64))
+    assert tuned.log["best_psnr"] == pytest.approx(-10.0 * math.log10(np.mean(error)), abs=1e-6)
+
+
+def test_costly_bytes_make_small_files(source, views):
+    sizes = []
+    for cost in (0.0, 1e-3, 1e-2):
+        frozen = freeze(source, EncodeOptions(sh_coding="scalar"))
+        tuned = finetune(frozen, views, replace(QUICK, iterations=150, byte_cost=cost))
+        sizes.append(len(encode_frozen(frozen, tuned.held).data))
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_what_does_not_get_better_stays_as_it_was(source, views):
+    frozen = freeze(source, EncodeOptions(preset="fast", quality=90.0, sh_coding="scalar"))
+    tuned = finetune(frozen, views, replace(QUICK.scaled(5.0), byte_cost=0.0))
+    assert 0 == tuned.log["best_iteration"]
+    start = frozen.start()
+    assert np.array_equal(start.sh, tuned.held.sh)
+
+
+def test_a_run_that_gains_nothing_ends_early(source, views):
+    frozen = freeze(source, EncodeOptions(preset="fast", quality=90.0, sh_coding="scalar"))
+    options = replace(QUICK, iterations=300, patience=2, byte_cost=0.0).scaled(5.0)
+    log = finetune(frozen, views, options).log
+    assert log["settled"]
+    assert 2 / 3 * 300 < log["steps"] < 300  # not before values have calmed down
+    assert not finetune(frozen, views, replace(options, patience=0)).log["settled"]
+
+
+# gradients
+
+
+def test_gradients_of_entries_are_those_of_all_their_users(source, views):
+    """A sum over users, against finite differences of the loss by an entry's values."""
+    frozen = freeze(source, EncodeOptions(quality=60.0, sh_coding="codebook", codebook_size=16))
+    scene, view = TunedScene(frozen), views.train[0]
+    loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
+    seen, _ = scene.seen()
+    wanted = np.zeros((H, W, 3), np.float32)
+
+    def rendered(shN):
+        splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, shN)
+        return rasteriser.forward(splats, view.camera, background=np.ones(3)).rgb
+
+    picture = rendered(seen.shN)
+    _, slope = loss(picture.astype(np.float32), wanted)
+    gradients = rasteriser.backward(slope.astype(np.float64))
+    by_row = scene._by_row(gradients.shN.astype(np.float32))
+    entry = int(np.argmax(np.abs(by_row[:16]).sum(axis=(1, 2))))
+    users, h = frozen.stages[0] == entry, 1e-3
+    assert users.sum() > 1
+    for k in range(3):
+        high, low = (seen.shN.astype(np.float64) for _ in range(2))
+        high[users, k, 1] += h
+        low[users, k, 1] -= h
+        difference = float((slope * (rendered(high) - rendered(low))).sum()) / (2 * h)
+        assert by_row[entry, k, 1] == pytest.approx(difference, rel=2e-2, abs=1e-6)
+
+
+def test_sums_by_entry_agree_with_their_twin():
+    rng = np.random.default_rng(0)
+    index = rng.integers(0, 9, 200)
+    order, starts = np.argsort(index, kind="stable"), np.searchsorted(np.sort(index), np.arange(9))
+    values = rng.standard_normal((200, 7)).astype(np.float32)
+    fast, slow = np.empty((8, 7), np.float32), np.empty((8, 7), np.float32)
+    sum_by_entry(values, order, starts, fast)
+    sum_by_entry_twin(values, order, starts, slow)
+    assert np.allclose(slow, fast, atol=1e-5)
+    assert np.allclose(slow[3], values[index == 3].sum(axis=0), atol=1e-5)
+
+
+def test_a_step_moves_values_through_their_quantisers(source, views):
+    scene = TunedScene(freeze(source, COARSE))
+    before = {name: values.copy() for name, values in scene.parameters.values.items()}
+    rasteriser, view = Rasteriser(), views.train[0]
+    seen, alphas = scene.seen()
+    splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, view.wanted)
+    rates = {"means": 0.0, "quats": 1e-4, "scales": 1e-4, "sizes": 0.0, "logits": 1e-4, "sh0": 1e-4, "shN": 1e-4}
+    scene.step(rasteriser.backward(slope), seen, alphas, rates, None)
+    after = scene.parameters.values
+    assert np.array_equal(before["means"], after["means"])
+    for name in ("scales", "logits", "sh0", "shN"):
+        moved = np.abs(after[name] - before[name])
+        assert 0 < moved.max() <= 1.01e-4, name  # Adam's first step is as long as the rate
+
+
+# the cost of bytes
+
+
+def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common():
+    columns = np.repeat([0, 1, -1, 2], [800, 100, 90, 10])[:, None]
+    slopes, bits = cost_slopes(columns)
+    shares = np.array([800, 100, 90, 10]) / 1000
+    assert bits == pytest.approx(-1000 * (shares * np.log2(shares)).sum())
+    assert slopes[0, 128 + 1] > 0.5  # towards 2 it gets dearer
+    assert slopes[0, 128 - 1] < -0.5
+    assert abs(slopes[0, 128]) < 0.2
+    assert np.abs(slopes).max() <= 4.0
+
+
+def test_costs_take_the_integers_that_are_coded(source):
+    frozen = freeze(source, EncodeOptions(sh_coding="scalar", chroma_shift=1))
+    scene = TunedScene(frozen)
+    seen, _ = scene.seen()
+    found = colour_integers_of(seen.shN, frozen.plan.sh_step, 1)
+    from csplat.encoder.colour import quantise_rows
+
+    columns, _, _ = quantise_rows(frozen.start().sh, frozen.plan, None)
+    assert np.array_equal(columns.transpose(2, 1, 0), found)
+
+
+@pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
+def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
+    """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
+    frozen = freeze(source, EncodeOptions(sh_coding="scalar", quality=60.0))
+    scene = TunedScene(frozen)
+    seen, _ = scene.seen()
+    stored = scene.stored(seen)
+    name = {"logits": "opacities"}.get(group, group)
+    integers = np.arange(-128, 129, dtype=np.float32)
+    costs = scene.count(seen, weight=float(len(source)))
+    costs.tables = {key: np.zeros_like(table) for key, table in costs.tables.items()}
+    costs.tables[name] += 0.01 * integers  # the slope of 0.005 n²
+    steps = {key: np.zeros_like(values) for key, values in scene.parameters.values.items()}
+    costs.add_to(steps, stored)
+    for other, slopes in steps.items():
+        assert slopes.any() == (other == group)
+    plan = frozen.plan
+    if group == "scales":
+        assert np.allclose(steps["scales"], 0.01 * stored.scales / plan.scale_step**2, rtol=1e-4)
+    elif group == "quats":
+        assert not steps["quats"][:, 0].any()
+        unit = 1.0 / (math.sqrt(2.0) * plan.quat_levels)
+        expected = 0.01 * np.clip(stored.quats[:, 1:] / unit, -128, 128) / unit  # the table ends there
+        assert np.allclose(steps["quats"][:, 1:], expected, rtol=1e-3, atol=1e-3)
+    elif group == "logits":
+        level = np.sqrt(stored.opacities) * plan.opacity_levels
+        expected = 0.01 * level * 0.5 * level * (1 - stored.opacities)
+        small = level < 127
+        assert np.allclose(steps["logits"][small], expected[small], rtol=1e-3, atol=1e-4)
+    else:
+        values, step = (stored.sh0[:, None], plan.sh0_step) if group == "sh0" else (stored.sh, plan.sh_step)
+        gradient = steps[group].reshape(values.shape)
+        n = (values / step).astype(np.float64)
+        y, co, cg = (n[..., 0] + 2 * n[..., 1] + n[..., 2]) / 4, n[..., 0] - n[..., 2], 0.0
+        cg = n[..., 1] - (n[..., 0] + n[..., 2]) / 2
+        scale = 2.0**plan.chroma_shift
+        by_y, by_co, by_cg = 0.01 * y, 0.01 * co / scale**2, 0.01 * cg / scale**2
+        expected = np.stack([by_y / 4 + by_co - by_cg / 2, by_y / 2 + by_cg, by_y / 4 - by_co - by_cg / 2], axis=-1)
+        assert np.abs(gradient - expected / step).max() < 0.05 / step  # integers are rounded, this is not
+
+
+def test_a_weight_of_bytes_is_loss_per_bit_and_splat(source):
+    scene = TunedScene(freeze(source, COARSE))
+    seen, _ = scene.seen()
+    costs = Costs.counted(scene.frozen, scene.stored(seen), 2e-4)
+    assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
+    assert 5 < costs.bits / 300 < 200
+
+
+# repeating
+
+
+def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
+    files = []
+    for seed, threads in ((1, 1), (1, 2), (2, 1)):
+        frozen = freeze(source, COARSE)
+        tuned = finetune(frozen, views, replace(QUICK, seed=seed, iterations=40), threads=threads)
+        files.append(encode_frozen(frozen, tuned.held).data)
+    assert files[0] == files[1]
+    assert files[0] != files[2]
+
+
+def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
+    frozen = freeze(source, EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32))
+    file = tmp_path / "c.npz"
+    middle = []
+
+    def keep(now):
+        if now.iteration == 40:
+            middle.append(file.read_bytes())  # the one of step 30
+
+    whole = finetune(frozen, views, QUICK, progress=keep, checkpoint=file, checkpoint_every=15)
+    file.write_bytes(middle[0])
+    rest = finetune(frozen, views, QUICK, resume=file)
+    assert encode_frozen(frozen, whole.held).data == encode_frozen(frozen, rest.held).data
+    assert whole.log["losses"] == rest.log["losses"]
+    assert whole.log["looks"] == rest.log["looks"]
+
+
+def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
+    file = tmp_path / "c.npz"
+    finetune(freeze(source, COARSE), views, replace(QUICK, iterations=5), checkpoint=file)
+    other = freeze(source, replace(COARSE, quality=29.0))
+    with pytest.raises(InputError, match="another scene"):
+        finetune(other, views, QUICK, resume=file)
+    np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
+    for content in (b"", b"no checkpoint", file.read_bytes()[:-500], (tmp_path / "n.npz").read_bytes()):
+        (tmp_path / "bad.npz").write_bytes(content)
+        with pytest.raises(InputError, match="not a checkpoint"):
+            finetune(freeze(source, COARSE), views, QUICK, resume=tmp_path / "bad.npz")
+
+
+# options and views
+
+
+@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"lr_sh0": -1.0}, {"byte_cost": float("nan")}, {"loss": "l3"}])
+def test_refuses_options_out_of_range(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        FinetuneOptions(**wrong)
+
+
+def test_learning_rates_rise_and_fall():
+    options = FinetuneOptions(iterations=1000, warm_up=100, decay=0.01)
+    shares = [options.share(step) for step in range(1, 1001)]
+    assert shares[0] == pytest.approx(1 / 101)
+    assert 90 < int(np.argmax(shares)) < 110
+    assert shares[-1] == pytest.approx(0.01, rel=0.01)
+    assert 2.0 * options.lr_sh0 == options.scaled(2.0).lr_sh0
+    assert options.byte_cost == options.scaled(2.0).byte_cost
+
+
+def test_views_that_judge_teach_unless_they_are_kept_aside():
+    views = [View(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
+    together, apart = split_views(views, BLACK), split_views(views, BLACK, aside=4)
+    assert (20, 16, False) == (len(together.train), len(together.validation), together.kept_aside)
+    assert (16, 4, True) == (len(apart.train), len(apart.validation), apart.kept_aside)
+    with pytest.raises(InputError, match="leave none"):
+        split_views(views, BLACK, aside=20)
+    with pytest.raises(InputError, match="at least one view"):
+        Views([], [], BLACK)
+
+
+# the command
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def call(*words):
+    result = invoke(*words)
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result
+
+
+@pytest.fixture(scope="module")
+def capture(source, tmp_path_factory):
+    """A PLY with one splat more, far behind all cameras, and sixteen photographs of the scene in front of black."""
+    folder = tmp_path_factory.mktemp("capture")
+    (folder / "images").mkdir()
+    frames = []
+    for number, camera in enumerate(cameras(16)):
+        pixels = np.clip(render(source, camera).rgb, 0.0, 1.0)
+        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number:02}.png")
+        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": pose.tolist()})
+    K = intrinsics(W, H, 60.0)
+    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    hidden = source.select(np.concatenate([[0], np.arange(300)]))
+    hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), source.means]))
+    write_ply(folder / "scene.ply", hidden)
+    return folder
+
+
+def test_the_command_tunes_prunes_and_reports(capture, tmp_path):
+    out, report, log = tmp_path / "s.csplat", tmp_path / "report.json", tmp_path / "log.json"
+    said = call(
+        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--quality", 28, "--iterations", 200,
+        "--report", report, "--json", log, "--deflate", "zlib",
+    )  # fmt: skip
+    facts = json.loads(report.read_text())
+    assert "" == said.stdout
+    assert "1 that no view shows" in said.stderr
+    assert "14 training and 2 test pictures" in said.stderr
+    decoded = decode(out.read_bytes())
+    assert (301, 300, 300) == (facts["source_splats"], facts["splats"], len(decoded))
+    assert out.stat().st_size == facts["size_bytes"]
+    assert facts["ratio"] == pytest.approx(301 * PLY_SPLAT_BYTES / out.stat().st_size)
+    assert sum(facts["bytes_by_attribute"].values()) + facts["overhead_bytes"] == out.stat().st_size
+    scores = facts["scores"]
+    assert scores["source"]["psnr"] > scores["file"]["psnr"] > scores["before tuning"]["psnr"] + 1.0
+    assert {"reading", "choosing", "encoding", "tuning", "judging"} == set(facts["seconds"])
+    assert 200 == len(json.loads(log.read_text())["losses"])
+    stated = read_stated_errors(out.read_bytes())
+    assert (301, 1) == (stated.source_count, stated.pruned_count)
+    assert 1 == read_options(out.read_bytes())["finetuned"]["unseen"]
+    compared = json.loads(call("compare", capture / "scene.ply", out, "--data", capture, "--json").stdout)
+    assert compared["photographs"]["b"]["psnr"] == pytest.approx(scores["file"]["psnr"], abs=1e-4)
+    assert compared["photographs"]["a"]["psnr"] == pytest.approx(scores["source"]["psnr"], abs=1e-4)
+    proof = call("verify", out, "--source", capture / "scene.ply")
+    assert "fitted anew" in proof.stdout + proof.stderr
+
+
+def test_a_scene_can_be_tuned_to_its_own_renders(capture, tmp_path):
+    out, report = tmp_path / "s.csplat", tmp_path / "report.json"
+    call(
+        "finetune", capture / "scene.ply", "--self", "-o", out, "--quality", 28, "--iterations", 150, "--views", 24,
+        "--view-size", "64x48", "--report", report, "-q",
+    )  # fmt: skip
+    facts = json.loads(report.read_text())
+    assert (301, 301) == (facts["source_splats"], facts["splats"])
+    assert (True, 3) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
+    assert {"before tuning", "file"} == set(facts["scores"])
+    assert facts["scores"]["file"]["psnr"] > facts["scores"]["before tuning"]["psnr"] + 0.5
+    compared = json.loads(call("compare", capture / "scene.ply", out, "--json").stdout)
+    assert compared["psnr"] == pytest.approx(facts["scores"]["file"]["psnr"], abs=1e-4)
+
+
+def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
+    save_cameras(tmp_path / "cameras.json", cameras(9))
+    out = tmp_path / "s.csplat"
+    result = call(
+        "finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json", "-o", out,
+        "--prune-unseen", "--iterations", 20, "--say-json", "-q",
+    )  # fmt: skip
+    facts = json.loads(result.stdout)
+    assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
+
+
+def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
+    out = tmp_path / "s.csplat"
+    result = call(
+        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, "-o", out, "--iterations", 30,
+        "--say-json",
+    )  # fmt: skip
+    facts = json.loads(result.stdout)
+    assert (301, 150, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
+    stated = read_stated_errors(out.read_bytes())
+    assert (301, 151) == (stated.source_count, stated.pruned_count)
+    call("verify", out, "--source", capture / "scene.ply")
+    again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", "--iterations", 1)
+    assert "need least" not in again.stderr
+
+
+def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 1)
+    np.save(tmp_path / "w.npy", np.ones(300))
+    result = invoke(*words, "--importance", tmp_path / "w.npy")
+    assert 1 == result.exit_code
+    assert "wanted (301,)" in result.stderr
+    np.save(tmp_path / "w.npy", np.arange(301.0))
+    call(*words, "--importance", tmp_path / "w.npy")
+
+
+def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 2)
+    facts = json.loads(call(*words, "--test-every", 0, "--aside", 2, "--say-json", "-q").stdout)
+    assert ({}, None) == (facts["scores"], facts["judged_by"])
+    assert (True, 2) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
+    assert "photographs" not in call(*words, "--test-every", 0, "--force").stderr
+
+
+def test_every_knob_of_the_encoder_is_there():
+    names = set(inspect.signature(finetune_command).parameters)
+    assert {field.name for field in fields(EncodeOptions)} <= names
+    assert "encoding" not in names
+
+
+def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--quality", 28, "-q")
+    call(*words, "-o", tmp_path / "whole.csplat", "--iterations", 50)
+    short = tmp_path / "run.npz"
+    call(*words, "-o", tmp_path / "a.csplat", "--iterations", 50, "--checkpoint", short, "--checkpoint-every", 20)
+    call(*words, "-o", tmp_path / "b.csplat", "--iterations", 50, "--resume", short, "--checkpoint", short)
+    assert (tmp_path / "whole.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "one of --data and --self"),
+        (("--self", "--data", "x"), "one of --data and --self"),
+        (("--data", "x", "--cameras", "y"), "--cameras goes with --self"),
+        (("--self", "--quality", "5"), "quality is 5"),
+        (("--self", "--keep", "1.5"), "--keep is 1.5"),
+        (("--self", "--lr-factor", "1e9"), "lr_"),
+    ],
+)
+def test_wrong_words_are_status_2(capture, tmp_path, words, message):
+    result = invoke("finetune", capture / "scene.ply", "-o", tmp_path / "s.csplat", *words)
+    assert 2 == result.exit_code
+    assert message in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_nothing_is_replaced_unasked(capture, tmp_path):
+    out = tmp_path / "s.csplat"
+    out.write_bytes(b"old")
+    result = invoke("finetune", capture / "scene.ply", "--self", "-o", out)
+    assert 1 == result.exit_code
+    assert "--force replaces it" in result.stderr
+    assert b"old" == out.read_bytes()
+
+
+def test_cameras_that_see_nothing_are_refused(source, tmp_path):
+    away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(3)]
+    save_cameras(tmp_path / "away.json", away)
+    write_ply(tmp_path / "scene.ply", source)
+    result = invoke(
+        "finetune", tmp_path / "scene.ply", "--self", "--cameras", tmp_path / "away.json", "--prune-unseen",
+        "-o", tmp_path / "s.csplat",
+    )  # fmt: skip
+    assert 1 == result.exit_code
+    assert "no view shows any splat" in result.stderr
+
+
+def test_a_trained_scene_loses_less_when_tuned(data_dir):
+    """Lego with few splats, coarse: tuning by photographs regains most of what quantisation lost."""
+    from csplat_trainer.data import load
+    from csplat_trainer.loop import train
+    from csplat_trainer.options import TrainOptions
+
+    data = load(data_dir / "images" / "lego200", (64, 64))
+    model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
+    white = np.ones(3, np.float32)
+    views = split_views([View(picture.camera, picture) for picture in data.train], white)
+    frozen = freeze(model, EncodeOptions(preset="small", quality=34.0))
+    tuned = finetune(frozen, views, FinetuneOptions(iterations=400))
+    judges = [View(one.camera, one) for one in data.test[::10]]
+
+    def score(scene):
+        error = []
+        for view in judges:
+            wanted = view.picture(white, np.empty((64, 64, 3), np.float32))
+            picture = np.clip(render(scene, view.camera, background=white).rgb, 0, 1)
+            error.append(np.square(picture - wanted).mean())
+        return -10.0 * math.log10(float(np.mean(error)))
+
+    plain = decode(encode(model, EncodeOptions(preset="small", quality=34.0)))
+    best, lost = score(model), score(plain)
+    assert score(decode(encode_frozen(frozen, tuned.held).data)) > lost + 0.6 * (best - lost)

@@ -1,0 +1,327 @@
+"""Sensitivity against finite differences of the exact twin; what never shows; files that belong to a scene."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat.model import SplatModel, normalise_quats
+from csplat.ply import read_ply, write_ply
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+from csplat_render.cameras import intrinsics, look_at
+from csplat_render.twin import Decisions, render_exact
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
+
+STEP = 1e-5
+
+
+def small_scene(count=6, degree=2, seed=0, **fields):
+    rng = np.random.default_rng(seed)
+    return SplatModel(
+        means=rng.normal(0, 0.5, (count, 3)).astype(np.float32),
+        quats=normalise_quats(rng.normal(size=(count, 4)).astype(np.float32)),
+        scales=rng.normal(-1.6, 0.4, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.2, 0.95, count).astype(np.float32),
+        sh0=rng.normal(0.5, 0.5, (count, 3)).astype(np.float32),
+        shN=rng.normal(0, 0.1, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+        **fields,
+    )
+
+
+def cameras(count=2, size=(40, 32)):
+    K = intrinsics(*size, 50.0)
+    up = np.array([0.0, 1.0, 0.0])
+    eyes = [np.array([3 * np.sin(a), 0.6, 3 * np.cos(a)]) for a in np.arange(count) * 2.1]
+    return [look_at(eye, np.zeros(3), up, K, *size, 0.1) for eye in eyes]
+
+
+class Loose:
+    """Arrays in float64 that can be changed: a `SplatModel` holds float32."""
+
+    def __init__(self, model):
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            setattr(self, name, getattr(model, name).astype(np.float64))
+
+
+def derivatives(model, camera, change):
+    """d picture / d parameter, [H, W, 3], by central differences with all comparisons held fast."""
+    decisions = Decisions()
+    render_exact(Loose(model), camera, antialiased=model.antialiased, decisions=decisions)
+    pictures = []
+    for step in (STEP, -STEP):
+        moved = Loose(model)
+        change(moved, step)
+        decisions.replay()
+        pictures.append(render_exact(moved, camera, antialiased=model.antialiased, decisions=decisions).rgb)
+    return (pictures[0] - pictures[1]) / (2 * STEP)
+
+
+def bend(splats, row, i, j, step):
+    """Add a step to one entry of the covariance over its trace, and to its mirror image."""
+    w, x, y, z = splats.quats[row] / np.linalg.norm(splats.quats[row])
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    covariance = R @ np.diag(np.exp(2 * splats.scales[row])) @ R.T
+    trace = np.trace(covariance)
+    change = np.zeros((3, 3))
+    change[i, j] = change[j, i] = step * trace
+    values, axes = np.linalg.eigh(covariance + change)
+    axes[:, 0] *= np.linalg.det(axes)
+    splats.scales[row] = 0.5 * np.log(values)
+    splats.quats[row] = quaternion(axes)
+
+
+def quaternion(R):
+    K = np.array(
+        [
+            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+            [0, 0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
+            [0, 0, 0, R[2, 2] - R[0, 0] - R[1, 1]],
+        ]
+    )
+    return np.linalg.eigh(K, UPLO="U")[1][:, -1]
+
+
+ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
+    model, views = small_scene(antialiased=antialiased), cameras()
+    found = measure_sensitivity(model, views, dtype=np.float64)
+    pixels = sum(view.W * view.H for view in views)
+    for row in range(len(model)):
+        sizes, net, squares = np.zeros(6), np.zeros(6), 0.0
+        for view in views:
+            for e, (i, j) in enumerate(ENTRIES):
+                slope = derivatives(model, view, lambda s, step, i=i, j=j, row=row: bend(s, row, i, j, step))
+                sizes[e] += np.abs(slope).sum()
+                net[e] += abs(slope.sum())
+                squares += (slope**2).sum() / (1 if i == j else 2)  # a pair of entries moved, each by half of it
+        np.testing.assert_allclose(sizes.max() / pixels, found.shape[row], rtol=2e-5)
+        np.testing.assert_allclose(net.max() / pixels, found.shape_net[row], rtol=2e-5)
+        np.testing.assert_allclose(squares / pixels, found.shape_squares[row], rtol=2e-5)
+
+        def fade(splats, step, row=row):
+            splats.opacities[row] += step
+
+        slopes = [derivatives(model, view, fade) for view in views]
+        np.testing.assert_allclose(sum(np.abs(s).sum() for s in slopes) / pixels, found.opacity[row], rtol=2e-5)
+        np.testing.assert_allclose(sum(abs(s.sum()) for s in slopes) / pixels, found.opacity_net[row], rtol=2e-5)
+        np.testing.assert_allclose(sum((s**2).sum() for s in slopes) / pixels, found.opacity_squares[row], rtol=2e-5)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_matrix_of_the_shape_predicts_what_a_small_error_costs(antialiased):
+    model, view = small_scene(antialiased=antialiased), cameras(1)
+    found = measure_sensitivity(model, view, dtype=np.float64)
+    rows, columns = np.triu_indices(6)
+    roots = np.array([1, 1, 1, 2**0.5, 2**0.5, 2**0.5])
+    for row, direction in enumerate(np.random.default_rng(3).normal(size=(len(model), 6))):
+
+        def change(splats, step, row=row, direction=direction):
+            for (i, j), part in zip(ENTRIES, direction, strict=True):
+                bend(splats, row, i, j, step * part)
+
+        slope = derivatives(model, view[0], change)
+        matrix = np.zeros((6, 6))
+        matrix[rows, columns] = matrix[columns, rows] = found.shape_metric[row]
+        expected = (slope**2).sum() / (view[0].W * view[0].H)
+        np.testing.assert_allclose(expected, (direction * roots) @ matrix @ (direction * roots), rtol=1e-4)
+
+
+def test_colour_is_that_of_finite_differences():
+    model, views = small_scene(), cameras()
+    found = measure_sensitivity(model, views, dtype=np.float64, metric=True)
+    pixels = sum(view.W * view.H for view in views)
+    diagonal = np.equal(*np.triu_indices(9))
+    for row in range(len(model)):
+        largest, squares = 0.0, np.zeros(9)
+        for k in range(9):
+            for channel in range(3):
+
+                def change(splats, step, row=row, k=k, channel=channel):
+                    target = splats.sh0[row] if k == 0 else splats.shN[row, k - 1]
+                    target[channel] += step
+
+                slopes = [derivatives(model, view, change) for view in views]
+                largest = max(largest, sum(abs(slope.sum()) for slope in slopes))
+                squares[k] = max(squares[k], sum((slope**2).sum() for slope in slopes))
+        np.testing.assert_allclose(largest / pixels, found.colour[row], rtol=1e-5)
+        np.testing.assert_allclose(squares / pixels, found.metric[row][diagonal], rtol=1e-4)
+    # The basis functions of a band add up to the same in every direction.
+    sums = found.metric[:, diagonal].sum(axis=1) * 4 * np.pi / 9
+    np.testing.assert_allclose(found.colour_squares, sums, rtol=1e-5)
+
+
+def test_means_are_nearly_those_of_finite_differences():
+    model, views = small_scene(degree=0), cameras()
+    found = measure_sensitivity(model, views, dtype=np.float64)
+    pixels = sum(view.W * view.H for view in views)
+    for row in range(len(model)):
+        squares = 0.0
+        for axis in range(3):
+
+            def change(splats, step, row=row, axis=axis):
+                splats.means[row, axis] += step
+
+            squares += sum((derivatives(model, view, change) ** 2).sum() for view in views)
+        np.testing.assert_allclose(
+            squares / pixels, found.means_squares[row], rtol=0.2
+        )  # the size that changes is left out
+
+
+def test_cancels_nothing_within_a_view():
+    found = measure_sensitivity(small_scene(40), cameras())
+    assert (found.shape >= found.shape_net * (1 - 1e-6)).all()
+    assert (found.shape > 1.5 * found.shape_net).any()
+
+
+def test_does_not_depend_on_threads():
+    model, views = small_scene(300, 3), cameras(3)
+    one, two = (measure_sensitivity(model, views, metric=True, threads=threads) for threads in (1, 2))
+    for name in ("colour", "opacity", "shape", "shape_net", "shape_metric", "means_squares", "metric", "views"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
+
+
+def test_what_no_view_sees_has_none():
+    model = small_scene(10)
+    away = np.where(np.arange(10)[:, None] < 3, np.float32(100.0), model.means)
+    found = measure_sensitivity(replace(model, means=away), cameras())
+    assert [False] * 3 + [True] * 7 == found.seen.tolist()
+    assert 0.3 == pytest.approx(found.unseen_share)
+    assert 0.0 == max(found.colour[:3].max(), found.shape[:3].max(), found.opacity[:3].max())
+
+
+def test_wants_a_camera():
+    with pytest.raises(InputError, match="camera"):
+        measure_sensitivity(small_scene(), [])
+
+
+# Files.
+
+
+@pytest.fixture
+def stored(tmp_path):
+    model = small_scene(30, 2)
+    found = measure_sensitivity(model, cameras(), metric=True)
+    path = tmp_path / "scene.npz"
+    with path.open("wb") as stream:
+        write_sensitivity(stream, model, found, "cameras")
+    return path, model, found
+
+
+def test_a_file_gives_back_what_was_written(stored):
+    path, model, found = stored
+    read = read_sensitivity(path, model)
+    assert ("cameras", 2) == (read.source, read.view_count)
+    assert np.isnan(read.missed_share)
+    for name in GROUPS:
+        np.testing.assert_array_equal(getattr(found, name).astype(np.float32), read.groups[name], name)
+    importance = read.importance()
+    assert (30, 36) == importance.sh_metric.shape
+    assert (30, 21) == importance.shape_metric.shape
+    rows, columns = np.triu_indices(8)
+    np.testing.assert_allclose(1.0, importance.sh_metric[:, rows == columns].mean(axis=1), rtol=1e-3)
+
+
+def test_a_file_is_refused_for_another_scene(stored):
+    path, model, _ = stored
+    with pytest.raises(InputError, match="30 splats, the scene has 29"):
+        read_sensitivity(path, model.select(np.arange(29)))
+    with pytest.raises(InputError, match="another scene"):
+        read_sensitivity(path, replace(model, sh0=model.sh0 + np.float32(0.5)))
+
+
+def test_damaged_files_are_refused(stored):
+    path, model, _ = stored
+    data = path.read_bytes()
+    for bad in (b"", b"PK", data[: len(data) // 2], data[:-30], b"nonsense" * 10):
+        path.write_bytes(bad)
+        with pytest.raises(InputError, match="no file of sensitivities"):
+            read_sensitivity(path, model)
+    with path.open("wb") as stream:
+        np.savez(stream, colour=np.ones(30))
+    with pytest.raises(InputError, match="no file of sensitivities"):
+        read_sensitivity(path, model)
+
+
+def test_never_seen_splats_weigh_a_little(stored):
+    path, model, _ = stored
+    away = np.where(np.arange(30)[:, None] < 3, np.float32(100.0), model.means)
+    model = replace(model, means=away)
+    with path.open("wb") as stream:
+        write_sensitivity(stream, model, measure_sensitivity(model, cameras(), metric=True), "virtual")
+    read = read_sensitivity(path, model)
+    weights = read.importance().sh
+    assert 3 == np.count_nonzero(~read.seen)
+    assert 0.0 < weights[:3].max() < np.median(weights[3:])
+    assert np.isfinite(read.importance().sh_metric).all()
+
+
+# The command line.
+
+
+def run(*words):
+    return subprocess.run(
+        [sys.executable, "-m", "csplat_tools", *map(str, words)], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture
+def camera_file(tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([camera.to_json() for camera in cameras(3)]))
+    return path
+
+
+def test_the_command_measures_what_encode_takes(tmp_path, camera_file):
+    model = small_scene(400, 1)
+    away = np.where(np.arange(400)[:, None] < 40, np.float32(100.0), model.means)
+    model = replace(model, means=away)
+    ply, npz, out, index = (tmp_path / name for name in ("s.ply", "s.npz", "s.csplat", "s.npy"))
+    write_ply(ply, model)
+    done = run("sensitivity", ply, npz, "--cameras", camera_file, "--json", "--quiet")
+    assert 0 == done.returncode, done.stderr
+    facts = json.loads(done.stdout)
+    assert (400, 3, "cameras") == (facts["splats"], facts["views"], facts["source"])
+    unseen = facts["unseen"]
+    assert 40 <= unseen < 400
+    assert 1 == run("sensitivity", ply, npz, "--cameras", camera_file).returncode  # not without --force
+    done = run("encode", ply, out, "--importance", npz, "--prune-unseen", "--source-index", index, "--json")
+    assert 0 == done.returncode, done.stderr
+    assert 400 - unseen == json.loads(done.stdout)["splats"]
+    assert set(range(400)) - set(np.load(index).tolist()) >= set(range(40))
+    checked = run("verify", out, "--source", ply, "--source-index", index)
+    assert 0 == checked.returncode, checked.stderr
+
+
+def test_the_command_makes_views_where_there_are_none(tmp_path, sample_path):
+    done = run("sensitivity", sample_path, tmp_path / "s.npz", "--views", "20", "--no-matrices")
+    assert 0 == done.returncode, done.stderr
+    assert "20 virtual views" in done.stderr
+    assert read_sensitivity(tmp_path / "s.npz", read_ply(sample_path)).matrices is None
+
+
+def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
+    out = tmp_path / "out.npz"
+    assert 2 == run("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).returncode
+    assert 2 == run("sensitivity", sample_path, "-").returncode
+    assert 2 == run("encode", sample_path, tmp_path / "o.csplat", "--prune-unseen").returncode
+    np.save(tmp_path / "w.npy", np.ones(3))
+    done = run("encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "--prune-unseen", "-q")
+    assert 1 == done.returncode
+    assert 1 == len(done.stderr.splitlines())

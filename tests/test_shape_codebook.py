@@ -1,0 +1,230 @@
+"""Codebooks of shapes: files that both decoders read, smaller than without, the same at any number of threads."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import absent
+
+import csplat
+from csplat import _spec
+from csplat.decoder import decode_scene
+from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.encoder.between import Between
+from csplat.encoder.gauge import fix_gauge
+from csplat.encoder.measure import covariance_entries, measure_errors
+from csplat.encoder.shape_covariances import mean_axes, unit_covariances
+from csplat.errors import InputError
+from csplat.model import normalise_quats
+from csplat_conformance.validator import validate
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def few_shapes(make_model, count=4000, kinds=12, seed=0, degree=1, **fields):
+    """A model whose splats have a few shapes, up to size and a little noise."""
+    rng = np.random.default_rng(seed)
+    kind = rng.integers(0, kinds, count)
+    quats = normalise_quats(rng.normal(size=(kinds, 4)))[kind] + rng.normal(0, 0.01, (count, 4))
+    scales = rng.normal(0, 1, (kinds, 3))[kind] + rng.normal(-4, 0.7, (count, 1)) + rng.normal(0, 0.02, (count, 3))
+    arrays = {"quats": normalise_quats(quats.astype(np.float32)), "scales": scales.astype(np.float32)}
+    return make_model(count, degree, **{**arrays, **fields})
+
+
+def seen_more(model, seed=1):
+    """Weights and matrices as cameras might give them."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(len(model), 6, 3))
+    matrices = roots @ roots.transpose(0, 2, 1)
+    matrices *= (6 / np.einsum("nii->n", matrices))[:, None, None]
+    weights = rng.lognormal(0, 2, len(model))
+    rows, columns = np.triu_indices(6)
+    return Importance(weights, weights, None, matrices[:, rows, columns])
+
+
+def encoded(model, importance=None, **options):
+    """Encode, and check what must hold of any file."""
+    result = encode_with_report(model, EncodeOptions(**options), importance=importance)
+    assert () == tuple(validate(result.data).violations)
+    decoded = csplat.decode(result.data)
+    for name, (largest, rms) in measure_errors(model, decoded, result.source_index).items():
+        assert largest <= result.report.errors[name][0], name
+        assert rms <= result.report.errors[name][1], name
+    return result, decoded
+
+
+def books(data):
+    return [book for book in decode_scene(data).header.codebooks if book.kind == _spec.CODEBOOK_KIND_SHAPE]
+
+
+@pytest.mark.parametrize("matrices", [False, True])
+@pytest.mark.parametrize("tile_splats", [65536, 700])
+@pytest.mark.parametrize("escapes", [None, 0.0, 0.3])
+def test_comes_back_smaller_and_within_stated_errors(make_model, matrices, tile_splats, escapes):
+    model = few_shapes(make_model)
+    importance = seen_more(model) if matrices else None
+    options = {"sh_coding": "none", "tile_splats": tile_splats}
+    plain, _ = encoded(model, importance, **options)
+    result, _ = encoded(model, importance, shape_codebook_size=64, shape_escape_fraction=escapes, **options)
+    assert len(result.data) < len(plain.data)
+    assert 1 <= result.report.options["shape_codebook_size"] <= 64
+    assert [result.report.options["shape_codebook_size"]] == [book.sizes[0] for book in books(result.data)]
+
+
+def test_stands_beside_codebooks_of_colour(make_model):
+    model = few_shapes(make_model, degree=2)
+    for coding in ("codebook", "scalar"):
+        result, decoded = encoded(model, sh_coding=coding, shape_codebook_size=32)
+        assert 1 == len(books(result.data))
+        assert 2 == decoded.sh_degree
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 60, 1000])
+def test_is_never_larger_than_without(make_model, count):
+    model = make_model(count, 1)  # random shapes: nothing to gain
+    plain, _ = encoded(model)
+    result, _ = encoded(model, shape_codebook_size=4096)
+    assert len(result.data) <= len(plain.data) + len('"shape_codebook_size":4096,')  # it says what was asked
+    if count < 1000:
+        assert not books(result.data)
+
+
+def test_splats_of_one_shape_share_an_entry(make_model):
+    model = few_shapes(make_model, 3000, 1)
+    result, decoded = encoded(model, shape_codebook_size=1, shape_escape_fraction=0.0, sh_coding="none")
+    rotations = {tuple(row) for row in decoded.quats}
+    assert 1 == len(rotations)
+    trace = [0.5 * np.log(np.exp(2.0 * m.scales.astype(np.float64)).sum(axis=1)) for m in (model, decoded)]
+    step = result.report.options["scale_step"]
+    assert np.abs(trace[0][result.source_index] - trace[1]).max() <= 0.5 * step * (1 + 1e-6)
+
+
+def test_no_entry_is_dead_and_frequent_ones_come_first(make_model):
+    model = few_shapes(make_model, kinds=40)
+    result, decoded = encoded(model, seen_more(model), shape_codebook_size=200, sh_coding="none")
+    (book,) = books(result.data)
+    shapes, counts = np.unique(decoded.quats, axis=0, return_counts=True)
+    assert book.sizes[0] <= 200
+    assert len(shapes) >= 0.5 * book.sizes[0]  # entries of one rotation may differ in scales
+    assert counts.max() > 1
+
+
+def test_what_weighs_more_is_served_better(make_model):
+    model = make_model(3000, 0)
+    heavy = np.arange(3000) % 10 == 0
+    importance = Importance(np.ones(3000), np.where(heavy, 1.0, 1e-4))
+    options = {"shape_codebook_size": 100, "shape_escape_fraction": 0.0}
+    result, decoded = encoded(model, importance, **options)
+    errors = covariance_entries(decoded.quats.T, np.exp(2.0 * decoded.scales.T.astype(np.float64)))
+    source = model.select(result.source_index)
+    wanted = covariance_entries(source.quats.T, np.exp(2.0 * source.scales.T.astype(np.float64)))
+    relative = np.linalg.norm(errors - wanted, axis=0) / np.linalg.norm(wanted, axis=0)
+    chosen = heavy[result.source_index]
+    assert np.median(relative[chosen]) < 0.8 * np.median(relative[~chosen])
+
+
+def test_huge_scales_leave_their_tile_without(make_model):
+    model = few_shapes(make_model)
+    scales = model.scales.copy()
+    scales[17] = 3e8
+    result, _ = encoded(replace(model, scales=scales), shape_codebook_size=16, tile_splats=1000, scale_step=0.05)
+    assert books(result.data)
+
+
+def test_whoever_fits_colours_is_shown_the_decoded_shapes(make_model):
+    model = few_shapes(make_model, degree=0)
+    shown = []
+
+    def colours(scene):
+        shown.append(scene)
+        return scene.sh0, scene.shN
+
+    between = Between(len(model), np.arange(len(model)), colours)
+    result = encode_with_report(model, EncodeOptions(shape_codebook_size=16), between=between)
+    decoded = csplat.decode(result.data)
+    for name in ("means", "quats", "scales", "opacities"):
+        np.testing.assert_array_equal(getattr(shown[0], name)[result.source_index], getattr(decoded, name))
+
+
+def test_matrices_that_do_not_fit_are_refused(make_model):
+    model = few_shapes(make_model, 200)
+    for bad in (np.ones((200, 20)), np.ones((199, 21)), np.ones((200, 21), int), np.full((200, 21), np.nan)):
+        with pytest.raises(InputError, match="shape matrices"):
+            encode_with_report(
+                model, EncodeOptions(shape_codebook_size=4), importance=Importance(np.ones(200), None, None, bad)
+            )
+
+
+def test_axes_of_covariances_come_back():
+    rng = np.random.default_rng(0)
+    quats, scales = normalise_quats(rng.normal(size=(300, 4)).astype(np.float32)), rng.normal(0, 1, (300, 3))
+    covariances, sizes = unit_covariances(quats.T, scales.T)
+    np.testing.assert_allclose(1.0, covariances[:3].sum(axis=0), rtol=1e-12)
+    rotation, found = fix_gauge(*mean_axes(covariances))
+    again, zero = unit_covariances(rotation, found)
+    np.testing.assert_allclose(covariances, again, atol=1e-6)
+    np.testing.assert_allclose(0.0, zero, atol=1e-6)
+    np.testing.assert_allclose(np.sort(scales - sizes[:, None], axis=1), np.sort(found.T, axis=1), atol=1e-3)
+
+
+HASH = """
+import hashlib, sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from csplat import EncodeOptions, SplatModel
+from csplat.encoder import Importance, encode_with_report
+rng = np.random.default_rng(4)
+n = 5000
+normal = lambda *shape: rng.standard_normal((n, *shape)).astype(np.float32)
+quats = normal(4)
+quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+model = SplatModel(means=normal(3), quats=quats, scales=normal(3) - 4, opacities=rng.random(n).astype(np.float32),
+                   sh0=normal(3), shN=normal(8, 3))
+def matrices(size):
+    roots = rng.normal(size=(n, size, 3))
+    full = roots @ roots.transpose(0, 2, 1) / 3
+    rows, columns = np.triu_indices(size)
+    return full[:, rows, columns]
+importance = Importance(rng.random(n), rng.random(n), matrices(8), matrices(6))
+options = EncodeOptions(sh_coding="codebook", shape_codebook_size=300, tile_splats=2000, threads=int(sys.argv[2]))
+print(hashlib.sha256(encode_with_report(model, options, importance=importance).data).hexdigest())
+"""
+
+
+def test_same_bytes_at_any_number_of_threads():
+    found = set()
+    for ours, blas in (("1", "1"), ("2", "2"), ("3", "2")):
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": blas}
+        done = subprocess.run(
+            [sys.executable, "-c", HASH, str(ROOT / "codec"), ours],
+            env=environment, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        found.add(done.stdout.strip())
+    assert 1 == len(found)
+    assert len(hashlib.sha256().hexdigest()) == len(found.pop())
+
+
+def test_the_javascript_decoder_reads_them_too(make_model, tmp_path):
+    if shutil.which("node") is None:
+        absent("the JavaScript decoder needs Node.js, which is not installed")
+    model = few_shapes(make_model, degree=2)
+    for name, options in (
+        ("escapes", {"shape_escape_fraction": 0.3, "tile_splats": 900}),
+        ("none", {"shape_escape_fraction": 0.0}),
+        ("chosen", {"sh_coding": "codebook"}),
+    ):
+        result, _ = encoded(model, seen_more(model), shape_codebook_size=40, **options)
+        assert books(result.data)
+        (tmp_path / f"{name}.csplat").write_bytes(result.data)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tools/benchmarks/decoders.py"), *map(str, sorted(tmp_path.glob("*.csplat")))],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert 0 == done.returncode, done.stderr
+    assert "3 of 3 files agree" == done.stdout.splitlines()[-1]

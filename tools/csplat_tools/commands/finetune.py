@@ -1,0 +1,194 @@
+"""`csplat finetune`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from csplat.encoder import EncodeOptions
+from csplat.errors import InputError
+from csplat_tools.commands.encoder_knobs import with_encoder_knobs
+from csplat_tools.console import guarded, note, say_json
+from csplat_tools.extras import need_trainer
+from csplat_tools.inout import STANDARD_STREAM, check_output
+from csplat_tools.parsing import parse_colour, parse_size
+
+__all__ = ["finetune"]
+
+_LIKE = "What the file is to look like (one of --data and --self)"
+_FILES = "Files on the way"
+_HOW = "How"
+
+# Steps and the factor of learning rates, by photographs and by the scene's own renders. Those can be met almost
+# exactly: what long steps lose of that, short ones take long to find again.
+_STEPS = {False: 2_000, True: 800}
+_FACTOR = {False: 1.0, True: 0.25}
+
+
+@guarded
+@with_encoder_knobs
+def finetune(
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
+    encoding: EncodeOptions,
+    output: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write.")],
+    data: Annotated[
+        str | None,
+        typer.Option(metavar="DATA", rich_help_panel=_LIKE, help="Posed photographs; those held out judge."),
+    ] = None,
+    itself: Annotated[
+        bool, typer.Option("--self", rich_help_panel=_LIKE, help="The scene's own renders, from all around.")
+    ] = False,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="Scale the photographs to this size.")
+    ] = None,
+    images: Annotated[
+        str | None, typer.Option(metavar="NAME", rich_help_panel=_LIKE, help="COLMAP: folder of pictures, images_4.")
+    ] = None,
+    test_every: Annotated[
+        int, typer.Option(metavar="N", rich_help_panel=_LIKE, help="Hold out every Nth photograph; see `train`.")
+    ] = 8,
+    near: Annotated[
+        float | None, typer.Option(metavar="UNITS", rich_help_panel=_LIKE, help="Near plane of the photographs.")
+    ] = None,
+    cameras: Annotated[
+        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_LIKE, help="With --self: your own cameras.")
+    ] = None,
+    views: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views.")
+    ] = 96,
+    view_size: Annotated[
+        str, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="With --self: of the virtual views.")
+    ] = "320x240",
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="R,G,B", rich_help_panel=_LIKE, help="As in training; black, but white behind alpha."),
+    ] = None,
+    aside: Annotated[
+        int,
+        typer.Option(
+            metavar="N", min=0, rich_help_panel=_LIKE, help="Views that judge and do not teach; 0: the ones that teach."
+        ),
+    ] = 0,
+    keep: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", rich_help_panel=_HOW, help="Remove what pictures need least first."),
+    ] = None,
+    prune_unseen: Annotated[
+        bool | None,
+        typer.Option(
+            "--prune-unseen/--keep-unseen",
+            rich_help_panel=_HOW,
+            help="Leave out splats that no view shows; by default with --data.",
+        ),
+    ] = None,
+    importance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE", rich_help_panel=_HOW, help="As for `encode`; without it, what the views say themselves."
+        ),
+    ] = None,
+    iterations: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, rich_help_panel=_HOW, help="Steps at most: 2000, or 800 with --self."),
+    ] = None,
+    lr_factor: Annotated[
+        float | None,
+        typer.Option(metavar="FACTOR", rich_help_panel=_HOW, help="Of all learning rates: 1, or 0.25 with --self."),
+    ] = None,
+    byte_cost: Annotated[
+        float,
+        typer.Option(metavar="COST", rich_help_panel=_HOW, help="What a bit per splat weighs in the loss; 0: nothing."),
+    ] = 2e-4,
+    patience: Annotated[
+        int,
+        typer.Option(metavar="N", min=0, rich_help_panel=_HOW, help="Late looks without a gain that end it; 0: none."),
+    ] = 4,
+    lpips: Annotated[
+        str | None, typer.Option(metavar="WEIGHTS.npz", help="Report LPIPS (Alex) with these weights, or `auto`.")
+    ] = None,
+    report: Annotated[
+        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_FILES, help="What came of it, for programs.")
+    ] = None,
+    log: Annotated[
+        str | None, typer.Option("--json", metavar="LOG", rich_help_panel=_FILES, help="Options, losses, looks.")
+    ] = None,
+    checkpoint: Annotated[
+        str | None, typer.Option(metavar="FILE.npz", rich_help_panel=_FILES, help="Where checkpoints go.")
+    ] = None,
+    checkpoint_every: Annotated[
+        int, typer.Option(metavar="N", min=0, rich_help_panel=_FILES, help="Steps; 0: at the end alone.")
+    ] = 0,
+    resume: Annotated[
+        str | None, typer.Option(metavar="FILE.npz", rich_help_panel=_FILES, help="Go on from this checkpoint.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    as_text: Annotated[bool, typer.Option("--say-json", help="The report on standard output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
+) -> None:
+    """Compress a scene, and tune what the file holds until it looks right.
+
+    The encoder decides lattices, tiles and codebooks once. Then the values
+    move, seen through the encoder's own quantisers, until pictures of what a
+    decoder will see look like the photographs; without photographs, like the
+    scene itself. What looks best for its bytes is written. Needs the
+    packages of the render extra.
+
+    Examples:
+      csplat finetune scene.ply --data capture -o scene.csplat --preset small
+      csplat finetune scene.ply --data capture -o scene.csplat --quality 40 --report scene.json
+      csplat finetune scene.ply --data capture -o scene.csplat --keep 0.5
+      csplat finetune scene.ply --self -o scene.csplat --views 160
+      csplat finetune scene.ply --data capture -o scene.csplat --checkpoint run.npz --resume run.npz
+    """
+    need_trainer()
+    from csplat_tools.finetune_report import format_report
+    from csplat_tools.finetune_sources import Sources
+    from csplat_tools.finetuning import Files, run_finetuning
+    from csplat_trainer.finetune.options import FinetuneOptions
+
+    if (data is None) != itself:
+        raise typer.BadParameter("wanted one of --data and --self")
+    if keep is not None and not 0.0 < keep <= 1.0:
+        raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
+    if data is not None and cameras is not None:
+        raise typer.BadParameter("--cameras goes with --self")
+    try:
+        options = FinetuneOptions(
+            iterations=iterations or _STEPS[itself], seed=encoding.seed, byte_cost=byte_cost, patience=patience
+        ).scaled(_FACTOR[itself] if lr_factor is None else lr_factor)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    if STANDARD_STREAM in (report, log, checkpoint):
+        raise typer.BadParameter("--report, --json and --checkpoint want names of files")
+    if as_text and output == STANDARD_STREAM:
+        raise typer.BadParameter("--say-json and - both want standard output")
+    inputs = tuple(path for path in (source, resume, importance, cameras) if path is not None)
+    check_output(output, force=force, inputs=inputs)
+    for path in (report, log):
+        if path is not None:
+            check_output(path, force=force, inputs=(*inputs, output))
+    if checkpoint is not None:
+        again = resume is not None and Path(checkpoint).exists() and Path(checkpoint).samefile(resume)
+        check_output(checkpoint, force=force or again)
+    sources = Sources(
+        data,
+        None if size is None else parse_size(size),
+        images,
+        test_every,
+        near,
+        cameras,
+        views,
+        parse_size(view_size),
+        None if background is None else parse_colour(background),
+        aside,
+        keep,
+        prune_unseen,
+    )
+    files = Files(source, output, importance, log, report, checkpoint, checkpoint_every, resume, lpips)
+    found = run_finetuning(files, encoding, sources, options, quiet=quiet)
+    if as_text:
+        say_json(found)
+    elif not quiet:
+        note(format_report(found))

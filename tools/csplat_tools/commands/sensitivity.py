@@ -1,0 +1,92 @@
+"""`csplat sensitivity`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from csplat_tools.console import format_table, guarded, note, progress_bar, say_json
+from csplat_tools.extras import prepare_renderer
+from csplat_tools.importances import Measured, Wanted, measure_scene
+from csplat_tools.inout import STANDARD_STREAM, check_output
+from csplat_tools.models import load_model
+from csplat_tools.parsing import parse_colour, parse_size
+
+__all__ = ["sensitivity"]
+
+_VIEWS = "Views"
+
+_SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
+
+
+@guarded
+def sensitivity(
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY or .csplat file, or - for standard input.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.npz", help="The file to write.")],
+    data: Annotated[
+        str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views.")
+    ] = None,
+    cameras: Annotated[
+        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own; else virtual ones.")
+    ] = None,
+    views: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
+    ] = 160,
+    view_size: Annotated[
+        str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="How large virtual views are.")
+    ] = "240x180",
+    background: Annotated[
+        str, typer.Option(metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, white, or 0..1.")
+    ] = "black",
+    matrices: Annotated[
+        bool,
+        typer.Option("--matrices/--no-matrices", help="How SH errors add up, for codebooks; 240 bytes per splat."),
+    ] = True,
+    seed: Annotated[int, typer.Option(min=0, help="Of the virtual views.")] = 0,
+    threads: Annotated[int | None, typer.Option(min=1, help="One per core by default; the result stays.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="What was found on standard output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
+) -> None:
+    """Measure how much pictures depend on each splat, attribute by attribute.
+
+    The file goes to `csplat encode --importance`, which then spends bytes where
+    they show. It belongs to this scene alone. Training views say most; without
+    them virtual ones are made, as many as it takes until they agree. Needs the
+    packages of the render extra.
+
+    Examples:
+      csplat sensitivity scene.ply scene.npz --data photographs
+      csplat encode scene.ply scene.csplat --importance scene.npz
+    """
+    if output == STANDARD_STREAM:
+        raise typer.BadParameter("OUT.npz wants the name of a file")
+    if data is not None and cameras is not None:
+        raise typer.BadParameter("--data and --cameras both say where to look from: give one of them")
+    wanted = Wanted(cameras, data, parse_size(view_size), views, parse_colour(background), matrices, seed, threads)
+    check_output(output, force=force, inputs=tuple(path for path in (source, cameras) if path is not None))
+    prepare_renderer(quiet=quiet, simplify=data is None and cameras is None)  # virtual views are looked for
+    model = load_model(source).model
+    with progress_bar(quiet=quiet) as progress:
+        measured = measure_scene(model, wanted, progress)
+    measured.write(output)
+    if as_json:
+        say_json(measured.as_json())
+    elif not quiet:
+        _tell(measured)
+
+
+def _tell(measured: Measured) -> None:
+    facts = measured.as_json()
+    note(
+        f"{facts['splats']} splats from {facts['views']} {facts['source']} views; no view saw {facts['unseen']} of them"
+        f" ({100.0 * facts['unseen_share']:.2f} %)"
+    )
+    if facts["missed_share"] is not None:
+        note(f"views that were kept aside saw {100.0 * facts['missed_share']:.2f} % more of the splats")
+    rows = [
+        (label, *(f"{facts['quantiles'][name][q]:.3g}" for q in ("0.5", "0.9", "0.99", "1.0")))
+        for name, label in _SHOWN.items()
+    ]
+    note(format_table(("sensitivity", "median", "90 %", "99 %", "largest"), rows))

@@ -1,0 +1,182 @@
+"""From a scene and pictures to a file that was tuned to look like them: the work of `csplat finetune`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, EncodeResult
+from csplat.encoder.between import Between
+from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_tools.console import note, progress_bar
+from csplat_tools.finetune_report import as_report
+from csplat_tools.finetune_sources import Looks, Sources, choose_splats
+from csplat_tools.inout import ply_path, write_bytes
+
+if TYPE_CHECKING:
+    from csplat_trainer.finetune import FinetuneOptions, Moment
+
+__all__ = ["Files", "run_finetuning"]
+
+I64 = NDArray[np.int64]
+
+_LINES = 10  # of progress where there is no terminal
+
+
+@dataclass(frozen=True)
+class Files:
+    """What is read and written; `None`: not wanted.
+
+    Attributes:
+        source: a PLY. output: the file to write.
+        importance: weights of the splats, see `choose_splats`.
+        log: options, losses and looks as JSON. report: what came of it as JSON.
+        checkpoint, checkpoint_every, resume: as for `csplat_trainer.finetune.finetune`.
+        lpips: a file of weights, or `auto`.
+    """
+
+    source: str
+    output: str
+    importance: str | None = None
+    log: str | None = None
+    report: str | None = None
+    checkpoint: str | None = None
+    checkpoint_every: int = 0
+    resume: str | None = None
+    lpips: str | None = None
+
+
+@dataclass
+class _Clock:
+    """Seconds by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
+
+
+def run_finetuning(
+    files: Files, encoding: EncodeOptions, sources: Sources, options: FinetuneOptions, *, quiet: bool
+) -> dict[str, Any]:
+    """Read, prune, freeze, tune, write, judge.
+
+    Returns:
+        The report, JSON-compatible.
+
+    Raises:
+        CsplatError: a file or an option cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    from csplat_render.jit import thread_count
+    from csplat_render.lpips import load_lpips
+    from csplat_render.warmup import warm_up
+    from csplat_trainer.finetune import finetune
+    from csplat_trainer.report import write_log
+
+    clock, threads = _Clock(), encoding.threads
+    distance = None if files.lpips is None else load_lpips(None if files.lpips == "auto" else files.lpips)
+    with clock.stage("reading"):
+        source = _read(files.source, encoding, quiet=quiet)
+        looks = Looks.read(source, sources, quiet=quiet)
+    with thread_count(threads):
+        warm_up(None if quiet else note)
+        with progress_bar(quiet=quiet) as progress:
+            with clock.stage("choosing"):
+                views = looks.views(source, sources, threads)
+                chosen = choose_splats(source, looks, sources, files.importance, threads, progress)
+            with clock.stage("encoding"):
+                between = Between(len(source), chosen.rows)
+                frozen = freeze(
+                    chosen.model, encoding, importance=chosen.importance, between=between, source=source,
+                    progress=progress,
+                )  # fmt: skip
+                plain = encode_frozen(frozen, frozen.start())
+        with clock.stage("tuning"), _shown(options, quiet=quiet) as show:
+            tuned = finetune(
+                frozen, views, options, progress=show, checkpoint=files.checkpoint,
+                checkpoint_every=files.checkpoint_every, resume=files.resume, threads=threads,
+            )  # fmt: skip
+        with clock.stage("encoding"):
+            said = {"views": len(views.train), "steps": tuned.log["best_iteration"], **chosen.said}
+            result = encode_frozen(frozen, tuned.held, said)
+            decoded = decode(result.data)
+        _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
+        write_bytes(files.output, result.data)
+        with clock.stage("judging"):
+            models = {"source": source, "before tuning": decode(plain.data), "file": decoded}
+            judged = looks.judge(source, models, distance, threads)
+    report = as_report(source, plain, result, judged, tuned.log, clock.seconds, chosen.said)
+    if files.log is not None:
+        write_log(files.log, {**tuned.log, "encoding": result.report.options, "seconds_by_stage": clock.seconds})
+    if files.report is not None:
+        write_log(files.report, report)
+    return report
+
+
+def _read(path: str, encoding: EncodeOptions, *, quiet: bool) -> SplatModel:
+    findings: list[Finding] = []
+    with ply_path(path) as local:
+        model = read_ply(local, keep_extra=encoding.keep_extra, report=findings)
+    for finding in findings:
+        if not quiet or finding.kind == "repair":
+            note(str(finding))
+    return model
+
+
+def _check_identity(seen: Any, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
+    """What was tuned is what was written: bit for bit."""
+    places = np.empty(int(source_index.max()) + 1, np.int64)
+    places[source_index] = np.arange(len(source_index))
+    rows = places[result.source_index]
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]), f"{name} was tuned as something else"
+
+
+@contextmanager
+def _shown(options: FinetuneOptions, *, quiet: bool) -> Iterator[Callable[[Moment], None] | None]:
+    """A bar on a terminal, some lines elsewhere, nothing where nothing is wanted."""
+    if quiet:
+        yield None
+        return
+    if not sys.stderr.isatty():
+        every = max(1, options.iterations // _LINES)
+
+        def tell(now: Moment) -> None:
+            last = now.iteration - options.log_every
+            if now.iteration // every > last // every or now.iteration == now.iterations:
+                note(_state(now))
+
+        yield tell
+        return
+    with Bar(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("tuning", total=options.iterations)
+
+        def show(now: Moment) -> None:
+            bar.update(task, completed=now.iteration, description=_state(now))
+
+        yield show
+
+
+def _state(now: Moment) -> str:
+    return (
+        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, validation {now.validation_psnr:.2f} dB"
+        f" (best {now.best_psnr:.2f}), {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
+    )

@@ -1,0 +1,138 @@
+"""How much splats matter: measured from views for `csplat sensitivity`, read from files for `csplat encode`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.importance import Importance
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.model import SplatModel
+from csplat_tools.inout import read_array
+from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, read_sensitivity, write_sensitivity
+
+if TYPE_CHECKING:
+    from csplat_trainer.sensitivity import Sensitivity
+
+__all__ = ["Measured", "Wanted", "measure_scene", "read_importance"]
+
+Progress = Callable[[str, float], None]
+
+_ZIP = b"PK"  # what a .npz begins with
+_GONE = 0.4  # share of the splats for whose removal virtual views have to agree before there are enough
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command line says.
+
+    Attributes:
+        cameras: a camera file, relative to the scene's origin; or `None`.
+        data: a data set, whose training views are used; or `None`.
+        size: width and height of virtual views.
+        views: virtual views at most.
+        background: red, green, blue behind everything.
+        matrices: measure the matrices of SH coefficients too.
+        seed: of the virtual views. threads: how many; `None` for all.
+    """
+
+    cameras: str | None
+    data: str | None
+    size: tuple[int, int]
+    views: int
+    background: tuple[float, float, float]
+    matrices: bool
+    seed: int
+    threads: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What was found.
+
+    Attributes:
+        model: the scene. found: by splat.
+        source: where the views came from, see `sensitivity_file.SOURCES`.
+        missed_share: share of the splats that only views that were kept aside saw; NaN where none were.
+    """
+
+    model: SplatModel
+    found: Sensitivity
+    source: str
+    missed_share: float
+
+    def write(self, path: str) -> None:
+        """Write the file, all of it or nothing."""
+        with atomic_writer(path) as stream:
+            write_sensitivity(stream, self.model, self.found, self.source, self.missed_share)
+
+    def as_json(self) -> dict[str, Any]:
+        """Counts, shares, and quantiles of every group, JSON-compatible."""
+        at = (0.0, 0.5, 0.9, 0.99, 1.0)
+        return {
+            "splats": len(self.model),
+            "views": self.found.view_count,
+            "pixels": self.found.pixel_count,
+            "source": self.source,
+            "unseen": int(np.count_nonzero(~self.found.seen)),
+            "unseen_share": self.found.unseen_share,
+            "missed_share": None if np.isnan(self.missed_share) else self.missed_share,
+            "quantiles": {
+                name: {str(q): float(np.quantile(getattr(self.found, name), q)) for q in at} if len(self.model) else {}
+                for name in GROUPS
+            },
+        }
+
+
+def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None = None) -> Measured:
+    """Measure a scene from what views there are.
+
+    Raises:
+        InputError: there are no splats, or no views, or they cannot be read.
+    """
+    from csplat_render.removal import measure_removal
+    from csplat_tools.simplify.files import find_sights
+    from csplat_tools.simplify.views import find_views
+    from csplat_trainer.sensitivity import measure_sensitivity
+
+    if not len(model):
+        raise InputError("a scene without splats has no sensitivities")
+    sights = find_sights(model, wanted.cameras, wanted.data, judged=False, background=wanted.background)
+    cameras, check = sights.cameras, []
+    source = "virtual" if cameras is None else "cameras" if wanted.data is None else "training"
+    if cameras is None:
+        views = find_views(
+            model, None, _GONE, size=wanted.size, most=wanted.views, seed=wanted.seed, background=wanted.background,
+            threads=wanted.threads, progress=progress,
+        )  # fmt: skip
+        cameras, check = views.used, views.check
+    if progress is not None:
+        progress("compiling", 0.0)  # the first time takes some seconds
+        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=wanted.matrices)
+        progress("compiling", 1.0)
+    found = measure_sensitivity(
+        model, cameras, background=wanted.background, metric=wanted.matrices, threads=wanted.threads, progress=progress
+    )
+    missed = float("nan")
+    if check:
+        elsewhere = measure_removal(model, check, background=wanted.background, threads=wanted.threads).seen
+        missed = float(np.mean(elsewhere & ~found.seen))
+    return Measured(model, found, source, missed)
+
+
+def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance | StoredSensitivity:
+    """Read weights from a .npy file, or sensitivities from a .npz file.
+
+    Raises:
+        InputError: it is neither, or is about another scene.
+        OSError: it cannot be read.
+    """
+    with Path(path).open("rb") as stream:
+        begin = stream.read(len(_ZIP))
+    return read_sensitivity(path, model) if begin == _ZIP else read_array(path)

@@ -1,0 +1,135 @@
+"""Checkpoints of fine-tuning: everything a run needs to go on as if it had not stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.frozen import Frozen, Held
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat_trainer.parameters import GROUPS, Parameters
+
+__all__ = ["FinetuneCheckpoint", "load_finetune", "save_finetune"]
+
+_VERSION = 1
+_KIND = "csplat finetune"
+_HELD = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
+_GROUPS = (*GROUPS, "sizes")
+
+
+@dataclass
+class FinetuneCheckpoint:
+    """A run between two steps.
+
+    Attributes:
+        iteration: steps that were made.
+        parameters: the values, with Adam's memory.
+        rng_state: of the generator of the order of pictures, JSON-compatible.
+        queue: pictures that are still to come in this round.
+        options: of the run, as a dictionary.
+        log: what was logged so far.
+        best_held: the best values so far.
+        costs: slopes of the costs of bytes by attribute, as they were last counted; empty if they never were.
+        best: their score and PSNR on the validation views, the step that they stood at, how many looks came after.
+    """
+
+    iteration: int
+    parameters: Parameters
+    rng_state: dict[str, Any]
+    queue: list[int]
+    options: dict[str, Any]
+    log: dict[str, Any]
+    best_held: Held
+    costs: dict[str, NDArray[np.float32]]
+    best: tuple[float, float, int, int]
+
+
+def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: Frozen) -> None:
+    """Write a checkpoint; the file appears under its name only when it is complete."""
+    facts = {
+        "kind": _KIND,
+        "version": _VERSION,
+        "frozen": fingerprint(frozen),
+        "iteration": checkpoint.iteration,
+        "step": checkpoint.parameters.step,
+        "rng_state": checkpoint.rng_state,
+        "queue": checkpoint.queue,
+        "options": checkpoint.options,
+        "log": checkpoint.log,
+        "best": list(checkpoint.best),
+    }
+    arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
+    for kind in ("values", "first", "second"):
+        arrays |= {f"{kind}_{name}": getattr(checkpoint.parameters, kind)[name] for name in _GROUPS}
+    arrays |= {f"best_{name}": getattr(checkpoint.best_held, name) for name in _HELD}
+    arrays |= {f"costs_{name}": table for name, table in checkpoint.costs.items()}
+    with atomic_writer(str(path)) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
+    """Read a checkpoint of a frozen scene.
+
+    Raises:
+        InputError: the file is no checkpoint, was written by another version, or for another scene or other options
+            of the encoder.
+        OSError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            facts = json.loads(stored["facts"].tobytes())
+            if facts.get("kind") != _KIND:
+                raise ValueError("it is of another kind")
+            parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
+            best = Held(*(stored[f"best_{name}"] for name in _HELD))
+            costs = {name[6:]: stored[name] for name in stored.files if name.startswith("costs_")}
+    except (ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is not a checkpoint of csplat finetune: {error}") from None
+    if facts.get("version") != _VERSION:
+        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+    if facts["frozen"] != fingerprint(frozen):
+        raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+    score, psnr, iteration, since = facts["best"]
+    checkpoint = FinetuneCheckpoint(
+        facts["iteration"],
+        Parameters(parts[0], parts[1], parts[2], facts["step"]),
+        facts["rng_state"],
+        facts["queue"],
+        facts["options"],
+        facts["log"],
+        best,
+        costs,
+        (score, psnr, iteration, since),
+    )
+    _check(path, checkpoint, frozen.start())
+    return checkpoint
+
+
+def fingerprint(frozen: Frozen) -> str:
+    """A digest of all that was decided, and of the values that it was decided for."""
+    digest = hashlib.sha256(repr((frozen.plan, frozen.stage_sizes)).encode())
+    start = frozen.start()
+    for array in (frozen.source_index, *frozen.stages, *(getattr(start, name) for name in _HELD)):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: Held) -> None:
+    shapes = {name: getattr(start, name).shape for name in _HELD}
+    found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_held, name)] for name in _HELD}
+    parameters = checkpoint.parameters
+    for part in (parameters.values, parameters.first, parameters.second):
+        for name in _GROUPS:
+            found[{"logits": "opacities", "shN": "sh"}.get(name, name)].append(part[name])
+    for name, arrays in found.items():
+        for array in arrays:
+            if array.shape != shapes[name] or array.dtype != np.float32 or not np.isfinite(array).all():
+                raise InputError(f"{path}: {name} is {array.dtype} {list(array.shape)}, wanted float32 {shapes[name]}")

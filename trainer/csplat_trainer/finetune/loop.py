@@ -1,0 +1,292 @@
+"""`finetune`: move the values of a frozen scene until its file looks like the pictures."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import PCG64, Generator
+from numpy.typing import NDArray
+
+from csplat.encoder.frozen import Frozen, Held, Seen
+from csplat.errors import InputError
+from csplat_render.metrics import psnr_of_mse
+from csplat_render.rasterise import Rasteriser, Splats
+from csplat_trainer.finetune.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
+from csplat_trainer.finetune.options import FinetuneOptions
+from csplat_trainer.finetune.rate import Costs
+from csplat_trainer.finetune.state import TunedScene
+from csplat_trainer.finetune.views import View, Views
+from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
+from csplat_trainer.report import peak_memory
+
+__all__ = ["FinetuneResult", "Moment", "finetune"]
+
+F32 = NDArray[np.float32]
+
+_COUNT_EVERY = 50  # steps between counts of the integers
+_LEAST_GAIN = 2e-4  # of the score that counts as a gain
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where a run stands.
+
+    Attributes:
+        iteration, iterations: steps made, and in all.
+        loss: mean over the steps since the last report.
+        validation_psnr: of the last look at the validation views, pooled, dB.
+        best_psnr: the best so far.
+        seconds, seconds_left: since the start, and at the present pace.
+    """
+
+    iteration: int
+    iterations: int
+    loss: float
+    validation_psnr: float
+    best_psnr: float
+    seconds: float
+    seconds_left: float
+
+
+@dataclass(frozen=True, eq=False)
+class FinetuneResult:
+    """What a run ends with.
+
+    Attributes:
+        held: the values that looked best on the validation views, those of the start if none did.
+        log: JSON-compatible: options, losses, looks, times.
+    """
+
+    held: Held
+    log: dict[str, Any]
+
+
+def finetune(
+    frozen: Frozen,
+    views: Views,
+    options: FinetuneOptions | None = None,
+    *,
+    progress: Callable[[Moment], None] | None = None,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: int = 0,
+    resume: str | Path | None = None,
+    threads: int | None = None,
+) -> FinetuneResult:
+    """Fine-tune a frozen scene.
+
+    The same scene, views and options give the same values on the same machine, at any number of threads.
+
+    Args:
+        frozen: what the encoder decided.
+        views: what the file is to look like.
+        options: how.
+        progress: is told every `log_every` steps.
+        checkpoint: where checkpoints go, each in the place of the last; `None`: nowhere.
+        checkpoint_every: steps from one to the next; 0: at the end alone.
+        resume: a checkpoint of the same frozen scene to go on from.
+        threads: how many; `None` for all.
+
+    Raises:
+        InputError: a checkpoint is none, or belongs to something else; or the loss is not finite.
+    """
+    run = _Run(frozen, views, options or FinetuneOptions(), threads)
+    if resume is not None:
+        run.go_on(load_finetune(resume, frozen))
+    return run.to_the_end(progress, checkpoint, checkpoint_every)
+
+
+@dataclass
+class _Best:
+    """The best look so far, and how many that count came after it."""
+
+    held: Held
+    score: float
+    psnr: float
+    iteration: int = 0
+    since: int = 0
+
+
+@dataclass
+class _Buffers:
+    """Loss and wanted picture of a size; kept from step to step."""
+
+    loss: PhotometricLoss
+    wanted: F32
+
+
+class _Run:
+    """A run: the scene, the renderer, the random numbers, the log."""
+
+    def __init__(self, frozen: Frozen, views: Views, options: FinetuneOptions, threads: int | None) -> None:
+        self._views, self._options = views, options
+        self._scene = TunedScene(frozen)
+        self._rasteriser = Rasteriser(threads=threads)
+        self._antialiased = frozen.decided.model.antialiased
+        self._extent = float(np.exp(np.median(np.median(frozen.decided.model.scales, axis=1))))
+        self._rng = Generator(PCG64(options.seed))
+        self._iteration, self._queue = 0, list[int]()
+        self._sizes: dict[tuple[int, int], _Buffers] = {}
+        self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0}
+        self._best: _Best | None = None
+        self._costs: Costs | None = None
+
+    def go_on(self, checkpoint: FinetuneCheckpoint) -> None:
+        """Take up what a checkpoint holds."""
+        self._scene = TunedScene(self._scene.frozen, checkpoint.parameters)
+        self._rng.bit_generator.state = checkpoint.rng_state
+        self._iteration = checkpoint.iteration
+        self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
+        self._log = checkpoint.log
+        self._best = _Best(checkpoint.best_held, *checkpoint.best)
+        if checkpoint.costs:
+            self._costs = Costs(self._scene.frozen, self._options.byte_cost, checkpoint.costs)
+
+    def to_the_end(
+        self, progress: Callable[[Moment], None] | None, checkpoint: str | Path | None, checkpoint_every: int
+    ) -> FinetuneResult:
+        options = self._options
+        begin, first, spent = time.perf_counter(), self._iteration, float(self._log["seconds"])
+        if self._best is None:
+            self._look()
+        window = list[float]()
+        while self._iteration < options.iterations and not self._settled:
+            self._iteration += 1
+            window.append(self._step())
+            if self._iteration % options.validate_every == 0 or self._iteration == options.iterations:
+                self._look()
+            seconds = time.perf_counter() - begin
+            self._log["seconds"] = spent + seconds
+            if progress is not None and (
+                self._iteration % options.log_every == 0 or self._iteration == options.iterations or self._settled
+            ):
+                left = seconds / (self._iteration - first) * (options.iterations - self._iteration)
+                progress(self._moment(window, left))
+                window = []
+            if checkpoint is not None and checkpoint_every and self._iteration % checkpoint_every == 0:
+                self._save(checkpoint)
+        if checkpoint is not None:
+            self._save(checkpoint)
+        assert self._best is not None
+        return FinetuneResult(self._best.held, self._full_log())
+
+    @property
+    def _settled(self) -> bool:
+        """Whether looks have brought nothing for long enough."""
+        assert self._best is not None
+        return 0 < self._options.patience <= self._best.since
+
+    def _step(self) -> float:
+        """One picture; returns its loss before the step."""
+        if not self._queue:
+            self._queue = self._rng.permutation(len(self._views.train)).tolist()
+        view = self._views.train[self._queue.pop()]
+        seen, alphas = self._scene.seen()
+        if self._options.byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
+            self._costs = self._scene.count(seen, self._options.byte_cost)
+        rendered = self._render(seen, view)
+        buffers = self._buffers(view)
+        value, slope = buffers.loss(rendered, view.picture(self._views.background, buffers.wanted))
+        if not math.isfinite(value.loss):
+            raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
+        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._costs)
+        self._log["losses"].append(float(f"{value.loss:.6g}"))
+        return value.loss
+
+    def _rates(self) -> dict[str, float]:
+        options = self._options
+        share = options.share(self._iteration)
+        return {
+            "means": options.lr_means * self._extent * share,
+            "quats": options.lr_quats * share,
+            "scales": options.lr_scales * share,
+            "sizes": options.lr_scales * share,
+            "logits": options.lr_opacities * share,
+            "sh0": options.lr_sh0 * share,
+            "shN": (options.lr_entries if self._scene.frozen.stage_sizes else options.lr_shN) * share,
+        }
+
+    def _render(self, seen: Seen, view: View) -> F32:
+        splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+        return self._rasteriser.forward(
+            splats, view.camera, background=self._views.background, antialiased=self._antialiased
+        ).rgb
+
+    def _look(self) -> None:
+        """Judge by the validation views, and keep what is best: by their loss, and what the bytes are worth."""
+        seen, _ = self._scene.seen()
+        loss, error, count = 0.0, 0.0, 0
+        for view in self._views.validation:
+            buffers, rendered = self._buffers(view), self._render(seen, view)
+            wanted = view.picture(self._views.background, buffers.wanted)
+            loss += buffers.loss(rendered, wanted)[0].loss / len(self._views.validation)
+            error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
+            count += rendered.size
+        costs = self._scene.count(seen, self._options.byte_cost)
+        score, psnr = loss + costs.loss, psnr_of_mse(error / count)
+        self._log["looks"].append(
+            {"iteration": self._iteration, "loss": loss, "psnr": psnr, "bits_per_splat": costs.bits / len(seen.means)}
+        )
+        if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
+            self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
+        elif self._options.has_calmed(self._iteration):
+            self._best.since += 1
+
+    def _buffers(self, view: View) -> _Buffers:
+        size = (view.camera.H, view.camera.W)
+        if size not in self._sizes:
+            loss = PhotometricLoss(*size, *LOSS_WEIGHTS[self._options.loss])
+            self._sizes[size] = _Buffers(loss, np.empty((*size, 3), np.float32))
+        return self._sizes[size]
+
+    def _moment(self, window: list[float], left: float) -> Moment:
+        assert self._best is not None
+        return Moment(
+            self._iteration,
+            self._options.iterations,
+            sum(window) / max(1, len(window)),
+            self._log["looks"][-1]["psnr"],
+            self._best.psnr,
+            self._log["seconds"],
+            left,
+        )
+
+    def _save(self, path: str | Path) -> None:
+        assert self._best is not None
+        best = (self._best.score, self._best.psnr, self._best.iteration, self._best.since)
+        save_finetune(
+            path,
+            FinetuneCheckpoint(
+                self._iteration,
+                self._scene.parameters,
+                dict(self._rng.bit_generator.state),
+                self._queue,
+                asdict(self._options),
+                self._log,
+                self._best.held,
+                {} if self._costs is None else self._costs.tables,
+                best,
+            ),
+            self._scene.frozen,
+        )
+
+    def _full_log(self) -> dict[str, Any]:
+        assert self._best is not None
+        return {
+            "options": asdict(self._options),
+            "train_views": len(self._views.train),
+            "validation_views": len(self._views.validation),
+            "kept_aside": self._views.kept_aside,
+            "steps": self._iteration,
+            "settled": self._settled,
+            "start_psnr": self._log["looks"][0]["psnr"],
+            "best_psnr": self._best.psnr,
+            "best_iteration": self._best.iteration,
+            "peak_memory_bytes": peak_memory(),
+            **self._log,
+        }

@@ -1,0 +1,100 @@
+"""`FinetuneOptions`: every knob of fine-tuning, checked once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from csplat.errors import InputError
+from csplat_trainer.options import LOSSES
+
+__all__ = ["FinetuneOptions"]
+
+
+@dataclass(frozen=True)
+class FinetuneOptions:
+    """How to fine-tune. Learning rates rise for `warm_up` steps, and fall to `decay` along half a cosine.
+
+    Attributes:
+        iterations: steps at most, one picture each.
+        seed: of the order of the pictures.
+        loss: as in `TrainOptions`.
+        lr_means: learning rate of the means, as a share of the median of the splats' middle standard deviation.
+        lr_quats: of the rotations.
+        lr_scales: of the log scales.
+        lr_opacities: of the logits of opacity.
+        lr_sh0: of the base colour.
+        lr_shN: of the higher SH coefficients.
+        lr_entries: of the codebook's entries.
+        byte_cost: how much a bit per splat weighs in the loss; 0: files may grow as they please.
+        warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
+        decay: share of the learning rates that is left at the end.
+        validate_every: steps between looks at the validation views.
+        patience: looks without a gain after which a run ends early, once the learning rates have fallen to a quarter:
+            before, values shake too much to look their best. 0: never.
+        log_every: steps between entries of the log.
+
+    Raises:
+        InputError: a value is out of its range.
+    """
+
+    iterations: int = 2_000
+    seed: int = 0
+    loss: str = "inria"
+    lr_means: float = 0.1
+    lr_quats: float = 4e-3
+    lr_scales: float = 1e-2
+    lr_opacities: float = 5e-2
+    lr_sh0: float = 5e-3
+    lr_shN: float = 1e-3
+    lr_entries: float = 2e-3
+    byte_cost: float = 2e-4
+    warm_up: int = 100
+    decay: float = 0.01
+    validate_every: int = 100
+    patience: int = 4
+    log_every: int = 100
+
+    def __post_init__(self) -> None:
+        if self.loss not in LOSSES:
+            raise InputError(f"loss is {self.loss!r}, wanted one of {', '.join(LOSSES)}")
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
+
+    def share(self, iteration: int) -> float:
+        """Share of the learning rates that a step gets."""
+        done = (iteration - 1) / self.iterations
+        rising = min(1.0, iteration / (self.warm_up + 1))
+        return rising * (self.decay + (1.0 - self.decay) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+    def has_calmed(self, iteration: int) -> bool:
+        """Whether looks without a gain count."""
+        return iteration > 0.5 * self.iterations and self.share(iteration) <= _CALM
+
+    def scaled(self, factor: float) -> FinetuneOptions:
+        """The same with all learning rates times a factor."""
+        rates = {name: getattr(self, name) * factor for name in _RANGES if name.startswith("lr_")}
+        return replace(self, **rates)
+
+
+_CALM = 0.25  # of the learning rates
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "iterations": (1, 10**7),
+    "seed": (0, 2**63 - 1),
+    "lr_means": (0, 10),
+    "lr_quats": (0, 1),
+    "lr_scales": (0, 1),
+    "lr_opacities": (0, 10),
+    "lr_sh0": (0, 1),
+    "lr_shN": (0, 1),
+    "lr_entries": (0, 1),
+    "byte_cost": (0, 1),
+    "warm_up": (0, 10**7),
+    "decay": (0, 1),
+    "validate_every": (1, 10**7),
+    "patience": (0, 10**6),
+    "log_every": (1, 10**7),
+}

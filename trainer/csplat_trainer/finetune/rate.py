@@ -1,0 +1,184 @@
+"""The cost of bytes in the loss: what each integer of the file takes, by how often its like occurs.
+
+A stream's bytes lie near its order-0 entropy: an integer n of a column takes about −log2 of its share of the column.
+The slope of that, from n − 1 to n + 1, pushes a value towards what is common, which is mostly zero; pictures push
+back where it shows. Shares are counted anew from time to time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from csplat.encoder.frozen import Frozen
+from csplat_trainer.kernels import parallel_kernel
+from csplat_trainer.parameters import Splats
+
+__all__ = ["Costs", "Stored", "colour_integers_of", "cost_slopes"]
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+
+_REACH = 128  # integers beyond ± this cost as much as the last ones
+_STEEPEST = 4.0  # bits per step; rare integers are counted too badly for more
+_ROOT2 = np.sqrt(2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What the streams of a file hold, as a decoder will see it: arrays as in `Held`, all on their lattices."""
+
+    quats: F32
+    scales: F32
+    sizes: F32
+    opacities: F32
+    sh0: F32
+    sh: F32
+
+
+@dataclass(eq=False)
+class Costs:
+    """Slopes of the costs of all attributes, and how they reach the gradients.
+
+    Attributes:
+        frozen: lattices.
+        weight: loss per bit and splat.
+        tables: by attribute: slopes in bits per step, [columns, 2 · 128 + 1].
+        bits: of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
+    """
+
+    frozen: Frozen
+    weight: float
+    tables: dict[str, F32]
+    bits: float = 0.0
+
+    @classmethod
+    def counted(cls, frozen: Frozen, stored: Stored, weight: float) -> Costs:
+        """Count the integers of a scene.
+
+        Args:
+            frozen: what was decided.
+            stored: what the streams hold.
+            weight: loss per bit and splat.
+        """
+        costs = cls(frozen, weight, {})
+        plan = frozen.plan
+        columns = {
+            "scales": _integers(stored.scales, plan.scale_step),
+            "sizes": _integers(stored.sizes[:, None], plan.scale_step),
+            "quats": _integers(stored.quats[:, 1:], 1.0 / (_ROOT2 * plan.quat_levels)),
+            "opacities": np.rint(np.sqrt(stored.opacities) * plan.opacity_levels).astype(np.int32)[:, None],
+            "sh0": colour_integers_of(stored.sh0[:, None], plan.sh0_step, plan.chroma_shift).reshape(-1, 3),
+        }
+        if stored.sh.shape[1]:
+            coloured = colour_integers_of(stored.sh, plan.sh_step, plan.chroma_shift)
+            columns["shN"] = coloured.reshape(len(stored.sh), -1)
+        for name, values in columns.items():
+            costs.tables[name], bits = cost_slopes(values)
+            costs.bits += bits
+        return costs
+
+    @property
+    def loss(self) -> float:
+        """What the bytes are worth, in loss."""
+        return self.weight * self.bits / len(self.frozen.source_index)
+
+    def add_to(self, steps: Splats, stored: Stored) -> None:
+        """Add the slopes to gradients.
+
+        Args:
+            steps: gradients of the loss by group; changed in place.
+            stored: what the streams hold.
+        """
+        plan, tables = self.frozen.plan, self.tables
+        per_bit = np.float32(self.weight / len(stored.opacities))
+        _add_plain(stored.scales, plan.scale_step, 0, tables["scales"], per_bit, steps["scales"])
+        _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
+        unit = 1.0 / (_ROOT2 * plan.quat_levels)
+        _add_plain(stored.quats, unit, 1, tables["quats"], per_bit, steps["quats"])
+        roots = np.sqrt(stored.opacities)
+        levels = np.minimum(np.rint(roots * plan.opacity_levels), _REACH).astype(np.int64)
+        # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
+        chain = np.float32(0.5 * plan.opacity_levels) * roots * (np.float32(1.0) - stored.opacities)
+        steps["logits"] += per_bit * chain * tables["opacities"][0][_REACH + levels]
+        shift = plan.chroma_shift
+        _add_colour(stored.sh0[:, None], plan.sh0_step, shift, tables["sh0"], per_bit, steps["sh0"][:, None])
+        if stored.sh.shape[1]:
+            _add_colour(stored.sh, plan.sh_step, shift, tables["shN"], per_bit, steps["shN"])
+
+
+def cost_slopes(columns: NDArray[Any]) -> tuple[F32, float]:
+    """Slope of the cost of integers in bits per step, and the cost of all of them.
+
+    Args:
+        columns: [n, C] integers.
+
+    Returns:
+        [C, 257] float32, for the integers −128 to 128, and bits.
+    """
+    count, width = columns.shape
+    places = np.clip(columns, -_REACH, _REACH) + _REACH
+    size = 2 * _REACH + 1
+    counts = np.bincount((places + np.arange(width) * size).reshape(-1), minlength=width * size).reshape(width, size)
+    # One more of each and a narrow blur: an integer that happens not to occur is no more than rare.
+    padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")
+    blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
+    bits = -np.log2(blurred / (count + size))
+    slopes = np.gradient(bits, axis=1)
+    shares = counts / max(1, count)
+    entropy = -(counts * np.log2(np.maximum(shares, 1e-12))).sum()
+    return np.clip(slopes, -_STEEPEST, _STEEPEST).astype(np.float32), float(entropy)
+
+
+def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
+    """Y, Co, Cg [..., 3] int32 of colours on their lattice [..., 3], as they are coded."""
+    rgb = _integers(seen, step)
+    red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    co = red - blue
+    t = blue + (co >> 1)
+    cg = green - t
+    return np.stack([t + (cg >> 1), co >> shift, cg >> shift], axis=-1)
+
+
+def _integers(seen: F32, step: float) -> I32:
+    return np.rint(np.clip(seen.astype(np.float64) / step, -(2.0**30), 2.0**30)).astype(np.int32)
+
+
+@parallel_kernel()
+def _add_plain(seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32) -> None:
+    """Add the slopes of plain columns, [n, C] from column `first` on; a thread takes a run of rows."""
+    reach = tables.shape[1] // 2
+    over = np.float32(1.0 / step)
+    for i in prange(seen.shape[0]):
+        for c in range(first, seen.shape[1]):
+            n = min(max(int(np.rint(seen[i, c] * over)), -reach), reach)
+            out[i, c] += per_bit * over * tables[c - first, reach + n]
+
+
+@parallel_kernel()
+def _add_colour(seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32) -> None:
+    """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; a thread takes a run of rows."""
+    reach = tables.shape[1] // 2
+    over = np.float32(1.0 / step)
+    chroma = np.float32(0.5**shift)
+    for i in prange(seen.shape[0]):
+        for k in range(seen.shape[1]):
+            red = int(np.rint(seen[i, k, 0] * over))
+            green = int(np.rint(seen[i, k, 1] * over))
+            blue = int(np.rint(seen[i, k, 2] * over))
+            co = red - blue
+            t = blue + (co >> 1)
+            cg = green - t
+            y = t + (cg >> 1)
+            by_y = tables[3 * k, reach + min(max(y, -reach), reach)]
+            by_co = chroma * tables[3 * k + 1, reach + min(max(co >> shift, -reach), reach)]
+            by_cg = chroma * tables[3 * k + 2, reach + min(max(cg >> shift, -reach), reach)]
+            # Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2, up to rounding.
+            quarter, half = np.float32(0.25), np.float32(0.5)
+            out[i, k, 0] += per_bit * over * (quarter * by_y + by_co - half * by_cg)
+            out[i, k, 1] += per_bit * over * (half * by_y + by_cg)
+            out[i, k, 2] += per_bit * over * (quarter * by_y - by_co - half * by_cg)

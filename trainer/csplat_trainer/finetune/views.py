@@ -1,0 +1,96 @@
+"""What fine-tuning looks at: photographs, or renders of the source; some of them to learn from, some to judge by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.camera import Camera
+from csplat_render.rasterise import Rasteriser
+from csplat_trainer.pictures import Picture, compose
+
+__all__ = ["View", "Views", "renders_of", "split_views"]
+
+F32 = NDArray[np.float32]
+
+_JUDGES = 16  # views at most, of those that teach
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and what it is to see.
+
+    Attributes:
+        camera: relative to the scene's origin.
+        wanted: a photograph, or [H, W, 3] float32.
+    """
+
+    camera: Camera
+    wanted: Picture | F32
+
+    def picture(self, background: F32, out: F32) -> F32:
+        """The wanted picture, [H, W, 3] float32; `out` may be overwritten and returned."""
+        return compose(self.wanted, background, out) if isinstance(self.wanted, Picture) else self.wanted
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Views to learn from, views to judge by, and the colour behind all of them.
+
+    Attributes:
+        train: at least one.
+        validation: at least one; they are among `train` unless they were kept aside.
+        background: [3].
+
+    Raises:
+        InputError: one of the two is empty.
+    """
+
+    train: Sequence[View]
+    validation: Sequence[View]
+    background: F32
+
+    def __post_init__(self) -> None:
+        if not self.train or not self.validation:
+            raise InputError("fine-tuning wants at least one view to learn from and one to judge by")
+
+    @property
+    def kept_aside(self) -> bool:
+        """Whether the views to judge by are not learnt from."""
+        return not any(one is other for one in self.validation for other in self.train)
+
+
+def split_views(views: Sequence[View], background: F32, aside: int = 0) -> Views:
+    """Say which views teach and which judge.
+
+    A scene fits the pictures that it was trained on better than any others. Those of them that are kept aside look
+    worse with every step, whatever is gained elsewhere; so by default all teach, and some of them judge.
+
+    Args:
+        views: in the order of their taking.
+        background: [3], behind all of them.
+        aside: how many judge and do not teach: pictures that the scene was not trained on, or renders of it. 0: none.
+
+    Raises:
+        InputError: there are not as many views.
+    """
+    if aside >= len(views):
+        raise InputError(f"{aside} of {len(views)} views to judge by leave none to learn from")
+    count = aside or min(len(views), _JUDGES)
+    judges = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
+    teachers = [view for number, view in enumerate(views) if not aside or number not in judges]
+    return Views(teachers, [views[number] for number in sorted(judges)], background)
+
+
+def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[View]:
+    """Views of a scene itself: what its file is to look like where there are no photographs."""
+    rasteriser = Rasteriser(gradients=False, threads=threads)
+    return [
+        View(camera, rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb)
+        for camera in cameras
+    ]

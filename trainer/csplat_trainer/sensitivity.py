@@ -1,0 +1,189 @@
+"""How much pictures depend on each splat, attribute by attribute, measured from training cameras or virtual ones.
+
+The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, E_i the sum of the red, green and
+blue of view i, P_i its pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger, Westermann,
+"Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). For colours that is what counts.
+For opacity and shape the pixels of one view cancel in E_i: a splat that grows brightens here what it darkens there. So
+magnitudes are taken here before pixels and channels are added up; the published figure stands beside it.
+
+Sums of squares in place of magnitudes are the diagonal of the Gauss-Newton matrix: what a small error of the parameter
+adds to the squared error of the pictures. Those are the weights of k-means, whose errors are squared too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.camera import Camera
+from csplat_render.conventions import view_vector
+from csplat_render.jit import thread_count
+from csplat_render.rasterise import Rasteriser
+from csplat_trainer.sensitivity_forms import FORM, covariance_forms
+from csplat_trainer.sensitivity_sums import SUMS, add_view, sum_derivatives
+
+__all__ = ["Sensitivity", "measure_sensitivity"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+_DIAGONAL = [0, 6, 11, 15, 18, 20]  # of a triangle of 6 by 6
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """What pictures of a scene depend on, by splat and group of attributes.
+
+    Attributes:
+        colour: [N] float64, S of the SH coefficients, sh0 among them: the largest of up to 48.
+        opacity: [N] float64, S of alpha, magnitudes added pixel by pixel and channel by channel.
+        shape: [N] float64, S of the covariance divided by its trace, the largest of 6 entries, added likewise.
+        opacity_net: [N] float64, S of alpha as published: pixels of a view cancel.
+        shape_net: [N] float64, the same of the covariance.
+        colour_squares: [N] float64, squared derivatives of a pixel's channel towards the splat's colour in that
+            channel, summed over pixels and views, per pixel.
+        opacity_squares: [N] float64, the same of all three channels towards alpha.
+        shape_squares: [N] float64, towards all nine entries of the covariance divided by its trace.
+        means_squares: [N] float64, towards the three coordinates of the centre, per square scene unit; what follows
+            through the direction of view alone is left out.
+        shape_metric: [N, 21] float64, the Gauss-Newton matrix whose trace is `shape_squares`: the upper triangle, row
+            by row, over xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
+        metric: [N, B (B + 1) / 2] float32, `colour_squares` with the basis functions of each view, B = (degree + 1)²:
+            the Gauss-Newton matrix of the SH coefficients of one channel, its upper triangle; None if it was not
+            asked for.
+        views: [N] int64, how many views saw the splat.
+        view_count: how many there were.
+        pixel_count: of all views together.
+    """
+
+    colour: F64
+    opacity: F64
+    shape: F64
+    opacity_net: F64
+    shape_net: F64
+    colour_squares: F64
+    opacity_squares: F64
+    shape_squares: F64
+    means_squares: F64
+    shape_metric: F64
+    metric: F32 | None
+    views: NDArray[np.int64]
+    view_count: int
+    pixel_count: int
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """[N], which splats any view saw: the others have a colour sensitivity of 0."""
+        seen: NDArray[np.bool_] = self.views > 0
+        return seen
+
+    @property
+    def unseen_share(self) -> float:
+        """Share of the splats that no view saw."""
+        return 1.0 - float(self.seen.mean()) if len(self.views) else 0.0
+
+
+def measure_sensitivity(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    *,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    metric: bool = False,
+    dtype: Any = np.float32,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Sensitivity:
+    """Measure what pictures depend on.
+
+    Args:
+        model: the scene.
+        cameras: the views, at least one; relative to the scene's origin.
+        background: red, green, blue behind everything.
+        metric: the matrices of SH coefficients too: 2 B² bytes per splat.
+        dtype: of pixels, float32 or float64 (which is for tests).
+        threads: how many; None for all. The result does not depend on it.
+        progress: is told how much is done.
+
+    Raises:
+        InputError: there is no camera.
+        LimitError: a picture has more than `rasterise.MAX_INTERSECTIONS`.
+    """
+    if not cameras:
+        raise InputError("measuring sensitivity wants a camera at least")
+    drawing = _Derivatives(model, metric=metric, dtype=dtype, threads=threads)
+    for number, camera in enumerate(cameras):
+        drawing.add(camera, background)
+        if progress is not None:
+            progress("measuring sensitivity", (number + 1) / len(cameras))
+    return drawing.result()
+
+
+class _Derivatives(Rasteriser):
+    """Renders views and adds up what each of them says. Owns the sums."""
+
+    def __init__(self, model: SplatModel, *, metric: bool, dtype: Any, threads: int | None) -> None:
+        super().__init__("standard", dtype, gradients=True, threads=threads)
+        n, count = len(model), 1 + model.shN.shape[1]
+        self._model = model
+        self._colour = np.zeros((n, count, 3), np.float32)
+        self._net, self._sizes = np.zeros((n, 7)), np.zeros((n, 7))
+        self._squares, self._bends = np.zeros((n, 3)), np.zeros((n, 21))
+        self._metric = np.zeros((n if metric else 0, count * (count + 1) // 2), np.float32)
+        self._views = np.zeros(n, np.int64)
+        self._wanted = metric
+        self._view_count = self._pixel_count = 0
+
+    def add(self, camera: Camera, background: ArrayLike) -> None:
+        """Add one view."""
+        self.forward(self._model, camera, background=background, antialiased=self._model.antialiased)
+        last = self._last
+        assert last is not None
+        a, n = last.splats, len(self._model)
+        shape, box = self._buffer("shape", (n, 10), np.float64), self._buffer("box", (n, 4), np.int32)
+        near, offsets = self._buffer("near", (n,), np.float32), self._buffer("offsets", (n + 1,), np.int64)
+        forms = self._buffer("forms", (n, FORM), np.float64)
+        records = self._buffer("derivatives", (last.intersections, SUMS), self.dtype)
+        view = view_vector(camera)
+        with thread_count(self.threads) as lanes:
+            covariance_forms(a.means, a.quats, a.scales, view, last.antialiased, shape, near, forms)
+            sum_derivatives(
+                self._buffer("starts", (last.tile_count + 1,), np.int64),
+                self._buffer("used", (last.tile_count,), np.int64), self._buffers["ids"], self._buffers["slots"],
+                shape, box, forms, last.tiles_x, lanes, self._limits, last.rgb, records,
+            )  # fmt: skip
+            add_view(
+                a.means, a.opacities, a.scales, view, last.degree, shape, near, offsets, records,
+                self._colour, self._net, self._sizes, self._squares, self._metric, self._bends,
+                self._views,
+            )  # fmt: skip
+        self._view_count += 1
+        self._pixel_count += camera.W * camera.H
+
+    def result(self) -> Sensitivity:
+        """Divide by the pixels, and take the largest of each group."""
+        pixels = max(1, self._pixel_count)
+        self._metric /= np.float32(pixels)
+        net, sizes, squares = self._net / pixels, self._sizes / pixels, self._squares / pixels
+        return Sensitivity(
+            colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels,
+            opacity=sizes[:, 0],
+            shape=sizes[:, 1:].max(axis=1),
+            opacity_net=net[:, 0],
+            shape_net=net[:, 1:].max(axis=1),
+            colour_squares=squares[:, 0],
+            opacity_squares=squares[:, 1],
+            shape_squares=self._bends[:, _DIAGONAL].sum(axis=1) / pixels,
+            means_squares=squares[:, 2],
+            shape_metric=self._bends / pixels,
+            metric=self._metric if self._wanted else None,
+            views=self._views,
+            view_count=self._view_count,
+            pixel_count=self._pixel_count,
+        )

@@ -1,0 +1,173 @@
+"""Sensitivities in a file: one array per group, and which scene they belong to. Wants NumPy alone, no renderer."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.importance import Importance
+from csplat.errors import InputError
+from csplat.model import SplatModel
+
+if TYPE_CHECKING:
+    from csplat_trainer.sensitivity import Sensitivity
+
+__all__ = ["GROUPS", "SOURCES", "StoredSensitivity", "read_sensitivity", "scene_digest", "write_sensitivity"]
+
+#: Arrays [N] float32 of a file, as in `Sensitivity`.
+GROUPS = (
+    "colour", "opacity", "shape", "opacity_net", "shape_net",
+    "colour_squares", "opacity_squares", "shape_squares", "means_squares",
+)  # fmt: skip
+
+#: Where the views came from.
+SOURCES = ("training", "cameras", "virtual")
+
+_FORMAT = "csplat sensitivity 1"
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_FLOOR = 0.01  # of the median: the weight of what no view saw; other views may see it
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSensitivity:
+    """What a file holds.
+
+    Attributes:
+        groups: [N] float32 by name, see `GROUPS`.
+        views: [N] int32, how many views saw each splat.
+        source: where the views came from, one of `SOURCES`.
+        view_count: how many there were.
+        missed_share: share of the splats that views that were kept aside saw, and no other; NaN where none were.
+        shape_matrices: [N, 21] float32, upper triangles of the Gauss-Newton matrices of the covariance over its trace,
+            see `Sensitivity.shape_metric`, the mean of the diagonal being 1.
+        matrices: [N, K (K + 1) / 2] float16, upper triangles of the Gauss-Newton matrices of the SH bands 1 to d, the
+            mean of the diagonal being 1; or None.
+    """
+
+    groups: dict[str, NDArray[np.float32]]
+    views: NDArray[np.int32]
+    source: str
+    view_count: int
+    missed_share: float
+    shape_matrices: NDArray[np.float32]
+    matrices: NDArray[np.float16] | None
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """[N], which splats any view saw."""
+        return np.asarray(self.views > 0, np.bool_)
+
+    def importance(self) -> Importance:
+        """Return the weights of squared errors that the encoder wants."""
+        matrices = self.matrices, self.shape_matrices
+        return Importance(self._floored("colour_squares"), self._floored("shape_squares"), *matrices)
+
+    def _floored(self, name: str) -> NDArray[np.float32]:
+        weights = self.groups[name]
+        positive = weights[weights > 0.0]
+        least = np.float32(_FLOOR * float(np.median(positive))) if len(positive) else np.float32(1.0)
+        return np.where(self.seen, weights, least)
+
+
+def scene_digest(model: SplatModel) -> str:
+    """SHA-256 of the arrays of a scene, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for name in _ARRAYS:
+        array: NDArray[np.float32] = np.ascontiguousarray(getattr(model, name), "<f4")
+        digest.update(f"{name}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def write_sensitivity(
+    stream: BinaryIO, model: SplatModel, found: Sensitivity, source: str, missed_share: float = float("nan")
+) -> None:
+    """Write a file.
+
+    Args:
+        stream: where it goes.
+        model: the scene that was measured.
+        found: what was measured.
+        source: see `StoredSensitivity`.
+        missed_share: see `StoredSensitivity`.
+    """
+    arrays: dict[str, Any] = {name: getattr(found, name).astype(np.float32) for name in GROUPS}
+    if found.metric is not None and model.sh_degree:
+        arrays["matrices"] = _packed(found.metric)
+    np.savez(
+        stream,
+        format=np.array(_FORMAT),
+        scene=np.array(scene_digest(model)),
+        source=np.array(source),
+        view_count=np.array(found.view_count),
+        missed_share=np.array(missed_share),
+        views=found.views.astype(np.int32),
+        shape_matrices=_over_mean(found.shape_metric, found.shape_squares / 6.0),
+        **arrays,
+    )
+
+
+def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
+    """Read a file that was made for a scene.
+
+    Args:
+        path: the file.
+        model: the scene.
+
+    Raises:
+        InputError: it is damaged, something else, or belongs to another scene.
+        OSError: it cannot be read.
+    """
+    try:
+        # Opened here: np.load leaves a damaged file open.
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        if str(arrays["format"]) != _FORMAT:
+            raise InputError(f"{path} is {str(arrays['format'])!r}, wanted {_FORMAT!r}")
+        digest = str(arrays["scene"])
+        found = StoredSensitivity(
+            {name: arrays[name] for name in GROUPS},
+            arrays["views"],
+            str(arrays["source"]),
+            int(arrays["view_count"]),
+            float(arrays["missed_share"]),
+            arrays["shape_matrices"],
+            arrays.get("matrices"),
+        )
+    except (ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is no file of sensitivities (`csplat sensitivity` makes them): {reason}") from None
+    wanted = (len(model),)
+    if any(array.shape != wanted for array in (*found.groups.values(), found.views)):
+        raise InputError(f"{path} is about {len(found.views)} splats, the scene has {len(model)}")
+    if digest != scene_digest(model):
+        raise InputError(f"{path} is about another scene: its splats differ from those of this one")
+    return found
+
+
+def _packed(metric: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Upper triangles of the bands above 0, over the mean of their diagonals."""
+    rows, columns = np.triu_indices(_order(metric))
+    mean = metric[:, (rows == columns) & (rows > 0)].mean(axis=1, dtype=np.float64)
+    return _over_mean(metric[:, rows > 0], mean).astype(np.float16)
+
+
+def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Triangles over the mean of their diagonals; the plain norm serves what no view saw."""
+    seen = mean > 0.0
+    scaled = triangles / np.where(seen, mean, 1.0)[:, None]
+    rows, columns = np.triu_indices(_order(triangles))
+    scaled[~seen] = rows == columns
+    return scaled.astype(np.float32)
+
+
+def _order(triangles: NDArray[Any]) -> int:
+    """Rows of a matrix whose upper triangle has so many entries."""
+    return (math.isqrt(8 * int(triangles.shape[1]) + 1) - 1) // 2
