@@ -49,6 +49,10 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/compiling.py
 	$(BIN)/python tools/benchmarks/virtual_cameras.py
 	$(BIN)/python tools/benchmarks/viewer.py
+	$(BIN)/python tools/benchmarks/simplify.py pass
+	$(BIN)/python tools/benchmarks/simplify.py removal --gone 20,40,60,80
+	$(BIN)/python tools/benchmarks/simplify.py files --psnr 40
+	$(BIN)/python tools/benchmarks/sensitivity.py
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

@@ -103,6 +103,34 @@ def test_the_geometry_of_a_refitted_file_is_proved(source):
     assert "source of 400 splats" in other.failures[0]
 
 
+def test_a_file_of_adjusted_shapes_states_its_means_alone(source):
+    rows = np.arange(100, 300)
+    adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
+    said = replace(between(source, rows), adjusted=True)
+    result = encode_with_report(adjusted, between=said)
+    scene = decode_scene(result.data)
+    assert ["means"] == [record.measure for record in scene.stated_errors.records]
+    assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(source, scene.model, scene.header, scene.stated_errors).holds
+    moved = replace(source, means=source.means + np.float32(0.1))
+    assert not prove(moved, scene.model, scene.header, scene.stated_errors).holds
+
+
+def test_a_file_says_how_good_its_renders_are(source):
+    seen = []
+
+    def figures(data):
+        seen.append(decode(data))
+        return {"psnr": 41.5}
+
+    rows = np.arange(100, 300)
+    result = encode_with_report(source.select(rows), between=replace(between(source, rows), figures=figures))
+    scene = decode_scene(result.data)
+    assert {"why": "a test", "psnr": 41.5} == scene.options["simplified"]
+    np.testing.assert_array_equal(seen[0].means, scene.model.means)
+    np.testing.assert_array_equal(seen[0].shN, scene.model.shN)
+
+
 # absent bands
 
 

@@ -13,9 +13,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_render.cameras import save_cameras
-from csplat_render.removal import Removal
+from csplat_render.removal import Removal, measure_removal
 from csplat_tools.app import app
 from csplat_tools.simplify import SimplifyOptions, Target, simplify
+from csplat_tools.simplify.adjusting import adjust
 from csplat_tools.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.simplify.files import parse_target
 from csplat_tools.simplify.judge import Judge, loss_as_psnr, render_pictures
@@ -110,7 +111,7 @@ def test_keeping_a_share_keeps_that_many_and_says_which(source):
     result = simplify(source, target=Target(keep=0.5), options=SMALL)
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
-    np.testing.assert_array_equal(source.opacities[result.source_index], result.model.opacities)
+    np.testing.assert_array_equal(source.quats[result.source_index], result.model.quats)
     report = result.report
     assert report["removed"]["invisible"] == 10
     assert sum(report["removed"].values()) == 225
@@ -129,10 +130,42 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
 
 
 def test_a_refit_that_serves_its_own_views_alone_is_refused(source):
-    options = replace(SMALL, views=4, bands=False)
+    options = replace(SMALL, views=4, bands=False, adjust=False)
     report = simplify(source, target=Target(keep=0.4), options=options).report
     assert report["refit_refused"]
     assert report["check_psnr"] == report["check_psnr_pruned"]
+
+
+def test_adjusted_opacities_and_scales_gain_on_views_that_were_not_used(source):
+    shell = source.select(slice(10, 300))
+    shell = replace(shell, scales=shell.scales + np.float32(0.5), shN=shell.shN[:, :0])
+    scores = {}
+    for adjusted in (False, True):
+        options = replace(SMALL, views=40, steps=8, adjust=adjusted)
+        scores[adjusted] = simplify(shell, target=Target(keep=0.5), options=options).report["check_psnr"]
+    assert scores[True] > scores[False] + 0.3
+
+
+def test_what_no_view_shows_is_not_adjusted(source):
+    cameras = camera_sequence(source, 4, (48, 36))[:1]
+    wanted = [picture + np.float32(0.1) for picture in render_pictures(source, cameras)]
+    adjusted = adjust(source, cameras, wanted, SMALL, error=0.1)
+    seen = measure_removal(source, cameras).seen
+    assert 0 < np.count_nonzero(seen) < len(source)
+    for name in ("means", "quats", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(source, name), getattr(adjusted, name))
+    for name in ("opacities", "scales"):
+        np.testing.assert_array_equal(getattr(source, name)[~seen], getattr(adjusted, name)[~seen])
+        assert (getattr(source, name)[seen] != getattr(adjusted, name)[seen]).mean() > 0.9
+
+
+def test_transparent_and_opaque_splats_stay_within_alpha(source):
+    cameras = camera_sequence(source, 4, (48, 36))
+    wanted = render_pictures(source, cameras)
+    extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
+    adjusted = adjust(extreme, cameras, wanted, SMALL, error=0.1)
+    assert np.isfinite(adjusted.scales).all()
+    assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
 
 @pytest.mark.parametrize("goal", [35.0, 28.0])
@@ -169,8 +202,8 @@ def test_the_result_does_not_depend_on_threads(source):
         simplify(source, target=Target(keep=0.5), options=replace(SMALL, threads=threads)) for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.source_index, two.source_index)
-    np.testing.assert_array_equal(one.model.sh0, two.model.sh0)
-    np.testing.assert_array_equal(one.model.shN, two.model.shN)
+    for name in ("opacities", "scales", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(one.model, name), getattr(two.model, name))
 
 
 def test_a_loss_of_psnr_is_a_psnr_of_renders():
@@ -182,7 +215,7 @@ def test_a_loss_of_psnr_is_a_psnr_of_renders():
 
 
 def test_bands_that_are_worth_less_than_their_bits_go():
-    bands = np.array([[0.07, 0.07, 0.07], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
+    bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
     removal = Removal(zeros, zeros, zeros, zeros, np.array([1, 0, 2]), bands, 1)
     stays = band_mask(removal, 1.0)

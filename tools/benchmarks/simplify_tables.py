@@ -12,6 +12,11 @@ __all__ = ["plot_files", "tables"]
 _TWIN = (("never finished", "largest"), ("finished", "median"), ("finished", "sum"))
 _COLUMNS = ("opacity", "opacity-area", "exact", "rounds")
 
+_HEADER = (
+    "PSNR, dB", *_COLUMNS, "+ colours", "+ shapes", "used views", "check views", "far: rounds", "+ colours", "views",
+    "rounds s", "colours s", "all s",
+)  # fmt: skip
+
 Results = dict[str, dict[str, Any]]
 
 
@@ -33,11 +38,13 @@ def _removal_table(name: str, measured: dict[str, Any]) -> str:
         row = [f"{name} {percent} %", *("-" if one is None else f"{one['psnr']:.1f}" for one in found)]
         last = found[-1]
         if last is not None:
-            row += [f"{last['fit_psnr']:.1f}", f"{last['used_psnr']:.1f}", f"{last['views']}"]
-            row += [f"{last['seconds']:.0f}", f"{last['fit_seconds']:.0f}"]
-        rows.append([*row, *["-"] * (10 - len(row))])
-    header = ("PSNR, dB", *_COLUMNS, "+ fit", "own views", "views", "s", "fit s")
-    return format_table(header, rows)
+            row += [f"{last[key]:.1f}" for key in ("fit_psnr", "adjusted_psnr", "adjusted_used", "adjusted_check")]
+            far = measured.get(f"{percent} far")
+            row += ["-"] * 2 if far is None else [f"{far['psnr']:.1f}", f"{far['fit_psnr']:.1f}"]
+            row.append(f"{last['views']}")
+            row += [f"{last[key]:.0f}" for key in ("seconds", "fit_seconds", "adjusted_seconds")]
+        rows.append([*row, *["-"] * (len(_HEADER) - len(row))])
+    return format_table(_HEADER, rows)
 
 
 def _files_table(results: Results) -> str:
@@ -66,11 +73,19 @@ def _pass_table(results: Results) -> str:
         views = seconds.get("views", 1)
         rows.append(
             (
-                name, *(f"{1000.0 * seconds.get(key, 0.0) / views:.1f}" for key in ("render", "pass")),
+                name, *(f"{1000.0 * seconds.get(key, 0.0) / views:.1f}" for key in ("render", "pass", "step")),
                 *(f"{twin[rule][key]:.1e}" for rule, key in _TWIN if rule in twin),
             )
         )  # fmt: skip
-    header = ("the pass, per view", "render ms", "pass ms", "off twin: largest", "with stop: median", "of the sum")
+    header = (
+        "the pass, per view",
+        "render ms",
+        "pass ms",
+        "step of a fit ms",
+        "off twin: largest",
+        "with stop: median",
+        "of the sum",
+    )
     return format_table(header, rows) if rows else ""
 
 

@@ -25,7 +25,7 @@ __all__ = ["MeasureProof", "Proof", "lattice_radii", "prove"]
 F64 = NDArray[np.float64]
 
 _COLOURS = ("sh0", "sh1", "sh2", "sh3")
-_REFITTED = "colours were fitted anew: renders are their judge, nothing is proved of them"
+_REFITTED = "what has no stated error was fitted anew: renders are its judge, nothing is proved of it"
 _EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
 
 
@@ -95,8 +95,9 @@ def prove(
         return Proof(failures=("the file states no errors",))
     names = measure_names(source, decoded)
     if stated.refitted:
-        names = [name for name in names if name not in _COLOURS]
-        if not set(names) >= {record.measure for record in stated.records} or not stated.records:
+        spoken_of = {record.measure for record in stated.records}
+        names = [name for name in names if name in spoken_of]
+        if not names or spoken_of.intersection(_COLOURS):
             return Proof(
                 failures=("the file says that attributes were fitted anew: renders are its judge, not these bounds",)
             )
@@ -176,7 +177,7 @@ def _prove_matches(
     names: Sequence[str],
     progress: Callable[[str, float], None] | None,
 ) -> Proof:
-    bounds = {"sh0": math.inf, **{record.measure: record.max for record in stated.records}}
+    bounds = {"opacities": math.inf, "sh0": math.inf, **{record.measure: record.max for record in stated.records}}
     found = match(source, decoded, bounds, lattice_radii(decoded, header), progress=progress)
     unmatched = int(np.count_nonzero(found == UNMATCHED))
     undecided = int(np.count_nonzero(found == UNDECIDED))

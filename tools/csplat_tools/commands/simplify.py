@@ -67,6 +67,10 @@ def simplify(
     refit: Annotated[
         bool, typer.Option("--refit/--no-refit", rich_help_panel=_HOW, help="Fit the colours of what stays.")
     ] = True,
+    adjust: Annotated[
+        bool,
+        typer.Option("--adjust/--no-adjust", rich_help_panel=_HOW, help="Move opacities and scales of what stays."),
+    ] = True,
     bands: Annotated[
         bool, typer.Option("--bands/--no-bands", rich_help_panel=_HOW, help="Set SH bands that hardly show to zero.")
     ] = True,
@@ -85,13 +89,13 @@ def simplify(
     as_json: Annotated[bool, typer.Option("--json", help="The report on standard output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
 ) -> None:
-    """Remove splats that no picture needs, and fit the colours of the others.
+    """Remove splats that no picture needs, and fit the others to what is to be seen.
 
     What the removal of each splat would change is measured exactly, in many
-    small views from all around, again and again as splats go. Then the colours
-    of the others are fitted to what the source looks like. No photographs are
-    needed; with --data, the test pictures judge a --max-loss. Needs the
-    packages of the render extra.
+    small views from all around, again and again as splats go. Then colours,
+    opacities and scales of the others are fitted to what the source looks
+    like. No photographs are needed; with --data, the test pictures judge a
+    --max-loss. Needs the packages of the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -109,6 +113,7 @@ def simplify(
             method=method,
             rounds=rounds,
             refit=refit,
+            adjust=adjust,
             bands=bands,
             keep_unseen=not drop_unseen,
             views=views,
@@ -156,8 +161,8 @@ def _tell(report: dict[str, Any]) -> None:
         f"decided by {views['used']} views of {views['size'][0]}x{views['size'][1]}, checked by {views['check']}"
         f" others; {100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
     )
-    rows = [("the other views, colours as they were", f"{report['check_psnr_pruned']:.2f}")]
-    rows.append(("the other views, colours fitted", f"{report['check_psnr']:.2f}"))
+    rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
+    rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))
     if "psnr" in report:
         rows.append(("the target's views", f"{report['psnr']:.2f}"))
     note(format_table(("PSNR", "dB"), rows))

@@ -1,4 +1,4 @@
-"""Colours of what stays, fitted to what the source looks like, and bands that stay."""
+"""What stays, fitted to what the source looks like: colours, opacities and scales, and which SH bands it needs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.refit import fit_colours
 from csplat_render.removal import measure_removal
+from csplat_tools.simplify.adjusting import adjust
 from csplat_tools.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.simplify.options import SimplifyOptions
 
@@ -21,18 +22,17 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
-_SECOND_STEPS = 4  # of the fit after bands have gone
+_SECOND_STEPS = 4  # of a fit after something has changed a little
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A scene with new colours.
+    """A scene with new colours, and opacities and scales adjusted.
 
     Attributes:
         model: the scene.
         stays: [N, d], which SH bands are not zero; None where that was not asked.
-        errors: squared error over the views that were fitted, before the first and after every step; of the second
-            fit, after bands have gone, too.
+        errors: squared error over the views that were fitted, before the first and after every step, fit by fit.
     """
 
     model: SplatModel
@@ -48,17 +48,19 @@ def fit(
     *,
     threshold: float,
     centre: SplatModel | None = None,
+    fixed: bool = False,
     progress: Progress | None = None,
 ) -> Fitted:
-    """Fit colours; then set bands to zero, and fit those that stay once more.
+    """Fit colours; adjust opacities and scales; set bands to zero; after each of the two fit colours once more.
 
     Args:
         model: the scene, with the source's colours.
         cameras: the views.
         wanted: what the source looks like there.
-        options: whether to fit and to choose bands, steps, background.
+        options: whether to fit, to adjust and to choose bands, steps, background.
         threshold: error up to which a whole splat is not worth its bits: what bands are measured by.
         centre: the scene to whose colours the ridge pulls; the same as `model` if left out.
+        fixed: opacities and scales may not be adjusted.
         progress: is told how much is done.
     """
     goal = _coefficients(model if centre is None else centre)
@@ -74,6 +76,12 @@ def fit(
 
     if options.refit:
         model = fitted(model, options.steps, None)
+    if options.refit and options.adjust and not fixed:
+        error = max(0.0, errors[-1][-1]) / sum(picture.size for picture in wanted)
+        moved = fitted(
+            adjust(model, cameras, wanted, options, error=error**0.5, progress=progress), _SECOND_STEPS, None
+        )
+        model = moved if errors[-1][-1] < errors[-2][-1] else model
     if not options.bands or not model.sh_degree:
         return Fitted(model, None, tuple(errors))
     removal = measure_removal(model, cameras, background=options.background, threads=options.threads, progress=progress)

@@ -1,4 +1,4 @@
-"""Simplify and encode in one go: remove, quantise geometry, fit colours to what is left of it, quantise colours.
+"""Simplify and encode in one go: remove, adjust, quantise geometry, fit colours to what that left, quantise colours.
 
 What a decoder will see of the geometry is known before its colours are chosen. So they are fitted to that, which mends
 part of what quantisation did, and their bands are chosen then.
@@ -6,6 +6,7 @@ part of what quantisation did, and their bands are chosen then.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,11 +31,14 @@ __all__ = ["SimplifiedFile", "encode_simplified"]
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str, float], None]
+Encoded = Callable[[EncodeOptions, float], "SimplifiedFile"]
 
-_MARGINS = (2.0, 5.0)  # dB above the target to which splats are removed, the rest being left to quantisation
+_MARGINS = (0.0, 3.0)  # dB above the target to which splats are removed, before what stays is fitted and quantised
 _QUALITIES = (30.0, 80.0)  # dB, between which the encoder's is looked for
 _TRIES = 5
 _NEAR = 0.15  # dB above the target that are good enough
+_LOSS = 6.0  # dB between what each attribute keeps by itself and what all keep together
+_BYTES_PER_DB = 0.08  # share of the bytes that a decibel costs, about
 _SHORT = 3  # steps of a fit that begins where another one ended
 
 
@@ -88,18 +92,17 @@ def encode_simplified(
         judge = Judge.of_source(source, judged_by, options.background, options.threads)
     if target.keep is not None:
         gone = min(len(source) - round(target.keep * len(source)), len(session.order.rows))
-        file = _Candidate(session, gone, progress).encoded(encoding, encoding.quality)
-        return replace(file, report={**file.report, "psnr": judge.psnr(decode(file.result.data))})
+        return _Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
     codings = [encoding.sh_coding]
     if encoding.sh_coding == "auto" and source.sh_degree:
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
     choices = [replace(encoding, sh_coding=coding) for coding in codings]
-    found = [_at_quality(partial(_plain, source, choice, progress), judge.psnr, goal) for choice in choices]
+    found = [_smallest(partial(_plain, source, judge, progress), choices, goal)]
     for margin in _MARGINS:
         gone = most_gone(session, judge, goal + margin)
         if gone:
-            candidate = _Candidate(session, gone, progress)
-            found += [_at_quality(partial(candidate.encoded, choice), judge.psnr, goal) for choice in choices]
+            candidate = _Candidate(session, gone, judge, progress)
+            found.append(_smallest(candidate.encoded, choices, goal))
     reached = [file for file in found if file is not None]
     if not reached:
         raise InputError(f"no file reaches {goal:.2f} dB: the target is too high for this scene")
@@ -113,29 +116,32 @@ def encode_simplified(
 class _Candidate:
     """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins."""
 
-    def __init__(self, session: Session, gone: int, progress: Progress | None) -> None:
-        self._session, self._progress = session, progress
+    def __init__(self, session: Session, gone: int, judge: Judge, progress: Progress | None) -> None:
+        self._session, self._judge, self._progress = session, judge, progress
         self._rows, self._threshold = session.pruned(gone), session.threshold(gone)
         self._pruned = session.source.select(self._rows)
         self._last: SplatModel | None = None
         options = session.options
+        self._fitted = fit(
+            self._pruned, session.views.used, session.wanted, replace(options, bands=False), threshold=0.0,
+            progress=progress,
+        ).model  # fmt: skip
         self._weights = measure_removal(
-            self._pruned, session.views.used, background=options.background, threads=options.threads, progress=progress
+            self._fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
         ).squared_weight
 
     def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
-        """Encode at a quality, the preset's if it is None."""
+        """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
         session = self._session
         report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
 
         def colours(seen: SplatModel) -> tuple[F32, F32]:
-            start, options = seen, session.options
+            start, options = seen, replace(session.options, steps=_SHORT)
             if self._last is not None:
                 start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
-                options = replace(options, steps=_SHORT)
             fitted = fit(
                 start, session.views.used, session.wanted, options, threshold=self._threshold, centre=self._pruned,
-                progress=self._progress,
+                fixed=True, progress=self._progress,
             )  # fmt: skip
             self._last = fitted.model
             if fitted.stays is not None:
@@ -143,10 +149,16 @@ class _Candidate:
             report["check_psnr"] = session.checked.psnr(fitted.model)
             return fitted.model.sh0, fitted.model.shN
 
+        def figures(data: bytes) -> dict[str, float]:
+            report["psnr"] = self._judge.psnr(decode(data))
+            return {"psnr": round(report["psnr"], 3), "check_psnr": round(report["check_psnr"], 3)}
+
         said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
-        between = Between(len(session.source), self._rows, colours, said)
+        between = Between(
+            len(session.source), self._rows, colours, said, adjusted=session.options.adjust, figures=figures
+        )
         result = encode_with_report(
-            self._pruned,
+            self._fitted,
             replace(encoding, quality=quality),
             importance=self._weights,
             between=between,
@@ -155,23 +167,40 @@ class _Candidate:
         return SimplifiedFile(result, report)
 
 
-def _plain(source: SplatModel, encoding: EncodeOptions, progress: Progress | None, quality: float) -> SimplifiedFile:
+def _plain(
+    source: SplatModel, judge: Judge, progress: Progress | None, encoding: EncodeOptions, quality: float
+) -> SimplifiedFile:
     """The file without simplification."""
     result = encode_with_report(source, replace(encoding, quality=quality), progress=progress)
-    return SimplifiedFile(result, {"splats": len(source), "splats_before": len(source), "quality": quality})
+    report = {"splats": len(source), "splats_before": len(source), "quality": quality}
+    return SimplifiedFile(result, {**report, "psnr": judge.psnr(decode(result.data))})
 
 
-def _at_quality(
-    encoded: Callable[[float], SimplifiedFile], psnr: Callable[[SplatModel], float], goal: float
-) -> SimplifiedFile | None:
-    """The smallest file that reaches a PSNR: false position on the encoder's quality; None if none does."""
+def _smallest(encoded: Encoded, choices: Sequence[EncodeOptions], goal: float) -> SimplifiedFile | None:
+    """The smallest file that reaches a PSNR, by the choice that is best at a first quality, or else the next best."""
+    quality = min(max(goal + _LOSS, _QUALITIES[0]), _QUALITIES[1])
+    first = [(choice, encoded(choice, quality)) for choice in choices]
+
+    def cost(one: tuple[EncodeOptions, SimplifiedFile]) -> float:
+        return math.log(len(one[1].result.data)) - _BYTES_PER_DB * float(one[1].report["psnr"])
+
+    for choice, file in sorted(first, key=cost):
+        best = _at_quality(partial(encoded, choice), file, goal)
+        if best is not None:
+            return best
+    return None
+
+
+def _at_quality(encoded: Callable[[float], SimplifiedFile], file: SimplifiedFile, goal: float) -> SimplifiedFile | None:
+    """The smallest file that reaches a PSNR: false position on the encoder's quality from a first file; or None."""
     low, high = _QUALITIES
-    quality, best, points = goal + 6.0, None, list[tuple[float, float]]()
+    quality: float = file.report["quality"]
+    best, points = None, list[tuple[float, float]]()
     for number in range(_TRIES):
-        quality = high if number == _TRIES - 1 and best is None else min(max(quality, low), high)
-        file = encoded(quality)
-        reached = psnr(decode(file.result.data))
-        file = replace(file, report={**file.report, "psnr": reached})
+        if number:
+            quality = high if number == _TRIES - 1 and best is None else min(max(quality, low), high)
+            file = encoded(quality)
+        reached = file.report["psnr"]
         if reached >= goal:
             high = quality
             if best is None or len(file.result.data) < len(best.result.data):

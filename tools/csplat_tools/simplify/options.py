@@ -52,6 +52,9 @@ class SimplifyOptions:
         rounds: how often errors are measured anew on the way, at least 1.
         refit: fit the colours of what stays to the source's renders.
         steps: of that fit at most.
+        adjust: then move opacities and scales of what stays, by gradient descent, and fit colours again; not without
+            `refit`.
+        passes: how often that looks at each view.
         bands: set SH bands to zero that are worth less than their bits.
         keep_unseen: splats that no view shows stay.
         views: virtual views at most.
@@ -70,6 +73,8 @@ class SimplifyOptions:
     rounds: int = 4
     refit: bool = True
     steps: int = 8
+    adjust: bool = True
+    passes: int = 2
     bands: bool = True
     keep_unseen: bool = True
     views: int = 160
@@ -82,7 +87,7 @@ class SimplifyOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"the method is {self.method!r}, wanted one of {', '.join(METHODS)}")
-        for name in ("rounds", "steps", "views"):
+        for name in ("rounds", "steps", "passes", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
         if min(self.view_size) < 1:
