@@ -18,7 +18,7 @@ from csplat_render.warmup import warm_up
 def compiled():
     return {
         f"{name}.{key}": len(value.signatures)
-        for name, module in list(sys.modules.items()) if name.startswith("csplat_render")
+        for name, module in list(sys.modules.items()) if name.startswith(("csplat_render", "csplat_trainer"))
         for key, value in vars(module).items() if hasattr(value, "signatures")
     }
 
@@ -29,7 +29,8 @@ arrays["quats"] = np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (40, 1))
 model = SplatModel(**arrays)
 """
 _SIMPLIFY = """
-warm_up(gradients=False, simplify=True)
+from csplat_tools.extras import prepare_renderer
+prepare_renderer(quiet=True, simplify=True)
 from csplat_tools.simplify import SimplifyOptions, Target, simplify
 before = compiled()
 simplify(model, None, target=Target(0.5), options=SimplifyOptions(views=2, view_size=(32, 24)))

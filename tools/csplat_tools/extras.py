@@ -36,7 +36,8 @@ def prepare_renderer(*, quiet: bool, simplify: bool = False, ssim: bool = False,
     from csplat_render.warmup import warm_up
 
     announce = None if quiet or not sys.stderr.isatty() else note
-    warm_up(announce, gradients=False, simplify=simplify, ssim=ssim, lpips=lpips)
+    others = [_warm_up_adam] if simplify else []
+    warm_up(announce, gradients=simplify, simplify=simplify, ssim=ssim, lpips=lpips, others=others)
 
 
 def need_trainer(*, plots: bool = False) -> None:
@@ -71,6 +72,15 @@ def need_photographs() -> None:
     """
     for module, package in (("numba", None), ("scipy", None), ("PIL", "pillow")):
         _need(module, package)
+
+
+def _warm_up_adam() -> None:
+    import numpy as np
+
+    from csplat_trainer.parameters import Parameters, adam_step
+
+    values = {"quats": np.zeros((0, 4), np.float32), "logits": np.zeros(1, np.float32)}
+    adam_step(Parameters.starting_at(values), values, dict.fromkeys(values, 0.0))
 
 
 def _need(module: str, package: str | None = None, extra: str = "render") -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ def warm_up(
     simplify: bool = False,
     ssim: bool = False,
     lpips: bool = False,
+    others: Sequence[Callable[[], object]] = (),
     dtype: Any = np.float32,
 ) -> float:
     """Compile kernels, or load them from numba's cache, by putting them to a single splat.
@@ -36,6 +37,7 @@ def warm_up(
         simplify: what `measure_removal` and `fit_colours` run.
         ssim: what `metrics.ssim` runs.
         lpips: what `lpips.Lpips` runs.
+        others: are called; each compiles kernels that are not the renderer's.
         dtype: of pixels and gradients, see `Rasteriser`; the other groups have one each.
 
     Returns:
@@ -57,6 +59,8 @@ def warm_up(
             _warm_up_simplifying(camera)
         if ssim or lpips:
             _warm_up_metrics(picture.rgb, ssim=ssim, lpips=lpips)
+        for call in others:
+            call()
     finally:
         timer.cancel()
     seconds = time.perf_counter() - started
