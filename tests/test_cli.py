@@ -160,6 +160,19 @@ def test_repairs_are_reported_and_strict_refuses_them(tmp_path, make_model):
     assert sorted(kept) == list(range(20))
 
 
+def test_encode_replaces_none_of_its_own_files(tmp_path, ply):
+    weights = tmp_path / "weights.npy"
+    np.save(weights, np.ones(5))
+    before = weights.read_bytes()
+    line = refused("encode", ply, weights, "--importance", weights, "--force")
+    assert "is the input" in line
+    assert before == weights.read_bytes()
+    out = tmp_path / "out.csplat"
+    line = refused("encode", ply, out, "--source-index", tmp_path / "." / "out.csplat")
+    assert "two outputs" in line
+    assert not out.exists()
+
+
 def test_takes_importance_from_a_file(tmp_path, ply):
     np.save(tmp_path / "weights.npy", np.linspace(0, 1, 200))
     call("encode", ply, tmp_path / "out.csplat", "--importance", tmp_path / "weights.npy")

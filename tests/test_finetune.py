@@ -295,6 +295,17 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
     assert whole.log["looks"] == rest.log["looks"]
 
 
+def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
+    frozen, file = freeze(source, COARSE), tmp_path / "c.npz"
+    finetune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
+    with pytest.raises(InputError, match="another byte_cost"):
+        finetune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
+    with pytest.raises(InputError, match="other views"):
+        finetune(frozen, replace(views, train=views.train[1:]), QUICK, resume=file)
+    with pytest.raises(InputError, match="other views"):
+        finetune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
+
+
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
     file = tmp_path / "c.npz"
     finetune(freeze(source, COARSE), views, replace(QUICK, iterations=5), checkpoint=file)
@@ -302,10 +313,29 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_pat
     with pytest.raises(InputError, match="another scene"):
         finetune(other, views, QUICK, resume=file)
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
-    for content in (b"", b"no checkpoint", file.read_bytes()[:-500], (tmp_path / "n.npz").read_bytes()):
+    np.save(tmp_path / "n.npy", np.zeros(3))
+    data, entry = file.read_bytes(), file.read_bytes().index(b"PK\x01\x02")
+    locked = data[: entry + 8] + bytes([data[entry + 8] | 1]) + data[entry + 9 :]
+    unknown = data[: entry + 10] + bytes([77]) + data[entry + 11 :]
+    wrong = [b"", b"no checkpoint", data[:-500], locked, unknown]
+    for content in (*wrong, (tmp_path / "n.npz").read_bytes(), (tmp_path / "n.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
-        with pytest.raises(InputError, match="not a checkpoint"):
+        with pytest.raises(InputError, match="not a checkpoint") as caught:
             finetune(freeze(source, COARSE), views, QUICK, resume=tmp_path / "bad.npz")
+        assert "pickle" not in str(caught.value)
+
+
+def test_values_that_are_not_finite_end_a_run(source, views, monkeypatch):
+    """Kernels survive NaN, so a loss may be finite all the same; a file cannot hold it."""
+    step = TunedScene.step
+
+    def spoilt(self, *arguments):
+        step(self, *arguments)
+        self.parameters.values["means"][7] = np.nan
+
+    monkeypatch.setattr(TunedScene, "step", spoilt)
+    with np.errstate(invalid="ignore"), pytest.raises(InputError, match="a value is not finite at step 20"):
+        finetune(freeze(source, COARSE), views, QUICK)
 
 
 # options and views
@@ -483,12 +513,24 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
         (("--self", "--quality", "5"), "quality is 5"),
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
         (("--self", "--lr-factor", "1e9"), "lr_"),
+        (("--self", "--near", "0.1"), "for the photographs of --data"),
     ],
 )
 def test_wrong_words_are_status_2(capture, tmp_path, words, message):
     result = invoke("finetune", capture / "scene.ply", "-o", tmp_path / "s.csplat", *words)
     assert 2 == result.exit_code
     assert message in " ".join(result.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    "words", [("--report", "r.json", "--json", "./r.json"), ("--report", "r", "--checkpoint", "r", "--force")]
+)
+def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    result = invoke("finetune", capture / "scene.ply", "--self", "-o", tmp_path / "s.csplat", *words)
+    assert 1 == result.exit_code
+    assert "is wanted for two outputs" in result.stderr
+    assert [] == list(tmp_path.iterdir())
 
 
 def test_nothing_is_replaced_unasked(capture, tmp_path):
@@ -498,6 +540,25 @@ def test_nothing_is_replaced_unasked(capture, tmp_path):
     assert 1 == result.exit_code
     assert "--force replaces it" in result.stderr
     assert b"old" == out.read_bytes()
+
+
+def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
+    scene = tmp_path / "scene.ply"
+    write_ply(scene, source)
+    before = scene.read_bytes()
+    words = ("finetune", scene, "--self", "-o", tmp_path / "s.csplat", "--iterations", 1, "--views", 2)
+    result = invoke(*words, "--view-size", "16x16", "--checkpoint", scene, "--force")
+    assert 1 == result.exit_code
+    assert "is the input" in result.stderr
+    assert before == scene.read_bytes()
+
+
+@pytest.mark.parametrize("option", ["--resume", "--importance"])
+def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_path, option):
+    out, absent = tmp_path / "s.csplat", tmp_path / "absent.npz"
+    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path / "nothing", "-o", out, option, absent)
+    assert 1 == result.exit_code
+    assert "absent.npz: No such file" in result.stderr
 
 
 def test_cameras_that_see_nothing_are_refused(source, tmp_path):

@@ -259,6 +259,48 @@ def test_damaged_files_are_refused(stored):
         read_sensitivity(path, model)
 
 
+@pytest.mark.parametrize("packed", [False, True], ids=["as written", "deflated"])
+def test_no_flipped_bit_ends_in_a_traceback(tmp_path, packed):
+    """A third of those in the directory at the end of the archive are tried, and some of those in the arrays."""
+    model, path = small_scene(1, 1), tmp_path / "one.npz"
+    with path.open("wb") as stream:
+        write_sensitivity(stream, model, measure_sensitivity(model, cameras(), metric=True), "cameras")
+    if packed:
+        with np.load(path) as file:
+            arrays = dict(file)
+        np.savez_compressed(path, **arrays)
+    data = path.read_bytes()
+    directory, refused = data.index(b"PK\x01\x02"), 0
+    for bit in (*range(0, 8 * directory, 61), *range(8 * directory, 8 * len(data), 3)):
+        bad = bytearray(data)
+        bad[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(bad)
+        try:
+            read_sensitivity(path, model)
+        except (InputError, OSError):  # zipfile seeks to before the file
+            refused += 1
+    assert refused > 0.3 * directory * 8 / 61
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("views", np.array(["1"] * 30)),
+        ("colour", np.ones(30, np.complex64)),
+        ("view_count", np.array(np.inf)),
+        ("shape_matrices", np.ones((29, 21), np.float32)),
+        ("matrices", np.ones(30, np.float16)),
+    ],
+)
+def test_arrays_that_are_no_sensitivities_are_refused(stored, name, array):
+    path, model, _ = stored
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **(arrays | {name: array}))
+    with pytest.raises(InputError, match="no file of sensitivities"):
+        read_sensitivity(path, model)
+
+
 def test_never_seen_splats_weigh_a_little(stored):
     path, model, _ = stored
     away = np.where(np.arange(30)[:, None] < 3, np.float32(100.0), model.means)
@@ -325,3 +367,12 @@ def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
     done = run("encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "--prune-unseen", "-q")
     assert 1 == done.returncode
     assert 1 == len(done.stderr.splitlines())
+
+
+def test_cameras_that_see_nothing_are_refused(tmp_path, camera_file):
+    model = small_scene(20, 1)
+    write_ply(tmp_path / "s.ply", replace(model, means=model.means + np.float32(1000.0)))
+    done = run("sensitivity", tmp_path / "s.ply", tmp_path / "s.npz", "--cameras", camera_file, "-q")
+    assert 1 == done.returncode
+    assert "no view shows any splat" in done.stderr
+    assert not (tmp_path / "s.npz").exists()

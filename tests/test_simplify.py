@@ -89,7 +89,7 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     unseen = ~found.removal.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
     assert (removal_keys(source, found.removal, keep_unseen=False)[unseen] < 0.0).all()
-    order = removal_order(source, found, SMALL, 0.5)
+    order = removal_order(source, found, SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
 
@@ -197,6 +197,20 @@ def test_nothing_changes_where_everything_stays(source):
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
 
+@pytest.mark.parametrize(
+    ("keep", "options", "left"),
+    [
+        (0.998, {}, 449),  # less than a splat for each round
+        (0.9, {"rounds": 300}, 405),
+        (1e-4, {"keep_unseen": False, "rounds": 1}, 1),
+        (1e-4, {"method": "opacity"}, 1),
+    ],
+)
+def test_as_many_stay_as_were_asked_for_and_one_at_least(source, keep, options, left):
+    chosen = replace(SMALL, refit=False, bands=False, **options)
+    assert left == len(simplify(source, target=Target(keep=keep), options=chosen).model)
+
+
 def test_the_result_does_not_depend_on_threads(source):
     one, two = (
         simplify(source, target=Target(keep=0.5), options=replace(SMALL, threads=threads)) for threads in (1, 2)
@@ -290,6 +304,22 @@ def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
     report = json.loads(result.stdout)
     assert report["psnr"] >= 30.0
     assert report["views"]["used"] == 9
+
+
+def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path):
+    scene, cameras, out = tmp_path / "scene.ply", tmp_path / "cameras.json", tmp_path / "out.ply"
+    write_ply(scene, source)
+    save_cameras(cameras, camera_sequence(source, 4, (32, 24)))
+    before = cameras.read_bytes()
+    for words in (
+        (out, "--report", out),
+        (out, "--report", tmp_path / "x", "--source-index", tmp_path / "x"),
+        (out, "--cameras", cameras, "--report", cameras, "--force"),
+    ):
+        result = invoke("simplify", scene, *words, "--keep", "0.5")
+        assert (1, 1) == (result.exit_code, len(result.stderr.splitlines()))
+    assert before == cameras.read_bytes()
+    assert {scene, cameras} == set(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("words", [(), ("--keep", "0.5", "--target-psnr", "40"), ("--keep", "2"), ("--max-loss", "x")])

@@ -163,8 +163,9 @@ class _Bench:
         source, options = self._source, replace(self._options, method=method)
         views = self._views
         start = time.perf_counter()
-        order = removal_order(source, views, options, 1.0 - percent / 100.0)
-        gone = min(round(len(source) * percent / 100.0), len(order.rows))
+        left = round(len(source) * (1.0 - percent / 100.0))
+        order = removal_order(source, views, options, left)
+        gone = min(len(source) - left, len(order.rows))
         model = source.select(order.kept(len(source), gone))
         result: dict[str, Any] = {"seconds": time.perf_counter() - start, "views": len(views.used), "gone": gone}
         result["psnr"] = self._judge.psnr(model)
@@ -257,7 +258,7 @@ def _bands(name: str, path: Path, args: argparse.Namespace) -> None:
         return
 
     def measured() -> dict[str, Any]:
-        session = prepare(source, None, 0.5, SimplifyOptions(views=args.views))
+        session = prepare(source, None, len(source) - len(source) // 2, SimplifyOptions(views=args.views))
         gone = min(len(source) // 2, len(session.order.rows))
         fitted = session.fitted(session.pruned(gone), session.threshold(gone))
         model, stays = fitted.model, fitted.stays

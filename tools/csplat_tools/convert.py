@@ -163,6 +163,8 @@ def _encoded(
     if not prune_unseen or stored is None or stored.seen.all():
         return encode_with_report(model, options, importance=weights, progress=progress)
     rows = np.flatnonzero(stored.seen)
+    if not len(rows):
+        raise InputError(f"{importance}: no view saw any splat; nothing would be left")
     between = Between(
         len(model),
         rows,

@@ -37,7 +37,7 @@ class Wanted:
         data: a data set, whose training views are used; or `None`.
         size: width and height of virtual views.
         views: virtual views at most.
-        background: red, green, blue behind everything.
+        background: red, green, blue behind everything; `None` for black, but white behind photographs with alpha.
         matrices: measure the matrices of SH coefficients too.
         seed: of the virtual views. threads: how many; `None` for all.
     """
@@ -46,7 +46,7 @@ class Wanted:
     data: str | None
     size: tuple[int, int]
     views: int
-    background: tuple[float, float, float]
+    background: tuple[float, float, float] | None
     matrices: bool
     seed: int
     threads: int | None
@@ -94,7 +94,7 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
     """Measure a scene from what views there are.
 
     Raises:
-        InputError: there are no splats, or no views, or they cannot be read.
+        InputError: there are no splats, or no views, or they cannot be read, or show no splat.
     """
     from csplat_render.removal import measure_removal
     from csplat_tools.simplify.files import find_sights
@@ -104,11 +104,12 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
     if not len(model):
         raise InputError("a scene without splats has no sensitivities")
     sights = find_sights(model, wanted.cameras, wanted.data, judged=False, background=wanted.background)
+    background = sights.background
     cameras, check = sights.cameras, []
     source = "virtual" if cameras is None else "cameras" if wanted.data is None else "training"
     if cameras is None:
         views = find_views(
-            model, None, _GONE, size=wanted.size, most=wanted.views, seed=wanted.seed, background=wanted.background,
+            model, None, _GONE, size=wanted.size, most=wanted.views, seed=wanted.seed, background=background,
             threads=wanted.threads, progress=progress,
         )  # fmt: skip
         cameras, check = views.used, views.check
@@ -117,11 +118,13 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
         measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=wanted.matrices)
         progress("compiling", 1.0)
     found = measure_sensitivity(
-        model, cameras, background=wanted.background, metric=wanted.matrices, threads=wanted.threads, progress=progress
+        model, cameras, background=background, metric=wanted.matrices, threads=wanted.threads, progress=progress
     )
+    if not found.seen.any():
+        raise InputError("no view shows any splat: scene and cameras do not belong together")
     missed = float("nan")
     if check:
-        elsewhere = measure_removal(model, check, background=wanted.background, threads=wanted.threads).seen
+        elsewhere = measure_removal(model, check, background=background, threads=wanted.threads).seen
         missed = float(np.mean(elsewhere & ~found.seen))
     return Measured(model, found, source, missed)
 

@@ -11,7 +11,7 @@ import mmap
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from csplat.ply import write_ply
 __all__ = [
     "STANDARD_STREAM",
     "check_output",
+    "check_outputs",
     "is_csplat",
     "local_path",
     "mapped_csplat",
@@ -70,6 +71,28 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
             raise InputError(f"{path} is the input: name another output")
     if target.is_file() and not force:
         raise InputError(f"{path} exists: --force replaces it")
+
+
+def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[str | None] = ()) -> None:
+    """Refuse outputs before any work is done for them: each as `check_output` does, or two of them in one place.
+
+    Args:
+        paths: the files to be written, or `-`; None for those that are not wanted.
+        force: existing files may be replaced.
+        inputs: files that the command reads; None for those that are not given.
+
+    Raises:
+        InputError: as `check_output`; or two paths name the same file.
+        OSError: a folder does not exist.
+    """
+    outputs = [path for path in paths if path is not None]
+    places = [path if path == STANDARD_STREAM else Path(path).resolve() for path in outputs]
+    for number, place in enumerate(places):
+        if place in places[:number]:
+            raise InputError(f"{outputs[number]} is wanted for two outputs: name a file for each")
+    read = tuple(path for path in inputs if path is not None)
+    for path in outputs:
+        check_output(path, force=force, inputs=read)
 
 
 @contextmanager

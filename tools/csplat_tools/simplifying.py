@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import typer
 
@@ -55,11 +55,10 @@ class Simplifying:
             raise typer.BadParameter(str(error)) from None
 
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> EncodeResult:
-            sights = find_sights(
-                model, self.cameras, self.data, judged=target.max_loss is not None, background=options.background
-            )
+            sights = find_sights(model, self.cameras, self.data, judged=target.max_loss is not None)
             return encode_simplified(
-                model, sights.cameras, target=target, encoding=encoding, options=options,
+                model, sights.cameras, target=target, encoding=encoding,
+                options=replace(options, background=sights.background),
                 photographs=sights.photographs, progress=progress,
             ).result  # fmt: skip
 

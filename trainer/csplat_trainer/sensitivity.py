@@ -106,7 +106,7 @@ def measure_sensitivity(
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue behind everything.
-        metric: the matrices of SH coefficients too: 2 B² bytes per splat.
+        metric: the matrices of SH coefficients too: 2 B (B + 1) bytes per splat.
         dtype: of pixels, float32 or float64 (which is for tests).
         threads: how many; None for all. The result does not depend on it.
         progress: is told how much is done.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import textwrap
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -32,6 +34,9 @@ SOURCES = ("training", "cameras", "virtual")
 
 _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+# What reading an archive raises where it is damaged: RuntimeError is for passwords and unknown ways to compress.
+_DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, zlib.error,
+            zipfile.BadZipFile)  # fmt: skip
 _FLOOR = 0.01  # of the median: the weight of what no view saw; other views may see it
 
 
@@ -141,8 +146,14 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
             arrays["shape_matrices"],
             arrays.get("matrices"),
         )
-    except (ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        reason = " ".join(str(error).split())
+        matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
+        kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
+        if (kinds, found.views.dtype.kind) != ({"f"}, "i"):
+            raise ValueError("its arrays hold other numbers, or none")
+        if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
+            raise ValueError("it has matrices for other splats than it has views")
+    except _DAMAGED as error:
+        reason = textwrap.shorten(str(error), 120)
         raise InputError(f"{path} is no file of sensitivities (`csplat sensitivity` makes them): {reason}") from None
     wanted = (len(model),)
     if any(array.shape != wanted for array in (*found.groups.values(), found.views)):

@@ -11,7 +11,7 @@ from csplat.encoder import PRESETS, EncodeOptions
 from csplat.errors import InputError
 from csplat_tools.console import format_bytes, format_table, guarded, note, progress_bar, say_json
 from csplat_tools.convert import Encoded, SceneFacts, encode_file
-from csplat_tools.inout import STANDARD_STREAM, check_output
+from csplat_tools.inout import STANDARD_STREAM, check_outputs
 from csplat_tools.simplifying import DEFAULT_VIEWS, Simplifying
 
 __all__ = ["encode"]
@@ -224,9 +224,7 @@ def encode(
         raise typer.BadParameter("--json and - both want standard output")
     if source_index == STANDARD_STREAM:
         raise typer.BadParameter("--source-index wants the name of a file")
-    check_output(target, force=force, inputs=(source,))
-    if source_index is not None:
-        check_output(source_index, force=force, inputs=(source, target))
+    check_outputs((target, source_index), force=force, inputs=(source, importance, cameras))
     with progress_bar(quiet=quiet) as progress:
         encoded = encode_file(
             source,

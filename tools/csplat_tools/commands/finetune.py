@@ -12,7 +12,7 @@ from csplat.errors import InputError
 from csplat_tools.commands.encoder_knobs import with_encoder_knobs
 from csplat_tools.console import guarded, note, say_json
 from csplat_tools.extras import need_trainer
-from csplat_tools.inout import STANDARD_STREAM, check_output
+from csplat_tools.inout import STANDARD_STREAM, check_output, check_outputs
 from csplat_tools.parsing import parse_colour, parse_size
 
 __all__ = ["finetune"]
@@ -68,7 +68,10 @@ def finetune(
     aside: Annotated[
         int,
         typer.Option(
-            metavar="N", min=0, rich_help_panel=_LIKE, help="Views that judge and do not teach; 0: the ones that teach."
+            metavar="N",
+            min=0,
+            rich_help_panel=_LIKE,
+            help="Views that judge and do not teach; 0: with --data some that teach judge, with --self one in eight.",
         ),
     ] = 0,
     keep: Annotated[
@@ -154,6 +157,8 @@ def finetune(
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     if data is not None and cameras is not None:
         raise typer.BadParameter("--cameras goes with --self")
+    if itself and (size, images, near) != (None, None, None):
+        raise typer.BadParameter("--size, --images and --near are for the photographs of --data")
     try:
         options = FinetuneOptions(
             iterations=iterations or _STEPS[itself], seed=encoding.seed, byte_cost=byte_cost, patience=patience
@@ -164,14 +169,15 @@ def finetune(
         raise typer.BadParameter("--report, --json and --checkpoint want names of files")
     if as_text and output == STANDARD_STREAM:
         raise typer.BadParameter("--say-json and - both want standard output")
-    inputs = tuple(path for path in (source, resume, importance, cameras) if path is not None)
-    check_output(output, force=force, inputs=inputs)
-    for path in (report, log):
+    for path in (resume, importance):
         if path is not None:
-            check_output(path, force=force, inputs=(*inputs, output))
-    if checkpoint is not None:
-        again = resume is not None and Path(checkpoint).exists() and Path(checkpoint).samefile(resume)
-        check_output(checkpoint, force=force or again)
+            Path(path).stat()  # an OSError that names it, before the minutes that views and splats may take
+    # A checkpoint may take the place of the one that it goes on from.
+    again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
+    inputs = (source, importance, cameras)
+    check_outputs((output, report, log, None if again else checkpoint), force=force, inputs=(*inputs, resume))
+    if again:
+        check_output(str(checkpoint), force=True, inputs=tuple(path for path in inputs if path is not None))
     sources = Sources(
         data,
         None if size is None else parse_size(size),

@@ -37,8 +37,11 @@ def sensitivity(
         str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="How large virtual views are.")
     ] = "240x180",
     background: Annotated[
-        str, typer.Option(metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, white, or 0..1.")
-    ] = "black",
+        str | None,
+        typer.Option(
+            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene, as in training; black, white behind alpha."
+        ),
+    ] = None,
     matrices: Annotated[
         bool,
         typer.Option("--matrices/--no-matrices", help="How SH errors add up, for codebooks; 240 bytes per splat."),
@@ -64,7 +67,8 @@ def sensitivity(
         raise typer.BadParameter("OUT.npz wants the name of a file")
     if data is not None and cameras is not None:
         raise typer.BadParameter("--data and --cameras both say where to look from: give one of them")
-    wanted = Wanted(cameras, data, parse_size(view_size), views, parse_colour(background), matrices, seed, threads)
+    colour = None if background is None else parse_colour(background)
+    wanted = Wanted(cameras, data, parse_size(view_size), views, colour, matrices, seed, threads)
     check_output(output, force=force, inputs=tuple(path for path in (source, cameras) if path is not None))
     prepare_renderer(quiet=quiet, simplify=data is None and cameras is None)  # virtual views are looked for
     model = load_model(source).model

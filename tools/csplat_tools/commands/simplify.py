@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
@@ -10,7 +11,7 @@ import typer
 from csplat.errors import InputError
 from csplat_tools.console import format_table, guarded, note, progress_bar, say_json
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.inout import STANDARD_STREAM, check_output, write_array, write_bytes, write_model
+from csplat_tools.inout import STANDARD_STREAM, check_outputs, write_array, write_bytes, write_model
 from csplat_tools.models import load_model
 from csplat_tools.parsing import parse_colour, parse_size
 
@@ -51,8 +52,11 @@ def simplify(
         str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="About how large the pictures are.")
     ] = "240x180",
     background: Annotated[
-        str, typer.Option(metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, white, or 0..1.")
-    ] = "black",
+        str | None,
+        typer.Option(
+            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene, as in training; black, white behind alpha."
+        ),
+    ] = None,
     photo_psnr: Annotated[
         float,
         typer.Option(metavar="DB", rich_help_panel=_VIEWS, help="What the source reaches, for --max-loss alone."),
@@ -107,6 +111,7 @@ def simplify(
     from csplat_tools.simplify import simplify as simplified
     from csplat_tools.simplify.files import find_sights, parse_target
 
+    colour = None if background is None else parse_colour(background)
     try:
         target = Target(keep, target_psnr, None if max_loss is None else parse_target(max_loss))
         options = SimplifyOptions(
@@ -118,7 +123,6 @@ def simplify(
             keep_unseen=not drop_unseen,
             views=views,
             view_size=parse_size(view_size),
-            background=parse_colour(background),
             photo_psnr=photo_psnr,
             seed=seed,
             threads=threads,
@@ -129,12 +133,10 @@ def simplify(
         raise typer.BadParameter("--json and - both want standard output")
     if STANDARD_STREAM in (report, source_index):
         raise typer.BadParameter("--report and --source-index want names of files")
-    check_output(output, force=force, inputs=(source,))
-    for path in (report, source_index):
-        if path is not None:
-            check_output(path, force=force, inputs=(source, output))
+    check_outputs((output, report, source_index), force=force, inputs=(source, cameras))
     model = load_model(source).model
-    sights = find_sights(model, cameras, data, judged=max_loss is not None, background=options.background)
+    sights = find_sights(model, cameras, data, judged=max_loss is not None, background=colour)
+    options = replace(options, background=sights.background)
     with progress_bar(quiet=quiet) as progress:
         result = simplified(
             model, sights.cameras, target=target, options=options, photographs=sights.photographs, progress=progress

@@ -93,7 +93,7 @@ class Session:
 def prepare(
     source: SplatModel,
     cameras: Sequence[Camera] | None,
-    keep: float | None,
+    left: int | None,
     options: SimplifyOptions,
     progress: Progress | None = None,
 ) -> Session:
@@ -102,21 +102,21 @@ def prepare(
     Args:
         source: the scene.
         cameras: the user's own, or None for virtual ones.
-        keep: share that is to stay; None if it is not known yet.
+        left: splats that are to stay; None if it is not known yet.
         options: how to go about it.
         progress: is told how much is done.
     """
     seconds = {}
     start = time.perf_counter()
     views = find_views(
-        source, cameras, 0.5 if keep is None else 1.0 - keep, size=options.view_size, most=options.views,
+        source, cameras, 0.5 if left is None else 1.0 - left / len(source), size=options.view_size, most=options.views,
         seed=options.seed, background=options.background, threads=options.threads, progress=progress,
     )  # fmt: skip
     wanted = render_pictures(source, views.used, background=options.background, threads=options.threads)
     checked = Judge.of_source(source, views.check, options.background, options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    order = removal_order(source, views, options, keep, progress)
+    order = removal_order(source, views, options, left, progress)
     seconds["rounds"] = time.perf_counter() - start
     return Session(source, options, views, wanted, order, checked, seconds)
 
@@ -150,10 +150,11 @@ def simplify(
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
-    session = prepare(source, cameras, target.keep, options, progress)
+    left = None if target.keep is None else target.count(len(source))
+    session = prepare(source, cameras, left, options, progress)
     start = time.perf_counter()
-    if target.keep is not None:
-        gone = min(len(source) - round(target.keep * len(source)), len(session.order.rows))
+    if left is not None:
+        gone = min(len(source) - left, len(session.order.rows))
         result = _finished(session, gone, None, progress)
     else:
         judge, goal = find_judge(source, cameras, target, options, session, photographs)

@@ -86,12 +86,13 @@ def encode_simplified(
     encoding, options = encoding or EncodeOptions(), options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
-    session = prepare(source, cameras, target.keep, options, progress)
+    left = None if target.keep is None else target.count(len(source))
+    session = prepare(source, cameras, left, options, progress)
     judge, goal = find_judge(source, cameras, target, options, session, photographs)
     if judged_by is not None:
         judge = Judge.of_source(source, judged_by, options.background, options.threads)
-    if target.keep is not None:
-        gone = min(len(source) - round(target.keep * len(source)), len(session.order.rows))
+    if left is not None:
+        gone = min(len(source) - left, len(session.order.rows))
         return _Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
     codings = [encoding.sh_coding]
     if encoding.sh_coding == "auto" and source.sh_degree:

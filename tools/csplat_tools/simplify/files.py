@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_tools.compare import BLACK, WHITE, Colour
 from csplat_tools.photographs import DataViews, relative_to, show_photograph
 
 __all__ = ["Sights", "find_sights", "parse_target"]
@@ -24,15 +25,22 @@ class Sights:
 
     Attributes:
         cameras: the user's own, relative to the scene's origin; None for virtual ones.
+        background: red, green, blue behind everything.
         photographs: cameras and what was photographed there, to judge by; None where there are none.
     """
 
     cameras: list[Camera] | None
+    background: Colour
     photographs: tuple[Sequence[Camera], Sequence[F32]] | None = None
 
 
 def find_sights(
-    model: SplatModel, cameras: str | None, data: str | None, *, judged: bool, background: tuple[float, float, float]
+    model: SplatModel,
+    cameras: str | None,
+    data: str | None,
+    *,
+    judged: bool,
+    background: Colour | None = None,
 ) -> Sights:
     """Read a camera file or a data set.
 
@@ -41,7 +49,7 @@ def find_sights(
         cameras: a camera file, relative to the scene's origin.
         data: a data set: the cameras of its training pictures decide.
         judged: photographs are wanted: the set's test pictures.
-        background: behind pictures with an alpha channel.
+        background: behind everything; None for black, but white with pictures that have an alpha channel.
 
     Raises:
         InputError: both are given, or one cannot be read.
@@ -51,16 +59,18 @@ def find_sights(
     if cameras is not None:
         from csplat_render.cameras import load_cameras
 
-        return Sights(load_cameras(cameras))
+        return Sights(load_cameras(cameras), background or BLACK)
     if data is None:
-        return Sights(None)
+        return Sights(None, background or BLACK)
     origin = model.origin
-    views = [relative_to(origin, picture.camera) for picture in DataViews(data, "train").read()]
+    taken = DataViews(data, "train").read()
+    views = [relative_to(origin, picture.camera) for picture in taken]
+    behind = background or (WHITE if any(picture.has_alpha for picture in taken) else BLACK)
     if not judged:
-        return Sights(views)
+        return Sights(views, behind)
     pictures = DataViews(data, "test").read()
-    shown = [show_photograph(picture, background) for picture in pictures]
-    return Sights(views, ([relative_to(origin, picture.camera) for picture in pictures], shown))
+    shown = [show_photograph(picture, behind) for picture in pictures]
+    return Sights(views, behind, ([relative_to(origin, picture.camera) for picture in pictures], shown))
 
 
 def parse_target(text: str) -> float:

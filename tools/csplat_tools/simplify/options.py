@@ -42,6 +42,11 @@ class Target:
         if self.max_loss is not None and not (math.isfinite(self.max_loss) and self.max_loss > 0.0):
             raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted above 0")
 
+    def count(self, splats: int) -> int:
+        """How many of so many splats stay, one at least; for `keep`."""
+        assert self.keep is not None
+        return max(1, round(self.keep * splats))
+
 
 @dataclass(frozen=True)
 class SimplifyOptions:
@@ -90,5 +95,7 @@ class SimplifyOptions:
         for name in ("rounds", "steps", "passes", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
+        if not 0.0 < self.photo_psnr <= 99.0:
+            raise InputError(f"photo_psnr is {self.photo_psnr:g} dB, wanted above 0, at most 99")
         if min(self.view_size) < 1:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")

@@ -63,7 +63,7 @@ def removal_order(
     model: SplatModel,
     views: Views,
     options: SimplifyOptions,
-    keep: float | None,
+    left: int | None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Order:
     """Find out in which order splats go.
@@ -72,7 +72,7 @@ def removal_order(
         model: the source.
         views: cameras to decide by, and what they say of the source.
         options: method, rounds.
-        keep: share of the splats that is to stay; None for an order that may be cut anywhere.
+        left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.
     """
     count = len(model)
@@ -82,18 +82,19 @@ def removal_order(
             keys = keys * surface_areas(model)
         rows = np.argsort(keys, kind="stable")
         return Order(rows, np.zeros(count), ())
-    targets = _targets(count, options, keep)
-    rows, removal, gone = np.arange(count), views.removal, []
+    targets = _targets(count, options, left)
+    rows, removal = np.arange(count), views.removal
+    gone: list[I64] = []
     errors: list[F64] = []
     rounds = []
-    for number, target in enumerate(targets):
-        if number:
+    for target in targets:
+        if gone:
             removal = measure_removal(
                 model.select(rows), views.used, background=options.background, threads=options.threads,
                 progress=progress,
             )  # fmt: skip
         keys = removal_keys(model.select(rows), removal, keep_unseen=options.keep_unseen)
-        order = np.argsort(keys, kind="stable")[: max(0, len(rows) - target)]
+        order = np.argsort(keys, kind="stable")[: len(rows) - target]
         order = order[np.isfinite(keys[order])]
         if not len(order):
             break
@@ -106,14 +107,15 @@ def removal_order(
     return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
 
 
-def _targets(count: int, options: SimplifyOptions, keep: float | None) -> list[int]:
-    """How many splats are left after each round."""
-    last = round(count * (_LEAST_SHARE if keep is None else keep))
+def _targets(count: int, options: SimplifyOptions, left: int | None) -> list[int]:
+    """How many splats are left after each round, each time fewer."""
+    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
     if options.method == "exact":
-        return [last]
-    if keep is not None:
-        return [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
-    targets = [count]
-    while targets[-1] > last:
-        targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
-    return targets[1:]
+        targets = [last]
+    elif left is not None:
+        targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
+    else:
+        targets = [count]
+        while targets[-1] > last:
+            targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
+    return sorted({target for target in targets if target < count}, reverse=True)

@@ -93,7 +93,7 @@ def finetune(
         threads: how many; `None` for all.
 
     Raises:
-        InputError: a checkpoint is none, or belongs to something else; or the loss is not finite.
+        InputError: a checkpoint is none, or of another scene, views or options; or a loss or a value is not finite.
     """
     run = _Run(frozen, views, options or FinetuneOptions(), threads)
     if resume is not None:
@@ -132,12 +132,21 @@ class _Run:
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _Buffers] = {}
-        self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0}
+        self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0, "views": views.digest}
         self._best: _Best | None = None
         self._costs: Costs | None = None
 
     def go_on(self, checkpoint: FinetuneCheckpoint) -> None:
-        """Take up what a checkpoint holds."""
+        """Take up what a checkpoint holds.
+
+        Raises:
+            InputError: it is of a run with other views or options.
+        """
+        if checkpoint.log["views"] != self._views.digest:
+            raise InputError("the checkpoint is of a run with other views")
+        for name, value in asdict(self._options).items():
+            if name != "iterations" and checkpoint.options[name] != value:
+                raise InputError(f"the checkpoint is of a run with another {name}: {checkpoint.options[name]}")
         self._scene = TunedScene(self._scene.frozen, checkpoint.parameters)
         self._rng.bit_generator.state = checkpoint.rng_state
         self._iteration = checkpoint.iteration
@@ -219,6 +228,8 @@ class _Run:
 
     def _look(self) -> None:
         """Judge by the validation views, and keep what is best: by their loss, and what the bytes are worth."""
+        if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
+            raise InputError(f"a value is not finite at step {self._iteration}: try smaller learning rates")
         seen, _ = self._scene.seen()
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:

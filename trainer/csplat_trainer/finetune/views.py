@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,6 +59,13 @@ class Views:
     def __post_init__(self) -> None:
         if not self.train or not self.validation:
             raise InputError("fine-tuning wants at least one view to learn from and one to judge by")
+
+    @property
+    def digest(self) -> str:
+        """Of the cameras and the background: what tells these views from others."""
+        cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
+        said = repr((cameras, len(self.validation), self.kept_aside, self.background.tolist()))
+        return hashlib.sha256(said.encode()).hexdigest()
 
     @property
     def kept_aside(self) -> bool:
