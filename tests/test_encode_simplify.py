@@ -190,6 +190,14 @@ def test_a_share_of_the_splats_is_encoded_with_its_colours_fitted(source):
     json.dumps(file.report, allow_nan=False)
 
 
+def test_shapes_are_clustered_by_what_the_views_say_of_them(source):
+    alike = replace(source, quats=source.quats[np.arange(400) % 8], scales=source.scales[np.arange(400) % 8])
+    encoding = EncodeOptions(shape_codebook_size=64, sh_coding="none")
+    file = encode_simplified(alike, target=Target(keep=0.9), encoding=encoding, options=SMALL)
+    assert 0 < file.result.report.options["shape_codebook_size"] <= 60
+    assert len(decode(file.result.data)) == 360
+
+
 def test_fitting_to_the_quantised_geometry_mends_it(source):
     """Coarse geometry, fine colours: fitted colours are better than the source's on views that were not used."""
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)

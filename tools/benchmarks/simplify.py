@@ -73,6 +73,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--scenes", default=_SCENES, help="names, separated by commas; default: %(default)s")
     parser.add_argument("--extra", type=Path, nargs="+", default=[], metavar="PLY", help="further scenes, by file")
     parser.add_argument("--gone", default="10,20,30,40,50,60,70,80", help="per cent removed; default: %(default)s")
+    parser.add_argument("--far", action="store_true", help="removal seen from twice as far, too")
     parser.add_argument("--psnr", default="34,37,40,43", help="of files, dB; default: %(default)s")
     parser.add_argument("--views", type=int, default=160, help="at most; default: %(default)s")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "simplify", help="default: %(default)s")
@@ -118,7 +119,8 @@ def _removal(name: str, path: Path, args: argparse.Namespace) -> None:
     for percent in (int(text) for text in args.gone.split(",")):
         for method in _METHODS:
             kept.measure("removal", f"{percent} {method}", lambda p=percent, m=method: near.one(p, m))
-        kept.measure("removal", f"{percent} far", lambda p=percent: far.one(p, "rounds"))
+        if args.far:
+            kept.measure("removal", f"{percent} far", lambda p=percent: far.one(p, "rounds"))
 
 
 def _far_cameras(source: SplatModel) -> tuple[list[Camera], list[Camera]]:
@@ -174,7 +176,7 @@ class _Bench:
         wanted, own = self._wanted, Judge(views.used, self._wanted)
         for prefix, adjusted in (("fit", False), ("adjusted", True)):
             start = time.perf_counter()
-            fitted = fit(model, views.used, wanted, replace(options, adjust=adjusted), threshold=0.0).model
+            fitted = fit(model, views.used, wanted, replace(options, adjust=adjusted)).model
             result[f"{prefix}_seconds"] = time.perf_counter() - start
             result[f"{prefix}_psnr"] = self._judge.psnr(fitted)
             result[f"{prefix}_used"], result[f"{prefix}_check"] = own.psnr(fitted), self._checked.psnr(fitted)
@@ -252,7 +254,7 @@ def _pass(name: str, path: Path, args: argparse.Namespace) -> None:
 
 
 def _bands(name: str, path: Path, args: argparse.Namespace) -> None:
-    """Bytes of the SH of half a scene whose bands have gone where they show least, written in four ways."""
+    """Bytes of the SH of half a scene whose bands have gone where they show least, written in five ways."""
     source, kept = read_ply(path), _Kept(name, args.out)
     if not source.sh_degree:
         return
@@ -260,7 +262,7 @@ def _bands(name: str, path: Path, args: argparse.Namespace) -> None:
     def measured() -> dict[str, Any]:
         session = prepare(source, None, len(source) - len(source) // 2, SimplifyOptions(views=args.views))
         gone = min(len(source) // 2, len(session.order.rows))
-        fitted = session.fitted(session.pruned(gone), session.threshold(gone))
+        fitted = session.fitted(session.pruned(gone))
         model, stays = fitted.model, fitted.stays
         assert stays is not None
         scalar = EncodeOptions(sh_coding="scalar")
@@ -281,20 +283,28 @@ def _bands(name: str, path: Path, args: argparse.Namespace) -> None:
             "tile cut": cut - geometry,
             "k-means codebook": len(encode_with_report(model, EncodeOptions(sh_coding="codebook")).data) - geometry,
             "values for all": _values_for_all(model, scalar) - geometry,
+            "as runs": _values_for_all(model, scalar, long_run=1) - geometry,
         }
 
     kept.measure("bands", "50", measured)
 
 
-def _values_for_all(model: SplatModel, options: EncodeOptions) -> int:
-    """Size of a file in which every splat has values: bytes of zeros, which DEFLATE makes runs of."""
-    from csplat.encoder import sparse
+def _values_for_all(model: SplatModel, options: EncodeOptions, long_run: int | None = None) -> int:
+    """Size of a file in which every splat has values: bytes of zeros, left to DEFLATE, or as runs where they come so.
 
-    threshold, sparse._WORTH_TRYING = sparse._WORTH_TRYING, 2.0  # noqa: SLF001 - what would be without it
+    Args:
+        model: the scene.
+        options: of the encoder.
+        long_run: mean length from which runs are written as such, bytes; None: the encoder's.
+    """
+    from csplat.encoder import sparse, streams
+
+    before = sparse._WORTH_TRYING, streams._LONG_RUN  # noqa: SLF001 - what would be without them
+    sparse._WORTH_TRYING, streams._LONG_RUN = 2.0, long_run or before[1]  # noqa: SLF001 - as above
     try:
         return len(encode_with_report(model, options).data)
     finally:
-        sparse._WORTH_TRYING = threshold  # noqa: SLF001 - as above
+        sparse._WORTH_TRYING, streams._LONG_RUN = before  # noqa: SLF001 - as above
 
 
 if __name__ == "__main__":

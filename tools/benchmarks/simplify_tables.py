@@ -90,7 +90,7 @@ def _pass_table(results: Results) -> str:
 
 
 def _bands_table(results: Results) -> str:
-    ways = ("values for all", "tile cut", "zero codebooks", "k-means codebook")
+    ways = ("values for all", "as runs", "tile cut", "zero codebooks", "k-means codebook")
     rows = []
     for name, one in results.items():
         for found in one.get("bands", {}).values():

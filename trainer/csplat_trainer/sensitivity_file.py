@@ -64,6 +64,28 @@ class StoredSensitivity:
     shape_matrices: NDArray[np.float32]
     matrices: NDArray[np.float16] | None
 
+    @classmethod
+    def of(
+        cls, model: SplatModel, found: Sensitivity, source: str = "virtual", missed_share: float = float("nan")
+    ) -> StoredSensitivity:
+        """What a file of a scene's sensitivities holds.
+
+        Args:
+            model: the scene that was measured.
+            found: what was measured.
+            source: as the attribute, like the next.
+            missed_share: as the attribute.
+        """
+        return cls(
+            {name: getattr(found, name).astype(np.float32) for name in GROUPS},
+            found.views.astype(np.int32),
+            source,
+            found.view_count,
+            missed_share,
+            _over_mean(found.shape_metric, found.shape_squares / 6.0),
+            None if found.metric is None or not model.sh_degree else _packed(found.metric),
+        )
+
     @property
     def seen(self) -> NDArray[np.bool_]:
         """[N], which splats any view saw."""
@@ -103,9 +125,10 @@ def write_sensitivity(
         source: see `StoredSensitivity`.
         missed_share: see `StoredSensitivity`.
     """
-    arrays: dict[str, Any] = {name: getattr(found, name).astype(np.float32) for name in GROUPS}
-    if found.metric is not None and model.sh_degree:
-        arrays["matrices"] = _packed(found.metric)
+    stored = StoredSensitivity.of(model, found, source, missed_share)
+    arrays: dict[str, Any] = dict(stored.groups)
+    if stored.matrices is not None:
+        arrays["matrices"] = stored.matrices
     np.savez(
         stream,
         format=np.array(_FORMAT),
@@ -113,8 +136,8 @@ def write_sensitivity(
         source=np.array(source),
         view_count=np.array(found.view_count),
         missed_share=np.array(missed_share),
-        views=found.views.astype(np.int32),
-        shape_matrices=_over_mean(found.shape_metric, found.shape_squares / 6.0),
+        views=stored.views,
+        shape_matrices=stored.shape_matrices,
         **arrays,
     )
 

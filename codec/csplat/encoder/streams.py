@@ -18,6 +18,7 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 Integers = NDArray[Any]
 
 _HUFFMAN_EFFORT = 1  # at this effort matches are not worth their search where Huffman codes alone do as well
+_LONG_RUN = 32  # bytes, of the mean run, from which runs are written as such
 _SAMPLE = 4096  # bytes from which the choice between the two is made
 
 
@@ -172,7 +173,7 @@ def _run_length(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     if len(data) < 64:
         return None
     changes = np.flatnonzero(data[1:] != data[:-1])
-    if 32 * (len(changes) + 1) > len(data):
+    if _LONG_RUN * (len(changes) + 1) > len(data):
         return None
     starts = np.concatenate([[0], changes + 1])
     lengths = np.diff(np.append(starts, len(data)))

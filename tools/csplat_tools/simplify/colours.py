@@ -46,7 +46,7 @@ def fit(
     wanted: Sequence[F32],
     options: SimplifyOptions,
     *,
-    threshold: float,
+    error: float | None = None,
     centre: SplatModel | None = None,
     fixed: bool = False,
     progress: Progress | None = None,
@@ -58,7 +58,8 @@ def fit(
         cameras: the views.
         wanted: what the source looks like there.
         options: whether to fit, to adjust and to choose bands, steps, background.
-        threshold: error up to which a whole splat is not worth its bits: what bands are measured by.
+        error: squared error over these views that the scene is to end with, by which bands are measured; None for
+            what is left after the fits.
         centre: the scene to whose colours the ridge pulls; the same as `model` if left out.
         fixed: opacities and scales may not be adjusted.
         progress: is told how much is done.
@@ -77,15 +78,15 @@ def fit(
     if options.refit:
         model = fitted(model, options.steps, None)
     if options.refit and options.adjust and not fixed:
-        error = max(0.0, errors[-1][-1]) / sum(picture.size for picture in wanted)
-        moved = fitted(
-            adjust(model, cameras, wanted, options, error=error**0.5, progress=progress), _SECOND_STEPS, None
-        )
+        rms = (max(0.0, errors[-1][-1]) / sum(picture.size for picture in wanted)) ** 0.5
+        moved = adjust(model, cameras, wanted, options, error=rms, progress=progress)
+        moved = fitted(moved, _SECOND_STEPS, None)
         model = moved if errors[-1][-1] < errors[-2][-1] else model
     if not options.bands or not model.sh_degree:
         return Fitted(model, None, tuple(errors))
     removal = measure_removal(model, cameras, background=options.background, threads=options.threads, progress=progress)
-    stays = band_mask(removal, threshold)
+    left = min(one[-1] for one in errors) if errors else 0.0
+    stays = band_mask(removal, (left if error is None else error) / max(1, len(model)))
     if not stays.all():
         model = without(model, stays)
         if options.refit:

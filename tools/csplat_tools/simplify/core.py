@@ -82,12 +82,9 @@ class Session:
         """The largest error among the first `gone`."""
         return float(self.order.errors[:gone].max(initial=0.0))
 
-    def fitted(self, rows: I64, threshold: float, progress: Progress | None = None) -> Fitted:
+    def fitted(self, rows: I64, progress: Progress | None = None) -> Fitted:
         """Fit what is left."""
-        return fit(
-            self.source.select(rows), self.views.used, self.wanted, self.options, threshold=threshold,
-            progress=progress,
-        )  # fmt: skip
+        return fit(self.source.select(rows), self.views.used, self.wanted, self.options, progress=progress)
 
 
 def prepare(
@@ -196,7 +193,7 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
     """Remove, fit, and say how good it is."""
     rows, threshold = session.pruned(gone), session.threshold(gone)
     pruned = session.source.select(rows)
-    fitted = session.fitted(rows, threshold, progress)
+    fitted = session.fitted(rows, progress)
     report: dict[str, Any] = {
         "gone": gone,
         "check_psnr_pruned": session.checked.psnr(pruned),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
 from csplat.encoder.between import Between
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -26,6 +26,8 @@ from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
 from csplat_tools.simplify.judge import Judge
 from csplat_tools.simplify.options import SimplifyOptions, Target
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
 
 __all__ = ["SimplifiedFile", "encode_simplified"]
 
@@ -33,11 +35,13 @@ F32 = NDArray[np.float32]
 Progress = Callable[[str, float], None]
 Encoded = Callable[[EncodeOptions, float], "SimplifiedFile"]
 
-_MARGINS = (0.0, 3.0)  # dB above the target to which splats are removed, before what stays is fitted and quantised
+_MARGIN = 1.0  # dB above the target to which splats are removed at first, before what stays is fitted
+_ROOM = (2.0, 4.0)  # dB that a fit leaves for quantisation, without and with SH, when a second number is tried
+_CAREFUL = 5.0  # dB to which splats are removed the second time, where the first was too many
 _QUALITIES = (30.0, 80.0)  # dB, between which the encoder's is looked for
 _TRIES = 5
 _NEAR = 0.15  # dB above the target that are good enough
-_LOSS = 6.0  # dB between what each attribute keeps by itself and what all keep together
+_LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
 _BYTES_PER_DB = 0.08  # share of the bytes that a decibel costs, about
 _SHORT = 3  # steps of a fit that begins where another one ended
 
@@ -94,42 +98,57 @@ def encode_simplified(
     if left is not None:
         gone = min(len(source) - left, len(session.order.rows))
         return _Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
+    has_sh = source.sh_degree > 0 and encoding.sh_degree != 0
     codings = [encoding.sh_coding]
-    if encoding.sh_coding == "auto" and source.sh_degree:
+    if encoding.sh_coding == "auto" and has_sh:
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
     choices = [replace(encoding, sh_coding=coding) for coding in codings]
-    found = [_smallest(partial(_plain, source, judge, progress), choices, goal)]
-    for margin in _MARGINS:
+    found = [_smallest(partial(_plain, source, judge, progress), choices, goal, has_sh=has_sh)]
+    margin = _MARGIN
+    for _ in range(2):
         gone = most_gone(session, judge, goal + margin)
-        if gone:
-            candidate = _Candidate(session, gone, judge, progress)
-            found.append(_smallest(candidate.encoded, choices, goal))
-    reached = [file for file in found if file is not None]
+        if not gone:
+            break
+        candidate = _Candidate(session, gone, judge, progress, goal)
+        found.append(_smallest(candidate.encoded, choices, goal, has_sh=has_sh))
+        spare = candidate.psnr - goal - _ROOM[has_sh]
+        margin = margin - spare if spare > 0.0 else _CAREFUL
+    reached = [one for one in found if one is not None]
     if not reached:
         raise InputError(f"no file reaches {goal:.2f} dB: the target is too high for this scene")
-    best = min(reached, key=lambda file: len(file.result.data))
-    tried = [
-        {"splats": f.report["splats"], "size_bytes": len(f.result.data), "psnr": f.report["psnr"]} for f in reached
-    ]
+    best = min(reached, key=_size)
+    tried = [{"splats": one.report["splats"], "size_bytes": _size(one), "psnr": one.report["psnr"]} for one in reached]
     return replace(best, report={**best.report, "goal": goal, "tried": tried})
+
+
+def _size(file: SimplifiedFile) -> int:
+    return len(file.result.data)
 
 
 class _Candidate:
     """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins."""
 
-    def __init__(self, session: Session, gone: int, judge: Judge, progress: Progress | None) -> None:
+    def __init__(
+        self, session: Session, gone: int, judge: Judge, progress: Progress | None, goal: float | None = None
+    ) -> None:
         self._session, self._judge, self._progress = session, judge, progress
-        self._rows, self._threshold = session.pruned(gone), session.threshold(gone)
+        self._rows = session.pruned(gone)
+        self._error = None if goal is None else 10.0 ** (-goal / 10.0) * session.views.removal.value_count
         self._pruned = session.source.select(self._rows)
         self._last: SplatModel | None = None
         options = session.options
         self._fitted = fit(
-            self._pruned, session.views.used, session.wanted, replace(options, bands=False), threshold=0.0,
-            progress=progress,
-        ).model  # fmt: skip
+            self._pruned, session.views.used, session.wanted, replace(options, bands=False), progress=progress
+        ).model
         self._weights = measure_removal(
             self._fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
         ).squared_weight
+        self._importance: Importance | None = None
+
+    @property
+    def psnr(self) -> float:
+        """Of what is fitted, before anything is quantised."""
+        return self._judge.psnr(self._fitted)
 
     def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
         """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
@@ -141,7 +160,7 @@ class _Candidate:
             if self._last is not None:
                 start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
             fitted = fit(
-                start, session.views.used, session.wanted, options, threshold=self._threshold, centre=self._pruned,
+                start, session.views.used, session.wanted, options, error=self._error, centre=self._pruned,
                 fixed=True, progress=self._progress,
             )  # fmt: skip
             self._last = fitted.model
@@ -161,11 +180,22 @@ class _Candidate:
         result = encode_with_report(
             self._fitted,
             replace(encoding, quality=quality),
-            importance=self._weights,
+            importance=self._weights if encoding.shape_codebook_size is None else self._by_shape(),
             between=between,
             progress=self._progress,
         )
         return SimplifiedFile(result, report)
+
+    def _by_shape(self) -> Importance:
+        """How much pictures depend on shapes, too."""
+        if self._importance is None:
+            session, options = self._session, self._session.options
+            found = measure_sensitivity(
+                self._fitted, session.views.used, background=options.background, threads=options.threads,
+                progress=self._progress,
+            )  # fmt: skip
+            self._importance = replace(StoredSensitivity.of(self._fitted, found).importance(), sh=self._weights)
+        return self._importance
 
 
 def _plain(
@@ -177,13 +207,15 @@ def _plain(
     return SimplifiedFile(result, {**report, "psnr": judge.psnr(decode(result.data))})
 
 
-def _smallest(encoded: Encoded, choices: Sequence[EncodeOptions], goal: float) -> SimplifiedFile | None:
+def _smallest(
+    encoded: Encoded, choices: Sequence[EncodeOptions], goal: float, *, has_sh: bool
+) -> SimplifiedFile | None:
     """The smallest file that reaches a PSNR, by the choice that is best at a first quality, or else the next best."""
-    quality = min(max(goal + _LOSS, _QUALITIES[0]), _QUALITIES[1])
+    quality = min(max(goal + _LOSS[has_sh], _QUALITIES[0]), _QUALITIES[1])
     first = [(choice, encoded(choice, quality)) for choice in choices]
 
     def cost(one: tuple[EncodeOptions, SimplifiedFile]) -> float:
-        return math.log(len(one[1].result.data)) - _BYTES_PER_DB * float(one[1].report["psnr"])
+        return math.log(_size(one[1])) - _BYTES_PER_DB * float(one[1].report["psnr"])
 
     for choice, file in sorted(first, key=cost):
         best = _at_quality(partial(encoded, choice), file, goal)
@@ -204,7 +236,7 @@ def _at_quality(encoded: Callable[[float], SimplifiedFile], file: SimplifiedFile
         reached = file.report["psnr"]
         if reached >= goal:
             high = quality
-            if best is None or len(file.result.data) < len(best.result.data):
+            if best is None or _size(file) < _size(best):
                 best = file
             if reached < goal + _NEAR:
                 break

@@ -49,7 +49,9 @@ Progress = Callable[[str, float], None]
 
 _BATCH = 40  # virtual views that are added at a time
 _CHECKS = 16  # virtual views that are kept aside
-_AGREED = 1.0  # dB between what is predicted for used views and for others, below which there are enough
+# dB between what is predicted for used views and for others, below which there are enough. Fits follow their views
+# farther than choices do: at 1 dB lego60k stops at 40 views, and is 3 dB better on others with 160.
+_AGREED = 0.1
 _SETTLED = 0.005  # share of the splats that the check views alone show, below which there are enough
 
 
