@@ -1,0 +1,244 @@
+"""One scene compressed in many ways, each judged on its held-out photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from compression_scenes import Scene
+from compression_sizes import books_of
+from numpy.typing import NDArray
+
+from csplat.decoder import decode, read_header
+from csplat.encoder import EncodeOptions, EncodeResult
+from csplat.encoder.between import Between
+from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.encoder.frozen import Frozen, Held
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_render.lpips import Lpips
+from csplat_render.rasterise import Rasteriser
+from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
+from csplat_tools.importances import Measured
+from csplat_tools.layout import describe
+from csplat_tools.photographs import show_photograph
+from csplat_trainer.finetune import FinetuneOptions, Views, finetune
+from csplat_trainer.report import save_picture, side_by_side
+from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
+
+__all__ = ["ARRAYS", "Bench", "Clock", "Tuned"]
+
+#: Arrays of a model.
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+#: Splats, and the seconds that it took to choose them, by stage.
+Pick = tuple[Chosen, dict[str, float]]
+
+Scores = dict[str, dict[str, float | None]]
+
+
+@dataclass
+class Clock:
+    """Seconds by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what happens inside."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """A scene that was frozen and tuned.
+
+    Attributes:
+        chosen: its splats.
+        frozen: what the encoder decided.
+        held: the values that were tuned.
+        plain: the file before tuning. result: the file.
+        log: of the tuning.
+        seconds: by stage, without those of judging.
+    """
+
+    chosen: Chosen
+    frozen: Frozen
+    held: Held
+    plain: EncodeResult
+    result: EncodeResult
+    log: Mapping[str, Any]
+    seconds: Mapping[str, float]
+
+
+class Bench:
+    """Compresses one scene over and over. Owns what all ways have in common, found once.
+
+    Args:
+        scene: what is compressed.
+        ply: its splats.
+        encoding: what the encoder is told where a way does not say otherwise.
+        tuning: how is tuned.
+        lpips: weights, or `None`: not measured.
+        scratch: an existing folder for sensitivities.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        ply: Path,
+        encoding: EncodeOptions,
+        tuning: FinetuneOptions,
+        lpips: Lpips | None,
+        scratch: Path,
+    ) -> None:
+        self.scene, self.encoding, self.tuning, self._lpips = scene, encoding, tuning, lpips
+        self.source = read_ply(ply)
+        self._sources = Sources(str(scene.data), scene.size, background=scene.background)
+        self.looks = Looks.read(self.source, self._sources, quiet=True)
+        if self.looks.data is None or not self.looks.data.test:
+            raise InputError(f"{scene.data} holds out no photographs to judge by")
+        self._importance = scratch / f"{scene.name}.sensitivity.npz"
+        self._clock = Clock()
+        self._picks: dict[tuple[float | None, bool], Pick] = {}
+
+    @property
+    def threads(self) -> int | None:
+        """How many; `None` for all."""
+        return self.encoding.threads
+
+    @cached_property
+    def views(self) -> Views:
+        """What teaches, and what judges on the way."""
+        return self.looks.views(self.source, self._sources, self.threads)
+
+    @cached_property
+    def sensitivity(self) -> Sensitivity:
+        """Measured from the training views."""
+        first = self.source.select(np.zeros(1, np.intp))
+        measure_sensitivity(first, self.looks.cameras[:1], metric=True)  # compiles
+        with self._clock.stage("sensitivity"):
+            found = measure_sensitivity(
+                self.source, self.looks.cameras, background=self.looks.background, metric=True, threads=self.threads
+            )
+            Measured(self.source, found, "training", float("nan")).write(str(self._importance))
+        return found
+
+    def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
+        """The splats that stay, and the seconds that it took to find them.
+
+        Args:
+            keep: share of the source's splats; `None`: all that any view shows.
+            told: whether the encoder is told the sensitivities; otherwise the squared shares of pixels.
+        """
+        if (keep, told) not in self._picks:
+            self._picks[keep, told] = self._pick(keep, told=told)
+        return self._picks[keep, told]
+
+    def _pick(self, keep: float | None, *, told: bool) -> Pick:
+        _ = self.sensitivity  # its file is wanted
+        clock = Clock(dict(self._clock.seconds) if told else {})
+        sources = replace(self._sources, keep=keep)
+        with clock.stage("choosing"):
+            file = str(self._importance) if told else None
+            chosen = choose_splats(self.source, self.looks, sources, file, self.threads)
+        return chosen, clock.seconds
+
+    def between(self, rows: NDArray[np.int64]) -> Between:
+        """Where the splats come from."""
+        return Between(len(self.source), rows)
+
+    def tuned(self, encoding: EncodeOptions, pick: Pick | None = None) -> Tuned:
+        """Freeze, tune, write.
+
+        Args:
+            encoding: what the encoder is told.
+            pick: splats, and the seconds that they took; `None`: all that are seen.
+        """
+        chosen, seconds = pick or self.chosen()
+        views, stages = self.views, _Stages()
+        clock = Clock(dict(seconds))
+        with clock.stage("clustering"):
+            frozen = freeze(
+                chosen.model, encoding, importance=chosen.importance, between=self.between(chosen.rows),
+                source=self.source, progress=stages,
+            )  # fmt: skip
+        plain = encode_frozen(frozen, frozen.start())  # not a part of the work: what it would have been without
+        with clock.stage("tuning"):
+            run = finetune(frozen, views, self.tuning, threads=self.threads)
+        with clock.stage("encoding"):
+            result = encode_frozen(frozen, run.held)
+        return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
+
+    def row(self, tuned: Tuned) -> dict[str, Any]:
+        """What came of it, JSON-compatible: sizes and scores before and after tuning."""
+        before, after = decode(tuned.plain.data), decode(tuned.result.data)
+        assert _same(tuned, after), "the decoded file is not what was tuned"
+        scores = self.judge({"before": before, "after": after})
+        colours, shapes = books_of(tuned.frozen)
+        kept = len(tuned.frozen.source_index)
+        described = describe(tuned.result.data, read_header(tuned.result.data))
+        return {
+            "splats": kept,
+            "before_bytes": len(tuned.plain.data),
+            "after_bytes": len(tuned.result.data),
+            "before": scores["before"],
+            "after": scores["after"],
+            "sh_entries": 0 if colours is None else colours.entries,
+            "sh_escapes": None if colours is None else colours.escaped / kept,
+            "shapes": 0 if shapes is None else shapes.entries,
+            "shape_escapes": None if shapes is None else shapes.escaped / kept,
+            "attribute_bytes": {name: one["size_bytes"] for name, one in described["attributes"].items()},
+            "steps": tuned.log["steps"],
+            "best_step": tuned.log["best_iteration"],
+            "seconds": dict(tuned.seconds),
+            "encoding": tuned.result.report.options,
+        }
+
+    def judge(self, models: Mapping[str, SplatModel]) -> Scores:
+        """Scores on the held-out photographs, by name."""
+        judged = self.looks.judge(self.source, dict(models), self._lpips, self.threads)
+        assert judged is not None
+        return {name: dict(one) for name, one in judged.scores.items()}
+
+    def picture(self, tuned: Tuned, path: Path) -> None:
+        """The middle one of the held-out photographs, beside source, file before tuning, and file."""
+        assert self.looks.data is not None
+        test = self.looks.data.test
+        one, rasteriser = test[len(test) // 2], Rasteriser(gradients=False, threads=self.threads)
+        panels = [show_photograph(one, self.looks.background)]
+        for model in (self.source, decode(tuned.plain.data), decode(tuned.result.data)):
+            seen = rasteriser.forward(
+                model, one.camera, background=self.looks.background, antialiased=model.antialiased
+            )
+            panels.append(seen.rgb.copy())
+        save_picture(path, side_by_side(*panels))
+
+
+class _Stages:
+    """When the encoder has done with shapes: what it tells while it decides."""
+
+    def __init__(self) -> None:
+        self._begin, self.shapes = time.perf_counter(), 0.0
+
+    def __call__(self, stage: str, done: float) -> None:
+        if stage == "shapes" and done == 1.0:
+            self.shapes = round(time.perf_counter() - self._begin, 3)
+
+
+def _same(tuned: Tuned, decoded: SplatModel) -> bool:
+    """Whether a decoded file holds what was tuned, bit for bit."""
+    seen = tuned.frozen.seen(tuned.held)
+    places = np.argsort(tuned.frozen.source_index)[
+        np.searchsorted(np.sort(tuned.frozen.source_index), tuned.result.source_index)
+    ]
+    return all(np.array_equal(getattr(decoded, name), getattr(seen, name)[places]) for name in ARRAYS)
