@@ -18,7 +18,7 @@ from csplat.model import SplatModel
 from csplat_tools.app import app
 from csplat_tools.proof import prove
 from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
-from csplat_tools.simplify.judge import Judge
+from csplat_tools.simplify.judge import Judge, render_pictures
 from csplat_tools.simplify.views import camera_sequence
 
 SMALL = SimplifyOptions(views=16, view_size=(48, 36), steps=4, rounds=2)
@@ -218,6 +218,21 @@ def test_a_file_of_a_target_psnr_is_never_larger_than_without(source, goal):
     sizes = [one["size_bytes"] for one in file.report["tried"]]
     assert len(file.result.data) == min(sizes)
     assert file.report["tried"][0]["splats"] == 400  # the whole scene was among them
+
+
+def test_a_loss_against_photographs_lets_splats_go(source):
+    """Photographs that the source misses by 25 dB: what may be lost is measured by renders, what was by photographs."""
+    cameras = camera_sequence(source, 24, (48, 36), seed=3)
+    rng = np.random.default_rng(1)
+    photographs = [np.clip(p + 0.06 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
+    judge = Judge(cameras, photographs)
+    file = encode_simplified(
+        source, cameras, target=Target(max_loss=0.5), options=SMALL, photographs=(cameras, photographs)
+    )
+    assert judge.psnr(source) < 28.0
+    assert judge.psnr(decode(file.result.data)) >= judge.psnr(source) - 0.5
+    assert file.report["splats"] < 400
+    assert len(file.result.data) < file.report["tried"][0]["size_bytes"]
 
 
 def test_a_psnr_that_no_file_has_is_refused(source):

@@ -24,7 +24,7 @@ from csplat_render import Camera
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
-from csplat_tools.simplify.judge import Judge
+from csplat_tools.simplify.judge import Judge, loss_as_psnr
 from csplat_tools.simplify.options import SimplifyOptions, Target
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -103,15 +103,20 @@ def encode_simplified(
     if encoding.sh_coding == "auto" and has_sh:
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
     choices = [replace(encoding, sh_coding=coding) for coding in codings]
-    found = [_smallest(partial(_plain, source, judge, progress), choices, goal, has_sh=has_sh)]
+    by_source, allowed = judge, goal
+    if target.max_loss is not None and photographs is not None:
+        # Photographs are missed by far more than what may be lost: room is measured by the source's renders.
+        by_source, allowed = session.checked, loss_as_psnr(target.max_loss, goal + target.max_loss)
+    quality = min(max(allowed + _LOSS[has_sh], _QUALITIES[0]), _QUALITIES[1])
+    found = [_smallest(partial(_plain, source, judge, progress), choices, goal, quality)]
     margin = _MARGIN
     for _ in range(2):
-        gone = most_gone(session, judge, goal + margin)
+        gone = most_gone(session, by_source, allowed + margin)
         if not gone:
             break
-        candidate = _Candidate(session, gone, judge, progress, goal)
-        found.append(_smallest(candidate.encoded, choices, goal, has_sh=has_sh))
-        spare = candidate.psnr - goal - _ROOM[has_sh]
+        candidate = _Candidate(session, gone, judge, progress, allowed)
+        found.append(_smallest(candidate.encoded, choices, goal, quality))
+        spare = by_source.psnr(candidate.fitted) - allowed - _ROOM[has_sh]
         margin = margin - spare if spare > 0.0 else _CAREFUL
     reached = [one for one in found if one is not None]
     if not reached:
@@ -126,29 +131,28 @@ def _size(file: SimplifiedFile) -> int:
 
 
 class _Candidate:
-    """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins."""
+    """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins.
+
+    Attributes:
+        fitted: what stays, before anything is quantised.
+    """
 
     def __init__(
-        self, session: Session, gone: int, judge: Judge, progress: Progress | None, goal: float | None = None
+        self, session: Session, gone: int, judge: Judge, progress: Progress | None, allowed: float | None = None
     ) -> None:
         self._session, self._judge, self._progress = session, judge, progress
         self._rows = session.pruned(gone)
-        self._error = None if goal is None else 10.0 ** (-goal / 10.0) * session.views.removal.value_count
+        self._error = None if allowed is None else 10.0 ** (-allowed / 10.0) * session.views.removal.value_count
         self._pruned = session.source.select(self._rows)
         self._last: SplatModel | None = None
         options = session.options
-        self._fitted = fit(
+        self.fitted = fit(
             self._pruned, session.views.used, session.wanted, replace(options, bands=False), progress=progress
         ).model
         self._weights = measure_removal(
-            self._fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
+            self.fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
         ).squared_weight
         self._importance: Importance | None = None
-
-    @property
-    def psnr(self) -> float:
-        """Of what is fitted, before anything is quantised."""
-        return self._judge.psnr(self._fitted)
 
     def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
         """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
@@ -178,7 +182,7 @@ class _Candidate:
             len(session.source), self._rows, colours, said, adjusted=session.options.adjust, figures=figures
         )
         result = encode_with_report(
-            self._fitted,
+            self.fitted,
             replace(encoding, quality=quality),
             importance=self._weights if encoding.shape_codebook_size is None else self._by_shape(),
             between=between,
@@ -191,10 +195,10 @@ class _Candidate:
         if self._importance is None:
             session, options = self._session, self._session.options
             found = measure_sensitivity(
-                self._fitted, session.views.used, background=options.background, threads=options.threads,
+                self.fitted, session.views.used, background=options.background, threads=options.threads,
                 progress=self._progress,
             )  # fmt: skip
-            self._importance = replace(StoredSensitivity.of(self._fitted, found).importance(), sh=self._weights)
+            self._importance = replace(StoredSensitivity.of(self.fitted, found).importance(), sh=self._weights)
         return self._importance
 
 
@@ -207,11 +211,8 @@ def _plain(
     return SimplifiedFile(result, {**report, "psnr": judge.psnr(decode(result.data))})
 
 
-def _smallest(
-    encoded: Encoded, choices: Sequence[EncodeOptions], goal: float, *, has_sh: bool
-) -> SimplifiedFile | None:
+def _smallest(encoded: Encoded, choices: Sequence[EncodeOptions], goal: float, quality: float) -> SimplifiedFile | None:
     """The smallest file that reaches a PSNR, by the choice that is best at a first quality, or else the next best."""
-    quality = min(max(goal + _LOSS[has_sh], _QUALITIES[0]), _QUALITIES[1])
     first = [(choice, encoded(choice, quality)) for choice in choices]
 
     def cost(one: tuple[EncodeOptions, SimplifiedFile]) -> float:
