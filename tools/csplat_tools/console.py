@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, ParamSpec, TextIO
+from typing import Any, ParamSpec, Protocol, TextIO, TypeVar
 
 import typer
 from rich.console import Console
@@ -30,10 +30,13 @@ __all__ = [
     "progress_bar",
     "say",
     "say_json",
+    "step_progress",
 ]
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+_LINES = 10  # of progress where there is no terminal
 
 #: What the encoder calls: the name of the stage, and how much of it is done, 0 to 1.
 Report = Callable[[str, float], None]
@@ -103,6 +106,53 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Report | None]:
             progress.update(tasks[stage], completed=done)
 
         yield report
+
+
+class Step(Protocol):
+    """How far a long run has come."""
+
+    @property
+    def iteration(self) -> int: ...
+
+    @property
+    def iterations(self) -> int: ...
+
+
+S = TypeVar("S", bound=Step)
+
+
+@contextmanager
+def step_progress(
+    name: str, tell: Callable[[S], str], *, iterations: int, log_every: int, quiet: bool = False
+) -> Iterator[Callable[[S], None] | None]:
+    """Show the steps of a long run: a bar on a terminal, some lines elsewhere, nothing where nothing is wanted.
+
+    Args:
+        name: of what is done.
+        tell: says in a line where a run stands.
+        iterations: steps in all.
+        log_every: steps from one report to the next.
+        quiet: show nothing.
+    """
+    if quiet:
+        yield None
+        return
+    if not sys.stderr.isatty():
+        every = max(1, iterations // _LINES)
+
+        def line(now: S) -> None:
+            if now.iteration // every > (now.iteration - log_every) // every or now.iteration == now.iterations:
+                note(tell(now))
+
+        yield line
+        return
+    with Progress(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, total=iterations)
+
+        def show(now: S) -> None:
+            bar.update(task, completed=now.iteration, description=tell(now))
+
+        yield show
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

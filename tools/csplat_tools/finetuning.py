@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bar
 
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodeResult
@@ -22,7 +18,7 @@ from csplat.encoder.freezing import encode_frozen, freeze
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_tools.console import note, progress_bar
+from csplat_tools.console import note, progress_bar, step_progress
 from csplat_tools.finetune_report import as_report
 from csplat_tools.finetune_sources import Looks, Sources, choose_splats
 from csplat_tools.inout import ply_path, write_bytes
@@ -33,8 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["Files", "run_finetuning"]
 
 I64 = NDArray[np.int64]
-
-_LINES = 10  # of progress where there is no terminal
 
 
 @dataclass(frozen=True)
@@ -109,7 +103,8 @@ def run_finetuning(
                     progress=progress,
                 )  # fmt: skip
                 plain = encode_frozen(frozen, frozen.start())
-        with clock.stage("tuning"), _shown(options, quiet=quiet) as show:
+        shown = step_progress("tuning", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
+        with clock.stage("tuning"), shown as show:
             tuned = finetune(
                 frozen, views, options, progress=show, checkpoint=files.checkpoint,
                 checkpoint_every=files.checkpoint_every, resume=files.resume, threads=threads,
@@ -148,31 +143,6 @@ def _check_identity(seen: Any, source_index: I64, result: EncodeResult, decoded:
     rows = places[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         assert np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]), f"{name} was tuned as something else"
-
-
-@contextmanager
-def _shown(options: FinetuneOptions, *, quiet: bool) -> Iterator[Callable[[Moment], None] | None]:
-    """A bar on a terminal, some lines elsewhere, nothing where nothing is wanted."""
-    if quiet:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        every = max(1, options.iterations // _LINES)
-
-        def tell(now: Moment) -> None:
-            last = now.iteration - options.log_every
-            if now.iteration // every > last // every or now.iteration == now.iterations:
-                note(_state(now))
-
-        yield tell
-        return
-    with Bar(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("tuning", total=options.iterations)
-
-        def show(now: Moment) -> None:
-            bar.update(task, completed=now.iteration, description=_state(now))
-
-        yield show
 
 
 def _state(now: Moment) -> str:

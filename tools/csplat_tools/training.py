@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bar
-
 from csplat.errors import InputError
-from csplat_tools.console import note
+from csplat_tools.console import note, step_progress
 from csplat_tools.extras import need_trainer
 from csplat_tools.inout import write_model
 
@@ -25,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Files", "Reading", "run_training"]
 
-_LINES = 10  # of progress where there is no terminal
 _FRUGAL_SPINS = "1000"  # see _wait_frugally
 
 
@@ -88,7 +80,9 @@ def run_training(
     with thread_count(threads):
         if options.device == "cpu":
             warm_up(None if quiet else note)
-        with _shown_progress(options, quiet=quiet) as show:
+        with step_progress(
+            "training", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet
+        ) as show:
             result = train(data, options, show, outputs)
     write_model(files.output, result.model, absolute=False)
     if files.log is not None:
@@ -127,30 +121,6 @@ def _wait_frugally() -> None:
     library is loaded, so set before; what the user has set stays.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", _FRUGAL_SPINS)
-
-
-@contextmanager
-def _shown_progress(options: TrainOptions, *, quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """A bar on a terminal, some lines elsewhere, nothing where nothing is wanted."""
-    if quiet:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        every = max(1, options.iterations // _LINES)
-
-        def tell(now: Progress) -> None:
-            if now.iteration // every > (now.iteration - options.log_every) // every or now.iteration == now.iterations:
-                note(_state(now))
-
-        yield tell
-        return
-    with Bar(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("training", total=options.iterations)
-
-        def show(now: Progress) -> None:
-            bar.update(task, completed=now.iteration, description=_state(now))
-
-        yield show
 
 
 def _state(now: Progress) -> str:

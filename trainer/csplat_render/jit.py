@@ -18,7 +18,6 @@ from csplat.errors import InputError
 __all__ = [
     "LOCK",
     "available_threads",
-    "fast_exp",
     "fast_exp2",
     "inline",
     "kernel",
@@ -88,11 +87,6 @@ def fast_exp2(x: float) -> float:
     return math.exp(x * _LN2)
 
 
-def fast_exp(x: float) -> float:
-    """exp(x) for x < 88 in kernels, see `fast_exp2`."""
-    return math.exp(x)
-
-
 def _fast_exp2(x: Any) -> Callable[[Any], Any]:
     def exact(x: Any) -> Any:
         return math.exp(x * _LN2)
@@ -116,19 +110,7 @@ def _fast_exp2(x: Any) -> Callable[[Any], Any]:
     return polynomial
 
 
-def _fast_exp(x: Any) -> Callable[[Any], Any]:
-    def exact(x: Any) -> Any:
-        return math.exp(x)
-
-    def polynomial(x: Any) -> Any:
-        return fast_exp2(x * log2e)
-
-    log2e = np.float32(1.0 / _LN2)
-    return polynomial if x == numba.types.float32 else exact
-
-
-for _function, _compiled in ((fast_exp2, _fast_exp2), (fast_exp, _fast_exp)):
-    extending.overload(_function, jit_options={"fastmath": _RELAXED}, inline="always")(_compiled)
+extending.overload(fast_exp2, jit_options={"fastmath": _RELAXED}, inline="always")(_fast_exp2)
 
 
 def python(compiled: Callable[P, R]) -> Callable[P, R]:

@@ -178,9 +178,8 @@ class _Candidate:
             return {"psnr": round(report["psnr"], 3), "check_psnr": round(report["check_psnr"], 3)}
 
         said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
-        between = Between(
-            len(session.source), self._rows, colours, said, adjusted=session.options.adjust, figures=figures
-        )
+        adjusted = session.options.refit and session.options.adjust
+        between = Between(len(session.source), self._rows, colours, said, adjusted=adjusted, figures=figures)
         result = encode_with_report(
             self.fitted,
             replace(encoding, quality=quality),
