@@ -481,6 +481,39 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
     call(*words, "--importance", tmp_path / "w.npy")
 
 
+def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path):
+    call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--byte-cost", 0)
+    call(*words, "-o", tmp_path / "a.csplat", "--importance", tmp_path / "s.npz")
+    call(*words, "-o", tmp_path / "b.csplat")
+    assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
+
+
+def test_the_file_says_what_the_ply_does_not(capture, tmp_path):
+    out, index = tmp_path / "s.csplat", tmp_path / "index.npy"
+    call(
+        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1, "--source-index", index,
+        "--axes", "RUB", "--unit-metres", 0.5, "--licence", "CC0-1.0",
+    )  # fmt: skip
+    decoded = decode(out.read_bytes())
+    assert ("RUB", 0.5, "CC0-1.0") == (
+        decoded.coordinate_system, decoded.unit_metres, decoded.metadata["licence"]
+    )  # fmt: skip
+    call("verify", out, "--source", capture / "scene.ply", "--source-index", index)
+    assert np.array_equal(np.arange(1, 301), np.sort(np.load(index)))  # all but the one behind the cameras
+
+
+def test_defects_can_be_refused(capture, source, tmp_path):
+    broken = source.select(np.arange(300))
+    broken.means[0] = np.nan
+    write_ply(tmp_path / "broken.ply", broken)
+    words = ("finetune", tmp_path / "broken.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 1)
+    refused = invoke(*words, "--strict")
+    assert 1 == refused.exit_code
+    assert not (tmp_path / "s.csplat").exists()
+    assert "repair" in call(*words).stderr
+
+
 def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
     words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 2)
     facts = json.loads(call(*words, "--test-every", 0, "--aside", 2, "--say-json", "-q").stdout)
@@ -491,8 +524,9 @@ def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
 
 def test_every_knob_of_the_encoder_is_there():
     names = set(inspect.signature(finetune_command).parameters)
-    assert {field.name for field in fields(EncodeOptions)} <= names
-    assert "encoding" not in names
+    facts = {"axes", "unit_metres", "antialiased", "licence"}
+    assert {field.name for field in fields(EncodeOptions)} | facts <= names
+    assert names.isdisjoint({"encoding", "facts"})
 
 
 def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):

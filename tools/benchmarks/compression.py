@@ -172,7 +172,7 @@ def _scene(scene: Scene, how: How, lpips: Lpips | None, machine: dict[str, str],
     ply, training = trained(scene, args.out, _tell)
     kept = Kept(args.out / f"{scene.name}.json", _settings(scene, ply, encoding, tuning, args), _tell)
     kept.values["machine"] = machine
-    bench = Bench(scene, ply, encoding, tuning, lpips, args.out)
+    bench = Bench(scene, ply, encoding, tuning, lpips)
     kept.measure("facts", "scene", partial(facts_of, bench, training))
     jobs = [job for job in find_jobs(bench, kept, ways, args) if job[0] in what and not kept.knows(*job[:2])]
     if jobs:

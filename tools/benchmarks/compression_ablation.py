@@ -49,7 +49,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[dict[str, Any]]:
     shape_seconds = log["of it shapes"]
     rows: list[tuple[str, str, str, int, float]] = [
         ("none", "none", "PLY", ply_bytes(len(bench.source)), 0.0),
-        ("prune unseen", "pruned", "PLY", ply_bytes(size), log["choosing"] + log.get("sensitivity", 0.0)),
+        ("prune unseen", "pruned", "PLY", ply_bytes(size), log["choosing"]),
         ("+ colour codebook" + ("" if colours else " (none made)"), "colours", "floats",
          float_bytes(size, coefficients, colours, None), log["clustering"] - shape_seconds),
         ("+ shape codebook" + ("" if shapes else " (none made)"), "shapes", "floats",

@@ -16,6 +16,7 @@ from compression_scenes import Kept
 from csplat.encoder import EncodeOptions
 from csplat.encoder.freezing import freeze
 from csplat_trainer.finetune import FinetuneOptions, finetune
+from csplat_trainer.sensitivity import measure_sensitivity
 
 __all__ = ["Ways", "facts_of", "find_jobs", "find_ways", "warm"]
 
@@ -99,3 +100,4 @@ def warm(bench: Bench) -> None:
     some = bench.source.select(slice(0, 500))
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
     finetune(freeze(some, options), bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
+    measure_sensitivity(some, bench.looks.cameras[:1], metric=True)

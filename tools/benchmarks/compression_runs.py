@@ -25,13 +25,14 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.lpips import Lpips
 from csplat_render.rasterise import Rasteriser
+from csplat_render.removal import measure_removal
 from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
-from csplat_tools.importances import Measured
+from csplat_tools.importances import measure_views
 from csplat_tools.layout import describe
 from csplat_tools.photographs import show_photograph
 from csplat_trainer.finetune import FinetuneOptions, Views, finetune
 from csplat_trainer.report import save_picture, side_by_side
-from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
+from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = ["ARRAYS", "Bench", "Clock", "Tuned"]
 
@@ -89,7 +90,6 @@ class Bench:
         encoding: what the encoder is told where a way does not say otherwise.
         tuning: how is tuned.
         lpips: weights, or `None`: not measured.
-        scratch: an existing folder for sensitivities.
     """
 
     def __init__(
@@ -99,7 +99,6 @@ class Bench:
         encoding: EncodeOptions,
         tuning: FinetuneOptions,
         lpips: Lpips | None,
-        scratch: Path,
     ) -> None:
         self.scene, self.encoding, self.tuning, self._lpips = scene, encoding, tuning, lpips
         self.source = read_ply(ply)
@@ -107,8 +106,6 @@ class Bench:
         self.looks = Looks.read(self.source, self._sources, quiet=True)
         if self.looks.data is None or not self.looks.data.test:
             raise InputError(f"{scene.data} holds out no photographs to judge by")
-        self._importance = scratch / f"{scene.name}.sensitivity.npz"
-        self._clock = Clock()
         self._picks: dict[tuple[float | None, bool], Pick] = {}
 
     @property
@@ -123,15 +120,10 @@ class Bench:
 
     @cached_property
     def sensitivity(self) -> Sensitivity:
-        """Measured from the training views."""
-        first = self.source.select(np.zeros(1, np.intp))
-        measure_sensitivity(first, self.looks.cameras[:1], metric=True)  # compiles
-        with self._clock.stage("sensitivity"):
-            found = measure_sensitivity(
-                self.source, self.looks.cameras, background=self.looks.background, metric=True, threads=self.threads
-            )
-            Measured(self.source, found, "training", float("nan")).write(str(self._importance))
-        return found
+        """Of the whole source, measured from the training views."""
+        return measure_views(
+            self.source, self.looks.cameras, self.looks.background, matrices=True, threads=self.threads
+        )
 
     def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
         """The splats that stay, and the seconds that it took to find them.
@@ -145,12 +137,14 @@ class Bench:
         return self._picks[keep, told]
 
     def _pick(self, keep: float | None, *, told: bool) -> Pick:
-        _ = self.sensitivity  # its file is wanted
-        clock = Clock(dict(self._clock.seconds) if told else {})
-        sources = replace(self._sources, keep=keep)
+        clock, sources = Clock(), replace(self._sources, keep=keep)
         with clock.stage("choosing"):
-            file = str(self._importance) if told else None
-            chosen = choose_splats(self.source, self.looks, sources, file, self.threads)
+            chosen = choose_splats(self.source, self.looks, sources, None, self.threads)
+        if not told:
+            removal = measure_removal(
+                chosen.model, self.looks.cameras, background=self.looks.background, threads=self.threads
+            )
+            chosen = replace(chosen, importance=removal.squared_weight)
         return chosen, clock.seconds
 
     def between(self, rows: NDArray[np.int64]) -> Between:

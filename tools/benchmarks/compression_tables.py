@@ -26,7 +26,7 @@ _TITLES = {
     "curve": "Simplified first, and coarser",
 }
 _LINES = {"simplified first": "o-", "coarser": "s--", "both": "^"}
-_WORK = ("sensitivity", "choosing", "clustering", "tuning", "encoding")
+_WORK = ("choosing", "clustering", "tuning", "encoding")
 
 
 def tables(results: Results, memory: dict[str, Any] | None = None, *, markdown: bool = False) -> str:
@@ -94,7 +94,7 @@ def _files(rows: dict[str, dict[str, Any]], facts: dict[str, Any], *, markdown: 
             _score(row["before"], "psnr", 2),
             *_sizes(row["after_bytes"], facts),
             *_scores(row["after"]),
-            _difference(row["after"]["psnr"], facts["scores"]["psnr"]),
+            *(_difference(row["after"][score], facts["scores"][score]) for score in ("psnr", "psnr_mean")),
             f"{row['best_step']}",
             f"{_seconds(row):.1f}",
         )
@@ -102,7 +102,7 @@ def _files(rows: dict[str, dict[str, Any]], facts: dict[str, Any], *, markdown: 
     ]
     header = (
         "", "kept %", "SH", "escape %", "shapes", "escape %", "untuned B/splat", "PSNR", "tuned B/splat", "ratio",
-        *_SCORE_NAMES, "to source", "best step", "s",
+        *_SCORE_NAMES, "to source", "mean to source", "best step", "s",
     )  # fmt: skip
     return _laid_out(header, lines, markdown=markdown)
 

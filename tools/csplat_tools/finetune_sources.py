@@ -14,7 +14,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.console import note
 from csplat_tools.finetune_report import Judged, judge_by_photographs, judge_by_source
-from csplat_tools.importances import read_importance
+from csplat_tools.importances import measure_views, read_importance
 from csplat_tools.photographs import relative_to
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from csplat_render import Camera
     from csplat_trainer.data import DataSet
     from csplat_trainer.finetune import Views
+    from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = ["Chosen", "Looks", "Sources", "choose_splats"]
 
@@ -157,8 +158,8 @@ def choose_splats(
         source: the scene.
         looks: the views.
         sources: what is to be left out.
-        importance: a file of weights of the source's splats; `None`: the squared shares of pixels that are theirs,
-            by which errors of their colours count.
+        importance: a file of weights of the source's splats; `None`: what stays is measured in these views, as
+            `csplat sensitivity` does.
         threads: how many; `None` for all.
         progress: is told the stages.
 
@@ -167,30 +168,42 @@ def choose_splats(
     """
     from csplat_render.removal import measure_removal
 
-    given = None if importance is None else read_importance(importance, source)
-    given = given.importance() if isinstance(given, StoredSensitivity) else given
-    if isinstance(given, np.ndarray) and given.shape != (len(source),):
-        raise InputError(f"{importance} has shape {given.shape}, wanted ({len(source)},)")
+    def weighed(model: SplatModel) -> Sensitivity:
+        return measure_views(model, looks.cameras, looks.background, matrices=True, threads=threads, progress=progress)
 
-    def weighed(model: SplatModel) -> Any:
-        return measure_removal(model, looks.cameras, background=looks.background, threads=threads, progress=progress)
-
-    removal = weighed(source)
-    if not removal.seen.any():
-        raise InputError("no view shows any splat: scene and cameras do not belong together")
+    given, found = _read(importance, source), None
     prune = looks.data is not None if sources.prune_unseen is None else sources.prune_unseen
-    rows = np.flatnonzero(removal.seen) if prune else np.arange(len(source))
+    if given is None and sources.keep is None:
+        found = weighed(source)
+        seen = found.seen
+    else:
+        seen = measure_removal(
+            source, looks.cameras, background=looks.background, threads=threads, progress=progress
+        ).seen
+    if not seen.any():
+        raise InputError("no view shows any splat: scene and cameras do not belong together")
+    rows = np.flatnonzero(seen) if prune else np.arange(len(source))
     model, said = source.select(rows), {"unseen": len(source) - len(rows)}
     if sources.keep is not None:
         model, kept = _simplified(model, looks, sources.keep * len(source) / len(rows), threads, progress)
         rows, said = rows[kept], {**said, "simplified_from": len(rows)}
-        removal = weighed(model)
-        weights = removal.squared_weight
-    else:
-        weights = removal.squared_weight[rows]
     if given is not None:
         return Chosen(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], said)
-    return Chosen(model, rows, weights, said)
+    if found is not None:
+        return Chosen(model, rows, StoredSensitivity.of(source, found).importance().select(rows), said)
+    return Chosen(model, rows, StoredSensitivity.of(model, weighed(model)).importance(), said)
+
+
+def _read(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:
+    """What a file says of the source's splats."""
+    if importance is None:
+        return None
+    given = read_importance(importance, source)
+    if isinstance(given, StoredSensitivity):
+        return given.importance()
+    if isinstance(given, np.ndarray) and given.shape != (len(source),):
+        raise InputError(f"{importance} has shape {given.shape}, wanted ({len(source)},)")
+    return given
 
 
 def _simplified(

@@ -19,14 +19,15 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.console import note, progress_bar, step_progress
+from csplat_tools.convert import SceneFacts
 from csplat_tools.finetune_report import as_report
 from csplat_tools.finetune_sources import Looks, Sources, choose_splats
-from csplat_tools.inout import ply_path, write_bytes
+from csplat_tools.inout import ply_path, write_array, write_bytes
 
 if TYPE_CHECKING:
     from csplat_trainer.finetune import FinetuneOptions, Moment
 
-__all__ = ["Files", "run_finetuning"]
+__all__ = ["Files", "Scene", "run_finetuning"]
 
 I64 = NDArray[np.int64]
 
@@ -38,6 +39,7 @@ class Files:
     Attributes:
         source: a PLY. output: the file to write.
         importance: weights of the splats, see `choose_splats`.
+        source_index: a .npy file: which splat of the PLY as read each splat of the file is.
         log: options, losses and looks as JSON. report: what came of it as JSON.
         checkpoint, checkpoint_every, resume: as for `csplat_trainer.finetune.finetune`.
         lpips: a file of weights, or `auto`.
@@ -46,12 +48,26 @@ class Files:
     source: str
     output: str
     importance: str | None = None
+    source_index: str | None = None
     log: str | None = None
     report: str | None = None
     checkpoint: str | None = None
     checkpoint_every: int = 0
     resume: str | None = None
     lpips: str | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How the PLY is read.
+
+    Attributes:
+        facts: what it does not say.
+        strict: whether what would be repaired is refused.
+    """
+
+    facts: SceneFacts
+    strict: bool = False
 
 
 @dataclass
@@ -68,7 +84,7 @@ class _Clock:
 
 
 def run_finetuning(
-    files: Files, encoding: EncodeOptions, sources: Sources, options: FinetuneOptions, *, quiet: bool
+    files: Files, scene: Scene, encoding: EncodeOptions, sources: Sources, options: FinetuneOptions, *, quiet: bool
 ) -> dict[str, Any]:
     """Read, prune, freeze, tune, write, judge.
 
@@ -88,7 +104,7 @@ def run_finetuning(
     clock, threads = _Clock(), encoding.threads
     distance = None if files.lpips is None else load_lpips(None if files.lpips == "auto" else files.lpips)
     with clock.stage("reading"):
-        source = _read(files.source, encoding, quiet=quiet)
+        source = _read(files.source, scene, encoding, quiet=quiet)
         looks = Looks.read(source, sources, quiet=quiet)
     with thread_count(threads):
         warm_up(None if quiet else note)
@@ -115,6 +131,8 @@ def run_finetuning(
             decoded = decode(result.data)
         _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
         write_bytes(files.output, result.data)
+        if files.source_index is not None:
+            write_array(files.source_index, result.source_index)
         with clock.stage("judging"):
             models = {"source": source, "before tuning": decode(plain.data), "file": decoded}
             judged = looks.judge(source, models, distance, threads)
@@ -126,14 +144,14 @@ def run_finetuning(
     return report
 
 
-def _read(path: str, encoding: EncodeOptions, *, quiet: bool) -> SplatModel:
+def _read(path: str, scene: Scene, encoding: EncodeOptions, *, quiet: bool) -> SplatModel:
     findings: list[Finding] = []
     with ply_path(path) as local:
-        model = read_ply(local, keep_extra=encoding.keep_extra, report=findings)
+        model = read_ply(local, strict=scene.strict, keep_extra=encoding.keep_extra, report=findings)
     for finding in findings:
         if not quiet or finding.kind == "repair":
             note(str(finding))
-    return model
+    return scene.facts.applied(model)
 
 
 def _check_identity(seen: Any, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +18,12 @@ from csplat_tools.inout import read_array
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, read_sensitivity, write_sensitivity
 
 if TYPE_CHECKING:
+    from csplat_render import Camera
     from csplat_trainer.sensitivity import Sensitivity
 
-__all__ = ["Measured", "Wanted", "measure_scene", "read_importance"]
+__all__ = ["Measured", "Wanted", "measure_scene", "measure_views", "read_importance"]
 
+Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
 
 _ZIP = b"PK"  # what a .npz begins with
@@ -99,7 +101,6 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
     from csplat_render.removal import measure_removal
     from csplat_tools.simplify.files import find_sights
     from csplat_tools.simplify.views import find_views
-    from csplat_trainer.sensitivity import measure_sensitivity
 
     if not len(model):
         raise InputError("a scene without splats has no sensitivities")
@@ -113,20 +114,49 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
             threads=wanted.threads, progress=progress,
         )  # fmt: skip
         cameras, check = views.used, views.check
-    if progress is not None:
-        progress("compiling", 0.0)  # the first time takes some seconds
-        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=wanted.matrices)
-        progress("compiling", 1.0)
-    found = measure_sensitivity(
-        model, cameras, background=background, metric=wanted.matrices, threads=wanted.threads, progress=progress
+    found = measure_views(
+        model, cameras, background, matrices=wanted.matrices, threads=wanted.threads, progress=progress
     )
-    if not found.seen.any():
-        raise InputError("no view shows any splat: scene and cameras do not belong together")
     missed = float("nan")
     if check:
         elsewhere = measure_removal(model, check, background=background, threads=wanted.threads).seen
         missed = float(np.mean(elsewhere & ~found.seen))
     return Measured(model, found, source, missed)
+
+
+def measure_views(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: Colour,
+    *,
+    matrices: bool,
+    threads: int | None,
+    progress: Progress | None = None,
+) -> Sensitivity:
+    """Measure a scene from given views.
+
+    Args:
+        model: the scene. cameras: relative to its origin.
+        background: behind everything.
+        matrices: whether those of SH coefficients are measured too.
+        threads: how many; `None` for all.
+        progress: is told the stages.
+
+    Raises:
+        InputError: no view shows any splat.
+    """
+    from csplat_trainer.sensitivity import measure_sensitivity
+
+    if progress is not None:
+        progress("compiling", 0.0)  # the first time takes some seconds
+        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices)
+        progress("compiling", 1.0)
+    found = measure_sensitivity(
+        model, cameras, background=background, metric=matrices, threads=threads, progress=progress
+    )
+    if not found.seen.any():
+        raise InputError("no view shows any splat: scene and cameras do not belong together")
+    return found
 
 
 def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance | StoredSensitivity:

@@ -1,4 +1,4 @@
-"""The encoder's knobs, for commands that encode beside `csplat encode`: declared there, and nowhere else."""
+"""The options of `csplat encode`, for commands that encode beside it: declared there, and nowhere else."""
 
 from __future__ import annotations
 
@@ -13,34 +13,39 @@ import typer
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat_tools.commands.encode import encode
+from csplat_tools.convert import SceneFacts
 
 __all__ = ["with_encoder_knobs"]
 
-_NAMES = {field.name for field in fields(EncodeOptions)}
+_KNOBS = {field.name for field in fields(EncodeOptions)}
+# By the names that the command line has for them, which `SceneFacts` takes in this order.
+_FACTS = ("axes", "unit_metres", "antialiased", "licence")
 
 
 def with_encoder_knobs(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command every option of `csplat encode` that `EncodeOptions` has a field for.
+    """Give a command every option of `csplat encode` that `EncodeOptions` or `SceneFacts` has a field for.
 
     Keywords are passed through here, against the custom: two dozen options, declared once, serve all commands, and
     a new one appears in all of them.
 
     Args:
-        command: takes them as one argument, `encoding`.
+        command: takes them as two arguments, `encoding` and `facts`.
     """
     own = inspect.signature(command, eval_str=True)
-    shared = [one for one in inspect.signature(encode, eval_str=True).parameters.values() if one.name in _NAMES]
+    declared = inspect.signature(encode, eval_str=True).parameters.values()
+    shared = [one for one in declared if one.name in _KNOBS or one.name in _FACTS]
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
-        chosen = {one.name: given.pop(one.name) for one in shared}
+        facts = SceneFacts(*(given.pop(name) for name in _FACTS))
+        chosen = {one.name: given.pop(one.name) for one in shared if one.name in _KNOBS}
         try:
             encoding = EncodeOptions(**chosen)
         except InputError as error:
             raise typer.BadParameter(str(error)) from None
-        command(**given, encoding=encoding)
+        command(**given, encoding=encoding, facts=facts)
 
-    kept = [one for one in own.parameters.values() if one.name != "encoding"]
+    kept = [one for one in own.parameters.values() if one.name not in ("encoding", "facts")]
     positional = [one for one in kept if one.default is inspect.Parameter.empty]
     rest = [one for one in kept if one.default is not inspect.Parameter.empty]
     signature = own.replace(parameters=[*positional, *shared, *rest])

@@ -11,6 +11,7 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat_tools.commands.encoder_knobs import with_encoder_knobs
 from csplat_tools.console import guarded, note, say_json
+from csplat_tools.convert import SceneFacts
 from csplat_tools.extras import need_trainer
 from csplat_tools.inout import STANDARD_STREAM, check_output, check_outputs
 from csplat_tools.parsing import parse_colour, parse_size
@@ -32,6 +33,7 @@ _FACTOR = {False: 1.0, True: 0.25}
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     encoding: EncodeOptions,
+    facts: SceneFacts,
     output: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write.")],
     data: Annotated[
         str | None,
@@ -89,7 +91,7 @@ def finetune(
     importance: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE", rich_help_panel=_HOW, help="As for `encode`; without it, what the views say themselves."
+            metavar="FILE", rich_help_panel=_HOW, help="As for `encode`; by default sensitivities are measured here."
         ),
     ] = None,
     iterations: Annotated[
@@ -110,6 +112,13 @@ def finetune(
     ] = 4,
     lpips: Annotated[
         str | None, typer.Option(metavar="WEIGHTS.npz", help="Report LPIPS (Alex) with these weights, or `auto`.")
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse a PLY with defects instead of repairing it.")
+    ] = False,
+    source_index: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.npy", rich_help_panel=_FILES, help="Write which splat each one of the file was."),
     ] = None,
     report: Annotated[
         str | None, typer.Option(metavar="FILE.json", rich_help_panel=_FILES, help="What came of it, for programs.")
@@ -148,7 +157,7 @@ def finetune(
     need_trainer()
     from csplat_tools.finetune_report import format_report
     from csplat_tools.finetune_sources import Sources
-    from csplat_tools.finetuning import Files, run_finetuning
+    from csplat_tools.finetuning import Files, Scene, run_finetuning
     from csplat_trainer.finetune.options import FinetuneOptions
 
     if (data is None) != itself:
@@ -165,8 +174,8 @@ def finetune(
         ).scaled(_FACTOR[itself] if lr_factor is None else lr_factor)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    if STANDARD_STREAM in (report, log, checkpoint):
-        raise typer.BadParameter("--report, --json and --checkpoint want names of files")
+    if STANDARD_STREAM in (source_index, report, log, checkpoint):
+        raise typer.BadParameter("--source-index, --report, --json and --checkpoint want names of files")
     if as_text and output == STANDARD_STREAM:
         raise typer.BadParameter("--say-json and - both want standard output")
     for path in (resume, importance):
@@ -175,7 +184,8 @@ def finetune(
     # A checkpoint may take the place of the one that it goes on from.
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     inputs = (source, importance, cameras)
-    check_outputs((output, report, log, None if again else checkpoint), force=force, inputs=(*inputs, resume))
+    outputs = (output, source_index, report, log, None if again else checkpoint)
+    check_outputs(outputs, force=force, inputs=(*inputs, resume))
     if again:
         check_output(str(checkpoint), force=True, inputs=tuple(path for path in inputs if path is not None))
     sources = Sources(
@@ -192,8 +202,9 @@ def finetune(
         keep,
         prune_unseen,
     )
-    files = Files(source, output, importance, log, report, checkpoint, checkpoint_every, resume, lpips)
-    found = run_finetuning(files, encoding, sources, options, quiet=quiet)
+    files = Files(source, output, importance, source_index, log, report, checkpoint, checkpoint_every, resume, lpips)
+    scene = Scene(facts, strict)
+    found = run_finetuning(files, scene, encoding, sources, options, quiet=quiet)
     if as_text:
         say_json(found)
     elif not quiet:
