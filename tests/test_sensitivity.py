@@ -358,6 +358,16 @@ def test_the_command_makes_views_where_there_are_none(tmp_path, sample_path):
     assert read_sensitivity(tmp_path / "s.npz", read_ply(sample_path)).matrices is None
 
 
+def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, sample_path):
+    npz, out = tmp_path / "s.npz", tmp_path / "o.csplat"
+    run("sensitivity", sample_path, npz, "--views", "2", "--no-matrices")
+    missed = read_sensitivity(npz, read_ply(sample_path)).missed_share
+    assert missed > 0.0
+    done = run("encode", sample_path, out, "--importance", npz, "--prune-unseen", "-q")
+    assert f"{100 * missed:.2g} % of the splats are left out although" in done.stderr
+    assert "left out" not in run("encode", sample_path, out, "--importance", npz, "--force").stderr
+
+
 def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
     out = tmp_path / "out.npz"
     assert 2 == run("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).returncode
