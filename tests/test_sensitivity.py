@@ -251,11 +251,11 @@ def test_damaged_files_are_refused(stored):
     data = path.read_bytes()
     for bad in (b"", b"PK", data[: len(data) // 2], data[:-30], b"nonsense" * 10):
         path.write_bytes(bad)
-        with pytest.raises(InputError, match="no file of sensitivities"):
+        with pytest.raises(InputError, match="not a file of sensitivities"):
             read_sensitivity(path, model)
     with path.open("wb") as stream:
         np.savez(stream, colour=np.ones(30))
-    with pytest.raises(InputError, match="no file of sensitivities"):
+    with pytest.raises(InputError, match="not a file of sensitivities"):
         read_sensitivity(path, model)
 
 
@@ -297,7 +297,7 @@ def test_arrays_that_are_no_sensitivities_are_refused(stored, name, array):
     with np.load(path) as file:
         arrays = dict(file)
     np.savez(path, **(arrays | {name: array}))
-    with pytest.raises(InputError, match="no file of sensitivities"):
+    with pytest.raises(InputError, match="not a file of sensitivities"):
         read_sensitivity(path, model)
 
 

@@ -48,7 +48,7 @@ class Scene:
 
 
 def _lego(count: int) -> Scene:
-    options = TrainOptions(max_splats=count, iterations=7_000)
+    options = TrainOptions(max_splats=count, iterations=30_000)
     return Scene(f"lego{count // 1000}k", DATA / "images" / "lego200", (200, 200), _WHITE, training=options)
 
 
@@ -63,11 +63,11 @@ SCENES = {
         _FOX,
         replace(
             _FOX, name="fox", ply=None,
-            training=TrainOptions(max_splats=120_000, iterations=4_500, background="black"),
+            training=TrainOptions(max_splats=120_000, iterations=10_000, background="black"),
         ),
         Scene(
             "desk29", DATA / "images" / "desk29", (476, 268), _WHITE,
-            training=TrainOptions(max_splats=40_000, iterations=3_000),
+            training=TrainOptions(max_splats=40_000, iterations=10_000),
         ),
     )
 }  # fmt: skip

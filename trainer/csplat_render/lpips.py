@@ -15,7 +15,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from csplat.archives import read_archive
 from csplat.errors import InputError
 
 __all__ = ["MIN_SIZE", "SCALE", "SHIFT", "Lpips", "load_lpips", "save_lpips"]
@@ -138,19 +138,15 @@ def save_lpips(path: str | Path, weights: Lpips) -> None:
 def _read(path: Path) -> Lpips:
     count = range(len(_LAYERS))
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return Lpips(
-                kernels=tuple(file[f"AlexNet_0/Conv_{i}/kernel"].astype(np.float32) for i in count),
-                biases=tuple(file[f"AlexNet_0/Conv_{i}/bias"].astype(np.float32) for i in count),
-                heads=tuple(file[f"NetLinLayer_{i}/Conv_0/kernel"].astype(np.float32).reshape(-1) for i in count),
-                source=str(path),
-            )
+        file = read_archive(path, "a file of LPIPS weights (.npz)")
     except OSError as error:
         raise InputError(f"LPIPS weights {path}: {error.strerror or error}") from error
-    except (ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is not an .npz file of LPIPS weights") from error
-    except KeyError as error:
-        raise InputError(f"{path} holds no LPIPS weights: {error.args[0]}") from error
+    names = ("AlexNet_0/Conv_{}/kernel", "AlexNet_0/Conv_{}/bias", "NetLinLayer_{}/Conv_0/kernel")
+    parts = [[file[name.format(i)] for i in count] for name in names]
+    if any(array.dtype.kind != "f" for part in parts for array in part):
+        file.refuse("its arrays hold no real numbers")
+    kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
+    return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
 
 def _from_torch() -> Lpips | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, Parameters, Splats
@@ -67,12 +67,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         InputError: the file is not one, or was written by another version.
         OSError: it cannot be read.
     """
-    try:
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            facts = json.loads(stored["facts"].tobytes())
-            parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is not a checkpoint of csplat train: {error}") from None
+    stored = read_archive(path, "a checkpoint of csplat train")
+    facts = stored.facts("facts")
+    parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
     if facts.get("version") != _VERSION:
         raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
     _check(path, parts)

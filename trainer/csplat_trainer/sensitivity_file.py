@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import textwrap
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -14,6 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.archives import read_archive
 from csplat.encoder.importance import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -34,9 +32,6 @@ SOURCES = ("training", "cameras", "virtual")
 
 _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-# What reading an archive raises where it is damaged: RuntimeError is for passwords and unknown ways to compress.
-_DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, zlib.error,
-            zipfile.BadZipFile)  # fmt: skip
 _FLOOR = 0.01  # of the median: the weight of what no view saw; other views may see it
 
 
@@ -153,13 +148,12 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
         InputError: it is damaged, something else, or belongs to another scene.
         OSError: it cannot be read.
     """
+    arrays = read_archive(path, "a file of sensitivities (`csplat sensitivity` makes them)")
+    if str(arrays["format"]) != _FORMAT:
+        arrays.refuse(f"it says {str(arrays['format'])!r}, wanted {_FORMAT!r}")
+    if any(arrays[name].shape for name in ("scene", "source", "view_count", "missed_share")):
+        arrays.refuse("it has lists where single values are wanted")
     try:
-        # Opened here: np.load leaves a damaged file open.
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        if str(arrays["format"]) != _FORMAT:
-            raise InputError(f"{path} is {str(arrays['format'])!r}, wanted {_FORMAT!r}")
-        digest = str(arrays["scene"])
         found = StoredSensitivity(
             {name: arrays[name] for name in GROUPS},
             arrays["views"],
@@ -169,19 +163,18 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
             arrays["shape_matrices"],
             arrays.get("matrices"),
         )
-        matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
-        kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
-        if (kinds, found.views.dtype.kind) != ({"f"}, "i"):
-            raise ValueError("its arrays hold other numbers, or none")
-        if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
-            raise ValueError("it has matrices for other splats than it has views")
-    except _DAMAGED as error:
-        reason = textwrap.shorten(str(error), 120)
-        raise InputError(f"{path} is no file of sensitivities (`csplat sensitivity` makes them): {reason}") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        arrays.refuse(error)
+    matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
+    kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
+    if (kinds, found.views.dtype.kind) != ({"f"}, "i"):
+        arrays.refuse("its arrays hold other numbers, or none")
+    if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
+        arrays.refuse("it has matrices for other splats than it has views")
     wanted = (len(model),)
     if any(array.shape != wanted for array in (*found.groups.values(), found.views)):
         raise InputError(f"{path} is about {len(found.views)} splats, the scene has {len(model)}")
-    if digest != scene_digest(model):
+    if str(arrays["scene"]) != scene_digest(model):
         raise InputError(f"{path} is about another scene: its splats differ from those of this one")
     return found
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import textwrap
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.archives import read_archive
 from csplat.encoder.frozen import Frozen, Held
 from csplat.errors import InputError
 from csplat.files import atomic_writer
@@ -23,8 +21,6 @@ __all__ = ["FinetuneCheckpoint", "load_finetune", "save_finetune"]
 
 _VERSION = 1
 _KIND = "csplat finetune"
-# What reading an archive raises where it is damaged: RuntimeError is for passwords and unknown ways to compress.
-_DAMAGED = (ValueError, KeyError, EOFError, TypeError, AttributeError, RuntimeError, zlib.error, zipfile.BadZipFile)
 _HELD = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
 _GROUPS = (*GROUPS, "sizes")
 
@@ -87,17 +83,13 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
             of the encoder.
         OSError: it cannot be read.
     """
-    try:
-        with Path(path).open("rb") as stream, np.load(_archive(stream), allow_pickle=False) as stored:
-            facts = json.loads(stored["facts"].tobytes())
-            if facts.get("kind") != _KIND:
-                raise ValueError("it is of another kind")
-            parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
-            best = Held(*(stored[f"best_{name}"] for name in _HELD))
-            costs = {name[6:]: stored[name] for name in stored.files if name.startswith("costs_")}
-    except _DAMAGED as error:
-        reason = textwrap.shorten(str(error), 120)
-        raise InputError(f"{path} is not a checkpoint of csplat finetune: {reason}") from None
+    stored = read_archive(path, "a checkpoint of csplat finetune")
+    facts = stored.facts("facts")
+    if facts.get("kind") != _KIND:
+        stored.refuse("it is of another kind")
+    parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
+    best = Held(*(stored[f"best_{name}"] for name in _HELD))
+    costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
     if facts.get("version") != _VERSION:
         raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
     if facts["frozen"] != fingerprint(frozen):
@@ -116,14 +108,6 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
     )
     _check(path, checkpoint, frozen.start())
     return checkpoint
-
-
-def _archive(stream: BinaryIO) -> BinaryIO:
-    """The stream, if it is a .npz file: of others `np.load` says that they might be loaded unsafely."""
-    if not zipfile.is_zipfile(stream):
-        raise ValueError("it is no .npz file")
-    stream.seek(0)
-    return stream
 
 
 def fingerprint(frozen: Frozen) -> str:

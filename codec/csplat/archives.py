@@ -1,0 +1,83 @@
+"""Reading NumPy's archives (.npz) that may be damaged, or something else."""
+
+from __future__ import annotations
+
+import json
+import struct
+import textwrap
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+
+__all__ = ["Archive", "read_archive"]
+
+# What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
+# sizes that no array has.
+_DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
+            SyntaxError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
+
+
+class Archive(dict[str, NDArray[Any]]):
+    """The arrays of a file by name; one that is wanted and not there is an `InputError`.
+
+    Args:
+        path: of the file.
+        kind: what it should be, for messages: "a checkpoint of csplat train".
+        arrays: what it holds.
+    """
+
+    def __init__(self, path: str | Path, kind: str, arrays: dict[str, NDArray[Any]]) -> None:
+        super().__init__(arrays)
+        self._path, self._kind = path, kind
+
+    def __missing__(self, name: str) -> NDArray[Any]:
+        self.refuse(f"it holds no {name}")
+
+    def refuse(self, reason: object) -> NoReturn:
+        """Raise the `InputError` that says why the file is not what it should be."""
+        text = textwrap.shorten(str(reason), 120)
+        raise InputError(f"{self._path} is not {self._kind}: {text}")
+
+    def facts(self, name: str) -> dict[str, Any]:
+        """A JSON object that is kept as an array of bytes.
+
+        Raises:
+            InputError: it is none.
+        """
+        try:
+            found = json.loads(self[name].tobytes())
+        except ValueError as error:
+            self.refuse(error)
+        if not isinstance(found, dict):
+            self.refuse(f"its {name} are a {type(found).__name__}")
+        return found
+
+
+def read_archive(path: str | Path, kind: str) -> Archive:
+    """Read all arrays of a .npz file; nothing in it is run.
+
+    Args:
+        path: the file.
+        kind: as in `Archive`.
+
+    Raises:
+        InputError: it is damaged, or no such file.
+        OSError: it cannot be read.
+    """
+    nothing = Archive(path, kind, {})
+    with Path(path).open("rb") as stream:  # opened here: np.load leaves a damaged file open
+        if not zipfile.is_zipfile(stream):  # of others np.load says that they might be loaded unsafely
+            nothing.refuse("it is no .npz file")
+        stream.seek(0)
+        try:
+            with np.load(stream, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+        except _DAMAGED as error:
+            nothing.refuse(error)
+    return Archive(path, kind, arrays)
