@@ -422,12 +422,33 @@ def test_the_command_tunes_prunes_and_reports(capture, tmp_path):
     assert 200 == len(json.loads(log.read_text())["losses"])
     stated = read_stated_errors(out.read_bytes())
     assert (301, 1) == (stated.source_count, stated.pruned_count)
-    assert 1 == read_options(out.read_bytes())["finetuned"]["unseen"]
+    said = read_options(out.read_bytes())
+    assert (1, 4096) == (said["finetuned"]["unseen"], said["asked"]["shape_codebook_size"])
     compared = json.loads(call("compare", capture / "scene.ply", out, "--data", capture, "--json").stdout)
     assert compared["photographs"]["b"]["psnr"] == pytest.approx(scores["file"]["psnr"], abs=1e-4)
     assert compared["photographs"]["a"]["psnr"] == pytest.approx(scores["source"]["psnr"], abs=1e-4)
     proof = call("verify", out, "--source", capture / "scene.ply")
     assert "fitted anew" in proof.stdout + proof.stderr
+
+
+def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--sh-coding", "none")
+    call(*words, "-o", tmp_path / "with.csplat", "--shape-codebook-size", 40)
+    call(*words, "-o", tmp_path / "without.csplat", "--shape-codebook-size", 0)
+    assert 0 < read_options((tmp_path / "with.csplat").read_bytes())["shape_codebook_size"] <= 40
+    assert "shape_codebook_size" not in read_options((tmp_path / "without.csplat").read_bytes())
+
+
+def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, monkeypatch):
+    def wrong(data):
+        model = decode(data)
+        return replace(model, sh0=model.sh0 + np.float32(1e-6))
+
+    monkeypatch.setattr("csplat_tools.finetuning.decode", wrong)
+    out = tmp_path / "s.csplat"
+    result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1)
+    assert "holds other sh0 than were tuned" in str(result.exception)
+    assert not out.exists()
 
 
 def test_a_scene_can_be_tuned_to_its_own_renders(capture, tmp_path):

@@ -106,8 +106,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--shapes", type=int, default=4096, help="their codebook at most; 0: none; default: %(default)s"
     )
-    parser.add_argument("--iterations", type=int, default=2_000, metavar="N", help="of tuning; default: %(default)s")
-    parser.add_argument("--byte-cost", type=float, default=2e-4, help="in the loss; default: %(default)s")
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        default=FinetuneOptions().iterations,
+        metavar="N",
+        help="of tuning; default: %(default)s",
+    )
+    parser.add_argument(
+        "--byte-cost", type=float, default=FinetuneOptions().byte_cost, help="in the loss; default: %(default)s"
+    )
     parser.add_argument("--lr-factor", type=float, default=1.0, help="of all learning rates; default: %(default)s")
     for name, kind, default, words in _LISTS:
         parser.add_argument(f"--{name}", type=_numbers(kind), default=default, help=f"{words}; default: %(default)s")

@@ -60,6 +60,7 @@ SCENES = {
     for one in (
         _lego(1_000),
         _lego(20_000),
+        _lego(50_000),
         _FOX,
         replace(
             _FOX, name="fox", ply=None,

@@ -15,6 +15,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodeResult
 from csplat.encoder.between import Between
 from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.encoder.frozen import Seen
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -154,13 +155,14 @@ def _read(path: str, scene: Scene, encoding: EncodeOptions, *, quiet: bool) -> S
     return scene.facts.applied(model)
 
 
-def _check_identity(seen: Any, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """What was tuned is what was written: bit for bit."""
+def _check_identity(seen: Seen, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
+    """Raise a `RuntimeError` unless what was tuned is what was written, bit for bit: no file would be better."""
     places = np.empty(int(source_index.max()) + 1, np.int64)
     places[source_index] = np.arange(len(source_index))
     rows = places[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        assert np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]), f"{name} was tuned as something else"
+        if not np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]):
+            raise RuntimeError(f"the file holds other {name} than were tuned: a fault of csplat, please report it")
 
 
 def _state(now: Moment) -> str:

@@ -35,8 +35,8 @@ class EncodeOptions:
         codebook_size: entries of the SH codebook's first stage.
         codebook_stages: residual stages, 1 to 4.
         escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
-        shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); by
-            default there is none. It is made only where the file becomes smaller.
+        shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); 0,
+            as by default: none. It is made only where the file becomes smaller.
         shape_escape_fraction: share of the splats, those with the largest weighted error, that keep shapes of their
             own; by default those whose error would grow by more than the bits are worth, where an importance holds
             matrices of shapes, and a twentieth where not.
@@ -154,7 +154,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
     "codebook_stages": (int, 1, _spec.STAGES_MAX),
     "escape_fraction": (float, 0, 1),
-    "shape_codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
+    "shape_codebook_size": (int, 0, _spec.CODEBOOK_ENTRIES_MAX),
     "shape_escape_fraction": (float, 0, 1),
     "adaptive": (float, 0, 1),
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),

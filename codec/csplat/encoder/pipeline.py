@@ -141,7 +141,7 @@ def decide(
     extras = extra_columns(model, options)
     tiles = cut(model.means, plan.lattice, plan.tile_splats)
     shapes = None
-    if options.shape_codebook_size is not None and len(model):
+    if options.shape_codebook_size and len(model):
         by_shape = shape_weights(model, importance)
         together = shape_metric(by_shape, importance)
         shapes = choose_shapes(model, by_shape, together, tiles, plan, options, _threads(options), progress or _silent)

@@ -114,7 +114,10 @@ def encode(
         typer.Option(metavar="0..1", rich_help_panel=_COLOUR, help="Share of splats that bypass the codebook."),
     ] = None,
     shape_codebook_size: Annotated[
-        int | None, typer.Option(metavar="1..65536", rich_help_panel=_SHAPE, help="Entries at most; none by default.")
+        int | None,
+        typer.Option(
+            metavar="0..65536", rich_help_panel=_SHAPE, help="Entries at most; by default none, `finetune`: 4096."
+        ),
     ] = None,
     shape_escape_fraction: Annotated[
         float | None, typer.Option(metavar="0..1", rich_help_panel=_SHAPE, help="Share with a shape of its own.")

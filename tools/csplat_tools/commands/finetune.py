@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,10 +23,11 @@ _LIKE = "What the file is to look like (one of --data and --self)"
 _FILES = "Files on the way"
 _HOW = "How"
 
-# Steps and the factor of learning rates, by photographs and by the scene's own renders. Those can be met almost
-# exactly: what long steps lose of that, short ones take long to find again.
-_STEPS = {False: 2_000, True: 800}
+# Of learning rates, by photographs and by the scene's own renders. Those can be met almost exactly: what long steps
+# lose of that, short ones take long to find again.
 _FACTOR = {False: 1.0, True: 0.25}
+# What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
+_SHAPES = 4096
 
 
 @guarded
@@ -95,9 +97,8 @@ def finetune(
         ),
     ] = None,
     iterations: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, rich_help_panel=_HOW, help="Steps at most: 2000, or 800 with --self."),
-    ] = None,
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_HOW, help="Steps at most, one picture each.")
+    ] = 1_000,
     lr_factor: Annotated[
         float | None,
         typer.Option(metavar="FACTOR", rich_help_panel=_HOW, help="Of all learning rates: 1, or 0.25 with --self."),
@@ -105,7 +106,7 @@ def finetune(
     byte_cost: Annotated[
         float,
         typer.Option(metavar="COST", rich_help_panel=_HOW, help="What a bit per splat weighs in the loss; 0: nothing."),
-    ] = 2e-4,
+    ] = 1e-4,
     patience: Annotated[
         int,
         typer.Option(metavar="N", min=0, rich_help_panel=_HOW, help="Late looks without a gain that end it; 0: none."),
@@ -170,7 +171,7 @@ def finetune(
         raise typer.BadParameter("--size, --images and --near are for the photographs of --data")
     try:
         options = FinetuneOptions(
-            iterations=iterations or _STEPS[itself], seed=encoding.seed, byte_cost=byte_cost, patience=patience
+            iterations=iterations, seed=encoding.seed, byte_cost=byte_cost, patience=patience
         ).scaled(_FACTOR[itself] if lr_factor is None else lr_factor)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
@@ -204,6 +205,8 @@ def finetune(
     )
     files = Files(source, output, importance, source_index, log, report, checkpoint, checkpoint_every, resume, lpips)
     scene = Scene(facts, strict)
+    if encoding.shape_codebook_size is None:
+        encoding = replace(encoding, shape_codebook_size=_SHAPES)
     found = run_finetuning(files, scene, encoding, sources, options, quiet=quiet)
     if as_text:
         say_json(found)

@@ -183,7 +183,7 @@ class _Candidate:
         result = encode_with_report(
             self.fitted,
             replace(encoding, quality=quality),
-            importance=self._weights if encoding.shape_codebook_size is None else self._by_shape(),
+            importance=self._by_shape() if encoding.shape_codebook_size else self._weights,
             between=between,
             progress=self._progress,
         )

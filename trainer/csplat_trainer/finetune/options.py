@@ -38,7 +38,7 @@ class FinetuneOptions:
         InputError: a value is out of its range.
     """
 
-    iterations: int = 2_000
+    iterations: int = 1_000
     seed: int = 0
     loss: str = "inria"
     lr_means: float = 0.1
@@ -48,7 +48,7 @@ class FinetuneOptions:
     lr_sh0: float = 5e-3
     lr_shN: float = 1e-3
     lr_entries: float = 2e-3
-    byte_cost: float = 2e-4
+    byte_cost: float = 1e-4
     warm_up: int = 100
     decay: float = 0.01
     validate_every: int = 100
