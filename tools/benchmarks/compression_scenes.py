@@ -64,7 +64,7 @@ SCENES = {
         _FOX,
         replace(
             _FOX, name="fox", ply=None,
-            training=TrainOptions(max_splats=120_000, iterations=10_000, background="black"),
+            training=TrainOptions(max_splats=120_000, iterations=7_000, background="black"),
         ),
         Scene(
             "desk29", DATA / "images" / "desk29", (476, 268), _WHITE,

@@ -28,7 +28,8 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-_TRIED = 24  # entries for a point: its own and the nearest to that
+_TRIED = 96  # entries for a point: its own and the nearest to that
+_ROUNDS = 2  # how often entries move
 _BLOCK = 1 << 12
 _RIDGE = 1e-3  # of the mean diagonal: keeps an entry where its points do not say
 
@@ -95,7 +96,7 @@ def reassign(points: Floats, metric: Metric, entries: Floats, index: I64, thread
 
 
 def refine(points: Floats, metric: Metric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
-    """Give each point the best of the entries near its own, move the entries, and give again.
+    """Give each point the best of the entries near its own, and move the entries; twice.
 
     Args:
         points: [N, D, C], in lattice steps.
@@ -108,8 +109,9 @@ def refine(points: Floats, metric: Metric, entries: I32, index: I64, threads: in
         entries [K', D, C], distinct, each used; index [N].
     """
     with one_blas_thread():
-        index = _assign(points, metric, entries, index, threads, _TRIED)
-        entries = _solve(points, metric, entries, index)
+        for _ in range(_ROUNDS):
+            index = _assign(points, metric, entries, index, threads, _TRIED)
+            entries = _solve(points, metric, entries, index)
         index = _assign(points, metric, entries, index, threads, _TRIED)
     flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
     index = place.reshape(-1)[index]
