@@ -53,6 +53,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/simplify.py removal --gone 20,40,60,80
 	$(BIN)/python tools/benchmarks/simplify.py files --psnr 40
 	$(BIN)/python tools/benchmarks/sensitivity.py
+	$(BIN)/python tools/benchmarks/compression.py
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

@@ -3,6 +3,7 @@
     python tools/benchmarks/compression.py main control --scenes lego20k       # the file, its ablation, the control
     python tools/benchmarks/compression.py --lpips alex.npz                    # everything: hours
     python tools/benchmarks/compression.py curve --scenes fox120k --keep 0.8,0.6,0.4
+    python tools/benchmarks/compression.py main --scenes lego50k --knob escape_fraction=0.12 --out out/finer
     python tools/benchmarks/compression.py main --scenes '' --extra NAME scene.ply photographs 640x480 black
     python tools/benchmarks/compression.py memory --memory 100000,500000
     python tools/benchmarks/compression.py tables --markdown
@@ -19,7 +20,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quality", type=float, metavar="DB", help="of the encoder; default: the preset's")
     parser.add_argument("--codebook-size", type=int, metavar="N", help="of SH; default: what the encoder chooses")
     parser.add_argument(
+        "--knob", action="append", default=[], metavar="NAME=NUMBER", help="any other option of the encoder"
+    )
+    parser.add_argument(
         "--shapes", type=int, default=4096, help="their codebook at most; 0: none; default: %(default)s"
     )
     parser.add_argument(
@@ -133,9 +137,29 @@ def _options(args: argparse.Namespace) -> tuple[EncodeOptions, FinetuneOptions]:
             raise InputError(f"a share of splats is {share:g}, wanted more than 0, at most 1")
     encoding = EncodeOptions(
         preset=args.preset, quality=args.quality, codebook_size=args.codebook_size,
-        shape_codebook_size=args.shapes or None, threads=args.threads,
+        shape_codebook_size=args.shapes or None, threads=args.threads, **_knobs(args.knob),
     )  # fmt: skip
     return encoding, FinetuneOptions(iterations=args.iterations, byte_cost=args.byte_cost).scaled(args.lr_factor)
+
+
+def _knobs(words: list[str]) -> dict[str, Any]:
+    """Options of the encoder by name, as NAME=NUMBER.
+
+    Raises:
+        InputError: there is no such option, or it takes no number.
+    """
+    known = {field.name: field.type for field in fields(EncodeOptions)}
+    found: dict[str, Any] = {}
+    for word in words:
+        name, _, number = word.partition("=")
+        kind = str(known.get(name, ""))
+        if not kind.startswith(("int", "float")):
+            raise InputError(f"--knob {word}: the encoder has no option {name!r} that is a number")
+        try:
+            found[name] = int(number) if kind.startswith("int") else float(number)
+        except ValueError:
+            raise InputError(f"--knob {word}: {number!r} is no number for {name}") from None
+    return found
 
 
 def _numbers(kind: type[int | float] | None) -> Callable[[str], tuple[Any, ...]]:
@@ -212,7 +236,7 @@ def _memory(args: argparse.Namespace) -> None:
     kept = Kept(args.out / _MEMORY, settings, _tell)
     kept.values["machine"] = describe_machine(("numpy", "numba", "deflate"))
     words = ["--data", str(scene.data), "--iterations", str(_MEMORY_STEPS), "--preset", args.preset]
-    words += ["--shape-codebook-size", str(args.shapes)] if args.shapes else []
+    words += ["--shape-codebook-size", str(args.shapes)]
     if scene.size is not None:
         words += ["--size", f"{scene.size[0]}x{scene.size[1]}"]
     for count in args.memory:

@@ -30,7 +30,9 @@ I64 = NDArray[np.int64]
 Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
 
-_RENDERS_ASIDE = 8  # one of so many renders judges and does not teach
+_RENDERS_ASIDE = 8  # one of so many renders judges and does not teach,
+_MOST_ASIDE = 16  # but no more than these
+_DECIDING = 160  # virtual views at most that say how much splats matter
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class Sources:
         views: how many virtual cameras.
         view_size: of their pictures.
         background: behind everything; `None`: white with pictures that have an alpha channel, else black.
-        aside: views that judge while values move, and do not teach; 0: some that teach, or one in eight renders.
+        aside: views that judge while values move, and do not teach; 0: some that teach, or one in eight renders, but
+            no more than 16.
         keep: share of the splats that stay, the others being those that pictures need least; `None`: all.
         prune_unseen: leave out splats that no view shows; `None`: if the views are those of the data set.
     """
@@ -55,7 +58,7 @@ class Sources:
     test_every: int = 8
     near: float | None = None
     cameras: str | None = None
-    views: int = 96
+    views: int = 480
     view_size: tuple[int, int] = (320, 240)
     background: Colour | None = None
     aside: int = 0
@@ -69,13 +72,15 @@ class Looks:
 
     Attributes:
         data: the data set, if there is one, its cameras relative to the scene's origin.
-        cameras: otherwise those of the renders.
+        cameras: those of its training pictures, or of the renders.
         background: behind everything.
+        deciding: cameras that say what is left out, and how much the rest matters.
     """
 
     data: DataSet | None
     cameras: Sequence[Camera]
     background: Colour
+    deciding: Sequence[Camera]
 
     @classmethod
     def read(cls, source: SplatModel, sources: Sources, *, quiet: bool) -> Looks:
@@ -89,11 +94,12 @@ class Looks:
         from csplat_trainer.data import load
 
         if sources.data is None:
+            colour = sources.background or (0.0, 0.0, 0.0)
             if sources.cameras is not None:
                 cameras = load_cameras(sources.cameras)
-            else:
-                cameras = camera_sequence(source, sources.views, sources.view_size)
-            return cls(None, cameras, sources.background or (0.0, 0.0, 0.0))
+                return cls(None, cameras, colour, cameras)
+            cameras = camera_sequence(source, sources.views, sources.view_size)
+            return cls(None, cameras, colour, cameras[:_DECIDING])
         data = load(sources.data, sources.size, images=sources.images, test_every=sources.test_every, near=sources.near)
         if not quiet:
             for line in data.report:
@@ -104,7 +110,8 @@ class Looks:
         )
         white = any(one.has_alpha for one in (*train, *test))
         colour = sources.background or ((1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0))
-        return cls(replace(data, train=train, test=test), [one.camera for one in train], colour)
+        cameras = [one.camera for one in train]
+        return cls(replace(data, train=train, test=test), cameras, colour, cameras)
 
     def views(self, source: SplatModel, sources: Sources, threads: int | None) -> Views:
         """Views to learn from and to judge by; none of those that the report is about."""
@@ -114,7 +121,7 @@ class Looks:
         if self.data is not None:
             return split_views([View(one.camera, one) for one in self.data.train], behind, sources.aside)
         renders = renders_of(source, self.cameras, behind, threads)
-        return split_views(renders, behind, sources.aside or len(renders) // _RENDERS_ASIDE)
+        return split_views(renders, behind, sources.aside or min(_MOST_ASIDE, len(renders) // _RENDERS_ASIDE))
 
     def judge(
         self, source: SplatModel, models: dict[str, SplatModel], distance: Any, threads: int | None
@@ -169,7 +176,7 @@ def choose_splats(
     from csplat_render.removal import measure_removal
 
     def weighed(model: SplatModel) -> Sensitivity:
-        return measure_views(model, looks.cameras, looks.background, matrices=True, threads=threads, progress=progress)
+        return measure_views(model, looks.deciding, looks.background, matrices=True, threads=threads, progress=progress)
 
     given, found = _read(importance, source), None
     prune = looks.data is not None if sources.prune_unseen is None else sources.prune_unseen
@@ -178,7 +185,7 @@ def choose_splats(
         seen = found.seen
     else:
         seen = measure_removal(
-            source, looks.cameras, background=looks.background, threads=threads, progress=progress
+            source, looks.deciding, background=looks.background, threads=threads, progress=progress
         ).seen
     if not seen.any():
         raise InputError("no view shows any splat: scene and cameras do not belong together")
@@ -215,5 +222,5 @@ def _simplified(
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(background=looks.background, threads=threads)
-    result = simplify(model, looks.cameras, target=Target(keep=keep), options=options, progress=progress)
+    result = simplify(model, looks.deciding, target=Target(keep=keep), options=options, progress=progress)
     return result.model, result.source_index

@@ -25,7 +25,9 @@ _HOW = "How"
 
 # Of learning rates, by photographs and by the scene's own renders. Those can be met almost exactly: what long steps
 # lose of that, short ones take long to find again.
-_FACTOR = {False: 1.0, True: 0.25}
+_FACTOR = {False: 1.0, True: 0.03}
+# Of bytes in the loss, which is that much smaller.
+_COST = {False: 1e-4, True: 2e-5}
 # What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
 _SHAPES = 4096
 
@@ -61,7 +63,7 @@ def finetune(
     ] = None,
     views: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views.")
-    ] = 96,
+    ] = 480,
     view_size: Annotated[
         str, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="With --self: of the virtual views.")
     ] = "320x240",
@@ -101,12 +103,16 @@ def finetune(
     ] = 1_000,
     lr_factor: Annotated[
         float | None,
-        typer.Option(metavar="FACTOR", rich_help_panel=_HOW, help="Of all learning rates: 1, or 0.25 with --self."),
+        typer.Option(metavar="FACTOR", rich_help_panel=_HOW, help="Of all learning rates: 1, or 0.03 with --self."),
     ] = None,
     byte_cost: Annotated[
-        float,
-        typer.Option(metavar="COST", rich_help_panel=_HOW, help="What a bit per splat weighs in the loss; 0: nothing."),
-    ] = 1e-4,
+        float | None,
+        typer.Option(
+            metavar="COST",
+            rich_help_panel=_HOW,
+            help="What a bit per splat weighs in the loss, 0: nothing; 1e-4, or 2e-5 with --self.",
+        ),
+    ] = None,
     patience: Annotated[
         int,
         typer.Option(metavar="N", min=0, rich_help_panel=_HOW, help="Late looks without a gain that end it; 0: none."),
@@ -171,7 +177,10 @@ def finetune(
         raise typer.BadParameter("--size, --images and --near are for the photographs of --data")
     try:
         options = FinetuneOptions(
-            iterations=iterations, seed=encoding.seed, byte_cost=byte_cost, patience=patience
+            iterations=iterations,
+            seed=encoding.seed,
+            byte_cost=_COST[itself] if byte_cost is None else byte_cost,
+            patience=patience,
         ).scaled(_FACTOR[itself] if lr_factor is None else lr_factor)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None

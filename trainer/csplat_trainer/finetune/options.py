@@ -28,7 +28,8 @@ class FinetuneOptions:
         lr_entries: of the codebook's entries.
         byte_cost: how much a bit per splat weighs in the loss; 0: files may grow as they please.
         warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
-        decay: share of the learning rates that is left at the end.
+        decay: share of the learning rates that is left at the end: what still moves then goes back and forth between
+            two integers, and neither can be learnt from.
         validate_every: steps between looks at the validation views.
         patience: looks without a gain after which a run ends early, once the learning rates have fallen to a quarter:
             before, values shake too much to look their best. 0: never.
@@ -41,16 +42,16 @@ class FinetuneOptions:
     iterations: int = 1_000
     seed: int = 0
     loss: str = "inria"
-    lr_means: float = 0.1
-    lr_quats: float = 4e-3
-    lr_scales: float = 1e-2
-    lr_opacities: float = 5e-2
-    lr_sh0: float = 5e-3
-    lr_shN: float = 1e-3
-    lr_entries: float = 2e-3
+    lr_means: float = 0.2
+    lr_quats: float = 8e-3
+    lr_scales: float = 2e-2
+    lr_opacities: float = 0.1
+    lr_sh0: float = 1e-2
+    lr_shN: float = 2e-3
+    lr_entries: float = 4e-3
     byte_cost: float = 1e-4
     warm_up: int = 100
-    decay: float = 0.01
+    decay: float = 5e-4
     validate_every: int = 100
     patience: int = 4
     log_every: int = 100

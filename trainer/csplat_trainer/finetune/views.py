@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ __all__ = ["View", "Views", "renders_of", "split_views"]
 F32 = NDArray[np.float32]
 
 _JUDGES = 16  # views at most, of those that teach
+_BRIGHTEST = np.float32(6e4)  # what float16 holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +30,18 @@ class View:
 
     Attributes:
         camera: relative to the scene's origin.
-        wanted: a photograph, or [H, W, 3] float32.
+        wanted: a photograph, or [H, W, 3] float16 or float32.
     """
 
     camera: Camera
-    wanted: Picture | F32
+    wanted: Picture | NDArray[np.floating[Any]]
 
     def picture(self, background: F32, out: F32) -> F32:
         """The wanted picture, [H, W, 3] float32; `out` may be overwritten and returned."""
-        return compose(self.wanted, background, out) if isinstance(self.wanted, Picture) else self.wanted
+        if isinstance(self.wanted, Picture):
+            return compose(self.wanted, background, out)
+        np.copyto(out, self.wanted)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +101,13 @@ def split_views(views: Sequence[View], background: F32, aside: int = 0) -> Views
 
 
 def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[View]:
-    """Views of a scene itself: what its file is to look like where there are no photographs."""
+    """Views of a scene itself: what its file is to look like where there are no photographs.
+
+    They are kept in float16, 66 dB and more from what they were up to white; there are hundreds of them.
+    """
     rasteriser = Rasteriser(gradients=False, threads=threads)
-    return [
-        View(camera, rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb)
-        for camera in cameras
-    ]
+    views = []
+    for camera in cameras:
+        seen = rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb
+        views.append(View(camera, np.clip(seen, -_BRIGHTEST, _BRIGHTEST).astype(np.float16)))
+    return views
