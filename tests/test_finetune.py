@@ -358,6 +358,18 @@ def test_learning_rates_rise_and_fall():
     assert options.byte_cost == options.scaled(2.0).byte_cost
 
 
+def test_renders_that_teach_are_those_of_the_source(source):
+    bright = replace(source, sh0=source.sh0 * np.float32(1e6))
+    for model in (source, bright):
+        camera = cameras(1)[0]
+        wanted = render(model, camera, background=BLACK).rgb
+        view = renders_of(model, [camera], BLACK, None)[0]
+        found = view.picture(BLACK, np.empty((H, W, 3), np.float32))
+        assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
+    with pytest.raises(InputError, match="wanted picture has shape"):
+        View(camera, np.zeros((1, 1, 3), np.float32))
+
+
 def test_views_that_judge_teach_unless_they_are_kept_aside():
     views = [View(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
     together, apart = split_views(views, BLACK), split_views(views, BLACK, aside=4)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import lzma
 import struct
 import textwrap
+import tokenize
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,9 +21,10 @@ from csplat.errors import InputError
 __all__ = ["Archive", "read_archive"]
 
 # What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
-# sizes that no array has.
+# sizes that no array has, OSError for places outside the file and broken bz2.
 _DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
-            SyntaxError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
+            SyntaxError, OSError, struct.error, tokenize.TokenError, lzma.LZMAError, zlib.error,
+            zipfile.BadZipFile)  # fmt: skip
 
 
 class Archive(dict[str, NDArray[Any]]):
@@ -44,19 +48,25 @@ class Archive(dict[str, NDArray[Any]]):
         text = textwrap.shorten(str(reason), 120)
         raise InputError(f"{self._path} is not {self._kind}: {text}")
 
-    def facts(self, name: str) -> dict[str, Any]:
-        """A JSON object that is kept as an array of bytes.
+    def facts(self) -> dict[str, Any]:
+        """The JSON object that is kept as an array of bytes by the name of "facts".
 
         Raises:
-            InputError: it is none.
+            InputError: there is none.
         """
         try:
-            found = json.loads(self[name].tobytes())
-        except ValueError as error:
+            found = json.loads(self["facts"].tobytes())
+        except (ValueError, RecursionError) as error:
             self.refuse(error)
         if not isinstance(found, dict):
-            self.refuse(f"its {name} are a {type(found).__name__}")
+            self.refuse(f"its facts are a {type(found).__name__}")
         return found
+
+    def check(self, facts: Mapping[str, Any], kinds: Mapping[str, type]) -> None:
+        """Refuse the file unless its facts have these names and kinds."""
+        for name, kind in kinds.items():
+            if not isinstance(facts.get(name), kind):
+                self.refuse(f"its {name} is no {kind.__name__}")
 
 
 def read_archive(path: str | Path, kind: str) -> Archive:
@@ -80,4 +90,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
                 arrays = {name: file[name] for name in file.files}
         except _DAMAGED as error:
             nothing.refuse(error)
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # NumPy gives the bytes of what is no array
+            nothing.refuse(f"its {name} is no array")
     return Archive(path, kind, arrays)

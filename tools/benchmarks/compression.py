@@ -44,6 +44,8 @@ _PARTS = ("main", "control", "others", "sizes", "escapes", "positions", "sh0", "
 _MEMORY = "peak-memory.json"
 _MEMORY_STEPS = 30  # memory does not grow with them
 
+_OWN = ("quality", "codebook_size", "shape_codebook_size", "threads")  # of the encoder's options
+
 _LISTS: tuple[tuple[str, type[int | float] | None, str, str], ...] = (
     ("sizes", int, "1024,2048,4096,8192,16384", "of codebooks"),
     ("escapes", float, "0,0.01,0.02,0.05,0.1,0.2", "shares"),
@@ -152,9 +154,9 @@ def _knobs(words: list[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for word in words:
         name, _, number = word.partition("=")
-        kind = str(known.get(name, ""))
+        kind = "" if name in _OWN else str(known.get(name, ""))
         if not kind.startswith(("int", "float")):
-            raise InputError(f"--knob {word}: the encoder has no option {name!r} that is a number")
+            raise InputError(f"--knob {word}: no other option of the encoder is called {name!r} and is a number")
         try:
             found[name] = int(number) if kind.startswith("int") else float(number)
         except ValueError:
@@ -193,7 +195,7 @@ def _measure(args: argparse.Namespace, encoding: EncodeOptions, tuning: Finetune
                 _tell(f"error: {scene.name}: {error}")
                 done = False
     if "memory" in what:
-        _memory(args)
+        _memory(args)  # of the command as it is: what the encoder is told hardly matters
     return done
 
 

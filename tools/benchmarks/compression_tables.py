@@ -37,12 +37,46 @@ def tables(results: Results, memory: dict[str, Any] | None = None, *, markdown: 
         memory: by number of splats.
         markdown: as documents have tables.
     """
-    parts = []
+    parts = [_summary(results, markdown=markdown)]
     for name, one in results.items():
         parts += _scene_tables(name, one, markdown=markdown)
     parts += [_attributes(results, markdown=markdown), _times(results, markdown=markdown)]
     parts.append(_memory(memory or {}, markdown=markdown))
     return "\n\n".join(part for part in parts if part)
+
+
+def _summary(results: Results, *, markdown: bool) -> str:
+    """A line for each file, before and after tuning."""
+    lines = []
+    for name, one in results.items():
+        facts = one.get("facts", {}).get("scene", {})
+        for key, row in {**one.get("main", {}), **one.get("curve", {})}.items():
+            source, before, after = facts["scores"], row["before"], row["after"]
+            lines.append(
+                (
+                    name if key == "main" else f"{name}, {key}", f"{facts['splats']:,}",
+                    f"{source['psnr']:.2f} / {source['psnr_mean']:.2f}", _sizes(row["before_bytes"], facts)[0],
+                    *(_difference(before[score], source[score]) for score in ("psnr", "psnr_mean")),
+                    *_sizes(row["after_bytes"], facts),
+                    *(_difference(after[score], source[score]) for score in ("psnr", "psnr_mean")),
+                    *_pairs(source, after), f"{_seconds(row):.0f}", _of_training(row, facts),
+                )
+            )  # fmt: skip
+    header = (
+        "", "splats", "PSNR / mean", "untuned B/splat", "PSNR", "mean", "tuned B/splat", "ratio", "PSNR", "mean",
+        "SSIM", "LPIPS", "s", "% of training",
+    )  # fmt: skip
+    return _titled("Files, before and after tuning", _laid_out(header, lines, markdown=markdown)) if lines else ""
+
+
+def _pairs(source: dict[str, Any], after: dict[str, Any]) -> list[str]:
+    """SSIM and LPIPS of the source and of the file."""
+    return [f"{_score(source, name, digits)} → {_score(after, name, digits)}" for name, digits in _SCORES[2:]]
+
+
+def _of_training(row: dict[str, Any], facts: dict[str, Any]) -> str:
+    training = facts["training"].get("seconds")
+    return "-" if training is None else f"{100 * _seconds(row) / training:.0f}"
 
 
 def _scene_tables(name: str, one: dict[str, Any], *, markdown: bool) -> list[str]:
@@ -182,7 +216,7 @@ def _times(results: Results, *, markdown: bool) -> str:
             (
                 name, f"{facts['splats']:,}", *(f"{row['seconds'].get(stage, 0.0):.1f}" for stage in _WORK),
                 f"{total:.1f}", "-" if training is None else f"{training:.1f}",
-                "-" if training is None else f"{100 * total / training:.0f}",
+                _of_training(row, facts),
             )
         )  # fmt: skip
     header = ("seconds", "splats", *_WORK, "all", "training", "% of it")

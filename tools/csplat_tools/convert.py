@@ -176,7 +176,7 @@ def _encoded(
     result = encode_with_report(model.select(rows), options, importance=chosen, between=between, progress=progress)
     if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
         missed = (
-            f"{100 * stored.missed_share:.2g} % of the splats are left out although views that were kept aside saw"
+            f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
             " them: `csplat sensitivity` with more views misses fewer"
         )
         result = replace(result, report=replace(result.report, notes=(*result.report.notes, missed)))

@@ -49,7 +49,7 @@ class Sources:
         aside: views that judge while values move, and do not teach; 0: some that teach, or one in eight renders, but
             no more than 16.
         keep: share of the splats that stay, the others being those that pictures need least; `None`: all.
-        prune_unseen: leave out splats that no view shows; `None`: if the views are those of the data set.
+        prune_unseen: leave out splats that none of the views shows; `None`: if they are those of the data set.
     """
 
     data: str | None = None
@@ -74,7 +74,7 @@ class Looks:
         data: the data set, if there is one, its cameras relative to the scene's origin.
         cameras: those of its training pictures, or of the renders.
         background: behind everything.
-        deciding: cameras that say what is left out, and how much the rest matters.
+        deciding: those of them that say how much splats matter.
     """
 
     data: DataSet | None
@@ -178,14 +178,14 @@ def choose_splats(
     def weighed(model: SplatModel) -> Sensitivity:
         return measure_views(model, looks.deciding, looks.background, matrices=True, threads=threads, progress=progress)
 
-    given, found = _read(importance, source), None
+    given = _read(importance, source)
     prune = looks.data is not None if sources.prune_unseen is None else sources.prune_unseen
-    if given is None and sources.keep is None:
-        found = weighed(source)
+    found = weighed(source) if given is None and sources.keep is None else None
+    if found is not None and not (prune and len(looks.deciding) < len(looks.cameras)):
         seen = found.seen
     else:
         seen = measure_removal(
-            source, looks.deciding, background=looks.background, threads=threads, progress=progress
+            source, looks.cameras, background=looks.background, threads=threads, progress=progress
         ).seen
     if not seen.any():
         raise InputError("no view shows any splat: scene and cameras do not belong together")

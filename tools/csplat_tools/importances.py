@@ -26,6 +26,7 @@ __all__ = ["Measured", "Wanted", "measure_scene", "measure_views", "read_importa
 Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
 
+_NOTHING = "a scene without splats has no sensitivities"
 _ZIP = b"PK"  # what a .npz begins with
 _GONE = 0.4  # share of the splats for whose removal virtual views have to agree before there are enough
 
@@ -103,7 +104,7 @@ def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None =
     from csplat_tools.simplify.views import find_views
 
     if not len(model):
-        raise InputError("a scene without splats has no sensitivities")
+        raise InputError(_NOTHING)
     sights = find_sights(model, wanted.cameras, wanted.data, judged=False, background=wanted.background)
     background = sights.background
     cameras, check = sights.cameras, []
@@ -143,10 +144,12 @@ def measure_views(
         progress: is told the stages.
 
     Raises:
-        InputError: no view shows any splat.
+        InputError: there are no splats, or no view shows any.
     """
     from csplat_trainer.sensitivity import measure_sensitivity
 
+    if not len(model):
+        raise InputError(_NOTHING)
     if progress is not None:
         progress("compiling", 0.0)  # the first time takes some seconds
         measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices)

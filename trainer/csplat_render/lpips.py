@@ -76,8 +76,10 @@ class Lpips:
                 ("bias", self.biases[i], shape[-1:]),
                 ("head", self.heads[i], shape[-1:]),
             ):
-                if array.shape != wanted or not np.isfinite(array).all():
+                if array.shape != wanted:
                     raise InputError(f"{self.source}: {name} {i} has shape {list(array.shape)}, wanted {list(wanted)}")
+                if not np.isfinite(array).all():
+                    raise InputError(f"{self.source}: {name} {i} holds values that are not finite")
 
     def __call__(self, reference: NDArray[Any], image: NDArray[Any]) -> float:
         """Perceptual distance of two pictures, 0 where they are the same; lower is better.
@@ -145,7 +147,8 @@ def _read(path: Path) -> Lpips:
     parts = [[file[name.format(i)] for i in count] for name in names]
     if any(array.dtype.kind != "f" for part in parts for array in part):
         file.refuse("its arrays hold no real numbers")
-    kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
+    with np.errstate(over="ignore"):  # what is beyond float32 is refused as not finite
+        kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
     return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
 

@@ -18,6 +18,7 @@ from csplat_trainer.parameters import GROUPS, Parameters, Splats
 __all__ = ["Checkpoint", "load_checkpoint", "save_checkpoint"]
 
 _VERSION = 1
+_FACTS = {"iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict}
 
 
 @dataclass
@@ -68,10 +69,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         OSError: it cannot be read.
     """
     stored = read_archive(path, "a checkpoint of csplat train")
-    facts = stored.facts("facts")
-    parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
+    facts = stored.facts()
     if facts.get("version") != _VERSION:
         raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+    stored.check(facts, _FACTS)
+    parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
     _check(path, parts)
     return Checkpoint(
         facts["iteration"],
@@ -84,7 +86,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def _check(path: str | Path, parts: list[Splats]) -> None:
-    count = len(parts[0]["means"])
+    count = len(parts[0]["means"]) if parts[0]["means"].ndim else -1
     coefficients = parts[0]["shN"].shape[1] if parts[0]["shN"].ndim == 3 else -1
     shapes: dict[str, tuple[int, ...]] = {
         "means": (count, 3),

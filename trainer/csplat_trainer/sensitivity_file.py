@@ -167,7 +167,7 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
         arrays.refuse(error)
     matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
     kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
-    if (kinds, found.views.dtype.kind) != ({"f"}, "i"):
+    if (kinds, found.views.dtype.kind, found.views.ndim) != ({"f"}, "i", 1):
         arrays.refuse("its arrays hold other numbers, or none")
     if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
         arrays.refuse("it has matrices for other splats than it has views")
@@ -176,6 +176,8 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
         raise InputError(f"{path} is about {len(found.views)} splats, the scene has {len(model)}")
     if str(arrays["scene"]) != scene_digest(model):
         raise InputError(f"{path} is about another scene: its splats differ from those of this one")
+    if not all(np.isfinite(array).all() for array in (*found.groups.values(), *matrices)):
+        arrays.refuse("it holds values that are not finite")
     return found
 
 

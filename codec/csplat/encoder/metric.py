@@ -77,7 +77,7 @@ class Metric:
         return found
 
 
-def reassign(points: Floats, metric: Metric, entries: Floats, index: I64, threads: int, tried: int = _TRIED) -> I64:
+def reassign(points: Floats, metric: Metric, entries: Floats, index: I64, threads: int, tried: int) -> I64:
     """Give each point the best of the entries near its own.
 
     Args:

@@ -193,7 +193,7 @@ def finetune(
             Path(path).stat()  # an OSError that names it, before the minutes that views and splats may take
     # A checkpoint may take the place of the one that it goes on from.
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
-    inputs = (source, importance, cameras)
+    inputs = (source, importance, cameras, None if lpips == "auto" else lpips)
     outputs = (output, source_index, report, log, None if again else checkpoint)
     check_outputs(outputs, force=force, inputs=(*inputs, resume))
     if again:

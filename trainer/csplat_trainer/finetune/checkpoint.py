@@ -20,6 +20,11 @@ from csplat_trainer.parameters import GROUPS, Parameters
 __all__ = ["FinetuneCheckpoint", "load_finetune", "save_finetune"]
 
 _VERSION = 1
+_FACTS = {
+    "frozen": str, "iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict,
+    "best": list,
+}  # fmt: skip
+_BEST = 4  # numbers of the best look
 _KIND = "csplat finetune"
 _HELD = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
 _GROUPS = (*GROUPS, "sizes")
@@ -84,16 +89,21 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
         OSError: it cannot be read.
     """
     stored = read_archive(path, "a checkpoint of csplat finetune")
-    facts = stored.facts("facts")
+    facts = stored.facts()
     if facts.get("kind") != _KIND:
         stored.refuse("it is of another kind")
+    if facts.get("version") != _VERSION:
+        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+    stored.check(facts, _FACTS)
+    if facts["frozen"] != fingerprint(frozen):
+        raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+    if len(facts["best"]) != _BEST or not all(isinstance(one, (int, float)) for one in facts["best"]):
+        stored.refuse(f"its best look is {facts['best']}")
     parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
     best = Held(*(stored[f"best_{name}"] for name in _HELD))
     costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
-    if facts.get("version") != _VERSION:
-        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
-    if facts["frozen"] != fingerprint(frozen):
-        raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+    if any(table.ndim != 2 or table.dtype != np.float32 or not np.isfinite(table).all() for table in costs.values()):
+        stored.refuse("its costs are no tables of float32")
     score, psnr, iteration, since = facts["best"]
     checkpoint = FinetuneCheckpoint(
         facts["iteration"],

@@ -28,8 +28,8 @@ class FinetuneOptions:
         lr_entries: of the codebook's entries.
         byte_cost: how much a bit per splat weighs in the loss; 0: files may grow as they please.
         warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
-        decay: share of the learning rates that is left at the end: what still moves then goes back and forth between
-            two integers, and neither can be learnt from.
+        decay: share of the learning rates that is left at the end. Next to nothing: values that still move go back and
+            forth between two integers.
         validate_every: steps between looks at the validation views.
         patience: looks without a gain after which a run ends early, once the learning rates have fallen to a quarter:
             before, values shake too much to look their best. 0: never.

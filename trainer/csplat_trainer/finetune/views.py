@@ -31,10 +31,18 @@ class View:
     Attributes:
         camera: relative to the scene's origin.
         wanted: a photograph, or [H, W, 3] float16 or float32.
+
+    Raises:
+        InputError: a picture of another size.
     """
 
     camera: Camera
     wanted: Picture | NDArray[np.floating[Any]]
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.H, self.camera.W, 3)
+        if not isinstance(self.wanted, Picture) and self.wanted.shape != shape:
+            raise InputError(f"a wanted picture has shape {list(self.wanted.shape)}, wanted {list(shape)}")
 
     def picture(self, background: F32, out: F32) -> F32:
         """The wanted picture, [H, W, 3] float32; `out` may be overwritten and returned."""
