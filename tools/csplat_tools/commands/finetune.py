@@ -148,17 +148,18 @@ def finetune(
 ) -> None:
     """Compress a scene, and tune what the file holds until it looks right.
 
-    The encoder decides lattices, tiles and codebooks once. Then the values
-    move, seen through the encoder's own quantisers, until pictures of what a
-    decoder will see look like the photographs; without photographs, like the
-    scene itself. What looks best for its bytes is written. Needs the
-    packages of the render extra.
+    How much the views depend on each splat is measured; by that the encoder
+    decides lattices, tiles and codebooks, once. Then the values move, seen
+    through the encoder's own quantisers, until pictures of what a decoder
+    will see look like the photographs; without photographs, like the scene
+    itself. What looks best for its bytes is written. Needs the packages of
+    the render extra.
 
     Examples:
       csplat finetune scene.ply --data capture -o scene.csplat --preset small
       csplat finetune scene.ply --data capture -o scene.csplat --quality 40 --report scene.json
       csplat finetune scene.ply --data capture -o scene.csplat --keep 0.5
-      csplat finetune scene.ply --self -o scene.csplat --views 160
+      csplat finetune scene.ply --self -o scene.csplat
       csplat finetune scene.ply --data capture -o scene.csplat --checkpoint run.npz --resume run.npz
     """
     need_trainer()
