@@ -17,6 +17,7 @@ BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 # They lie in the folder that is named above.
+from captures import H, W, cameras, photograph, shell  # noqa: E402
 from compression import main  # noqa: E402
 from compression_controls import Unquantised, cluster_colours, eight_bits, histogram  # noqa: E402
 from compression_memory import with_splats  # noqa: E402
@@ -32,59 +33,24 @@ from compression_sizes import (  # noqa: E402
 )
 from compression_tables import tables  # noqa: E402
 
-from csplat import EncodeOptions, write_ply  # noqa: E402 - wants what is looked for above; so do all below
+from csplat import EncodeOptions  # noqa: E402 - wants what is looked for above; so do all below
 from csplat.encoder.freezing import encode_frozen, freeze  # noqa: E402
 from csplat.errors import InputError  # noqa: E402
-from csplat.model import SplatModel, normalise_quats  # noqa: E402
-from csplat_render import render  # noqa: E402
-from csplat_render.cameras import intrinsics, look_at  # noqa: E402
 from csplat_trainer.finetune import FinetuneOptions, finetune, renders_of, split_views  # noqa: E402
 from csplat_trainer.sensitivity import measure_sensitivity  # noqa: E402
 
-W, H = 48, 40
 BLACK = np.zeros(3, np.float32)
 BOOKS = EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
 
 
-def cameras(count):
-    K, angles = intrinsics(W, H, 60.0), np.linspace(0.2, 5.9, count)
-    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1), K, W, H) for a in angles]
-
-
 @pytest.fixture(scope="module")
 def source():
-    """A shell of 300 splats, whose colours vary smoothly."""
-    rng = np.random.default_rng(0)
-    means = rng.standard_normal((300, 3))
-    means /= np.linalg.norm(means, axis=1, keepdims=True)
-    return SplatModel(
-        means=means.astype(np.float32),
-        quats=normalise_quats(rng.standard_normal((300, 4))),
-        scales=rng.uniform(-2.5, -1.3, (300, 3)).astype(np.float32),
-        opacities=rng.uniform(0.1, 0.95, 300).astype(np.float32),
-        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
-        shN=(0.1 * rng.standard_normal((300, 15, 3))).astype(np.float32),
-    )
+    return shell(15)
 
 
 @pytest.fixture(scope="module")
 def capture(source, tmp_path_factory):
-    """A PLY with one splat more, far behind all cameras, and sixteen photographs of the scene in front of black."""
-    folder = tmp_path_factory.mktemp("capture")
-    (folder / "images").mkdir()
-    frames = []
-    for number, camera in enumerate(cameras(16)):
-        pixels = np.clip(render(source, camera).rgb, 0.0, 1.0)
-        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number:02}.png")
-        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": pose.tolist()})
-    K = intrinsics(W, H, 60.0)
-    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
-    hidden = source.select(np.concatenate([[0], np.arange(300)]))
-    hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), source.means]))
-    write_ply(folder / "scene.ply", hidden)
-    return folder
+    return photograph(source, tmp_path_factory.mktemp("capture"))
 
 
 # sizes

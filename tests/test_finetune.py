@@ -11,51 +11,34 @@ from typer.testing import CliRunner
 
 pytest.importorskip("numba", reason="fine-tuning needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
 # Importing them needs what is looked for above.
-from csplat import EncodeOptions, decode, encode, write_ply  # noqa: E402
-from csplat.decoder import read_options, read_stated_errors  # noqa: E402
-from csplat.encoder.freezing import encode_frozen, freeze  # noqa: E402
-from csplat.errors import InputError  # noqa: E402
-from csplat_render import render  # noqa: E402
-from csplat_render.cameras import intrinsics, look_at, save_cameras  # noqa: E402
-from csplat_render.rasterise import Rasteriser, Splats  # noqa: E402
-from csplat_tools.app import app  # noqa: E402
-from csplat_tools.commands.finetune import finetune as finetune_command  # noqa: E402
-from csplat_tools.finetune_report import PLY_SPLAT_BYTES  # noqa: E402
-from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views  # noqa: E402
-from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes  # noqa: E402
-from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin  # noqa: E402
-from csplat_trainer.loss import PhotometricLoss  # noqa: E402
+from captures import H, W, cameras, photograph, shell
 
-W, H = 48, 40
+from csplat import EncodeOptions, decode, encode, write_ply
+from csplat.decoder import read_options, read_stated_errors
+from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.errors import InputError
+from csplat_render import render
+from csplat_render.cameras import save_cameras
+from csplat_render.rasterise import Rasteriser, Splats
+from csplat_tools.app import app
+from csplat_tools.commands.finetune import finetune as finetune_command
+from csplat_tools.finetune_report import PLY_SPLAT_BYTES
+from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views
+from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes
+from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin
+from csplat_trainer.loss import PhotometricLoss
+
 BLACK = np.zeros(3, np.float32)
 QUICK = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, log_every=10)
 COARSE = EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16)
 
 
-def cameras(count):
-    K, angles = intrinsics(W, H, 60.0), np.linspace(0.2, 5.9, count)
-    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1), K, W, H) for a in angles]
-
-
 @pytest.fixture(scope="module")
 def source():
-    """A shell of 300 overlapping splats, whose colours vary smoothly."""
-    from csplat.model import SplatModel, normalise_quats
-
-    rng = np.random.default_rng(0)
-    means = rng.standard_normal((300, 3))
-    means /= np.linalg.norm(means, axis=1, keepdims=True)
-    return SplatModel(
-        means=means.astype(np.float32),
-        quats=normalise_quats(rng.standard_normal((300, 4))),
-        scales=rng.uniform(-2.5, -1.3, (300, 3)).astype(np.float32),
-        opacities=rng.uniform(0.1, 0.95, 300).astype(np.float32),
-        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
-        shN=(0.1 * rng.standard_normal((300, 8, 3))).astype(np.float32),
-    )
+    return shell(8)
 
 
 @pytest.fixture(scope="module")
@@ -396,22 +379,7 @@ def call(*words):
 
 @pytest.fixture(scope="module")
 def capture(source, tmp_path_factory):
-    """A PLY with one splat more, far behind all cameras, and sixteen photographs of the scene in front of black."""
-    folder = tmp_path_factory.mktemp("capture")
-    (folder / "images").mkdir()
-    frames = []
-    for number, camera in enumerate(cameras(16)):
-        pixels = np.clip(render(source, camera).rgb, 0.0, 1.0)
-        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number:02}.png")
-        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": pose.tolist()})
-    K = intrinsics(W, H, 60.0)
-    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
-    hidden = source.select(np.concatenate([[0], np.arange(300)]))
-    hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), source.means]))
-    write_ply(folder / "scene.ply", hidden)
-    return folder
+    return photograph(source, tmp_path_factory.mktemp("capture"))
 
 
 def test_the_command_tunes_prunes_and_reports(capture, tmp_path):

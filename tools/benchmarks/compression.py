@@ -8,7 +8,7 @@
     python tools/benchmarks/compression.py memory --memory 100000,500000
     python tools/benchmarks/compression.py tables --markdown
 
-A compression is what `csplat sensitivity` and `csplat finetune` do: sensitivities from the training views, codebooks
+A compression is what `csplat finetune` does: sensitivities from the training views, codebooks
 of SH and shapes, fine-tuning through the encoder's quantisers. Scores are those of the decoded files, ratios those to
 a PLY of 62 floats. What was measured is kept scene by scene in out/compression/NAME.json. LPIPS is AlexNet's.
 """

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from csplat_render.lpips import Lpips
 from csplat_render.rasterise import Rasteriser
 from csplat_render.removal import measure_removal
 from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
+from csplat_tools.finetuning import Clock
 from csplat_tools.importances import measure_views
 from csplat_tools.layout import describe
 from csplat_tools.photographs import show_photograph
@@ -34,7 +34,7 @@ from csplat_trainer.finetune import FinetuneOptions, Views, finetune
 from csplat_trainer.report import save_picture, side_by_side
 from csplat_trainer.sensitivity import Sensitivity
 
-__all__ = ["ARRAYS", "Bench", "Clock", "Tuned"]
+__all__ = ["ARRAYS", "Bench", "Tuned"]
 
 #: Arrays of a model.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -43,20 +43,6 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 Pick = tuple[Chosen, dict[str, float]]
 
 Scores = dict[str, dict[str, float | None]]
-
-
-@dataclass
-class Clock:
-    """Seconds by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time what happens inside."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from csplat_tools.inout import ply_path, write_array, write_bytes
 if TYPE_CHECKING:
     from csplat_trainer.finetune import FinetuneOptions, Moment
 
-__all__ = ["Files", "Scene", "run_finetuning"]
+__all__ = ["Clock", "Files", "Scene", "run_finetuning"]
 
 I64 = NDArray[np.int64]
 
@@ -72,13 +72,14 @@ class Scene:
 
 
 @dataclass
-class _Clock:
+class Clock:
     """Seconds by stage."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        """Time what happens inside."""
         start = time.perf_counter()
         yield
         self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
@@ -102,7 +103,7 @@ def run_finetuning(
     from csplat_trainer.finetune import finetune
     from csplat_trainer.report import write_log
 
-    clock, threads = _Clock(), encoding.threads
+    clock, threads = Clock(), encoding.threads
     distance = None if files.lpips is None else load_lpips(None if files.lpips == "auto" else files.lpips)
     with clock.stage("reading"):
         source = _read(files.source, scene, encoding, quiet=quiet)

@@ -20,6 +20,7 @@ __all__ = ["with_encoder_knobs"]
 _KNOBS = {field.name for field in fields(EncodeOptions)}
 # By the names that the command line has for them, which `SceneFacts` takes in this order.
 _FACTS = ("axes", "unit_metres", "antialiased", "licence")
+_READING = ("strict",)  # passed on under its name
 
 
 def with_encoder_knobs(command: Callable[..., None]) -> Callable[..., None]:
@@ -29,11 +30,11 @@ def with_encoder_knobs(command: Callable[..., None]) -> Callable[..., None]:
     a new one appears in all of them.
 
     Args:
-        command: takes them as two arguments, `encoding` and `facts`.
+        command: takes them as two arguments, `encoding` and `facts`; and `strict`, which is declared there, too.
     """
     own = inspect.signature(command, eval_str=True)
     declared = inspect.signature(encode, eval_str=True).parameters.values()
-    shared = [one for one in declared if one.name in _KNOBS or one.name in _FACTS]
+    shared = [one for one in declared if one.name in {*_KNOBS, *_FACTS, *_READING}]
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
@@ -45,7 +46,7 @@ def with_encoder_knobs(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.BadParameter(str(error)) from None
         command(**given, encoding=encoding, facts=facts)
 
-    kept = [one for one in own.parameters.values() if one.name not in ("encoding", "facts")]
+    kept = [one for one in own.parameters.values() if one.name not in ("encoding", "facts", *_READING)]
     positional = [one for one in kept if one.default is inspect.Parameter.empty]
     rest = [one for one in kept if one.default is not inspect.Parameter.empty]
     signature = own.replace(parameters=[*positional, *shared, *rest])

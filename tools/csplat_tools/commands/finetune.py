@@ -38,6 +38,7 @@ def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     encoding: EncodeOptions,
     facts: SceneFacts,
+    strict: bool,
     output: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write.")],
     data: Annotated[
         str | None,
@@ -120,9 +121,6 @@ def finetune(
     lpips: Annotated[
         str | None, typer.Option(metavar="WEIGHTS.npz", help="Report LPIPS (Alex) with these weights, or `auto`.")
     ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse a PLY with defects instead of repairing it.")
-    ] = False,
     source_index: Annotated[
         str | None,
         typer.Option(metavar="FILE.npy", rich_help_panel=_FILES, help="Write which splat each one of the file was."),
