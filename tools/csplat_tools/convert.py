@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from csplat_trainer.sensitivity_file import StoredSensitivity
 __all__ = [
     "Encoded",
     "Encoder",
+    "Made",
     "SceneFacts",
     "decode_file",
     "encode_file",
@@ -34,8 +35,24 @@ __all__ = [
 #: What is told how far a stage has come: its name, and 0 to 1.
 Report = Callable[[str, float], None]
 
+
+@dataclass(frozen=True)
+class Made:
+    """A file, and what whoever made it has to say.
+
+    Attributes:
+        result: of the encoder.
+        key: under which name a report has `said`.
+        said: what was looked for, tried and chosen, JSON-compatible.
+    """
+
+    result: EncodeResult
+    key: str = ""
+    said: Mapping[str, Any] = field(default_factory=dict)
+
+
 #: Makes a file of a scene.
-Encoder = Callable[[SplatModel, EncodeOptions, Report | None], EncodeResult]
+Encoder = Callable[[SplatModel, EncodeOptions, Report | None], Made]
 
 _SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
 
@@ -71,16 +88,21 @@ class Encoded:
     """What an encoding took and gave.
 
     Attributes:
-        result: of the encoder.
+        made: the file.
         findings: what lint noticed in the PLY.
         source_bytes: size of the PLY.
         seconds: reading, encoding and writing.
     """
 
-    result: EncodeResult
+    made: Made
     findings: tuple[Finding, ...]
     source_bytes: int
     seconds: float
+
+    @property
+    def result(self) -> EncodeResult:
+        """Of the encoder."""
+        return self.made.result
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -98,6 +120,7 @@ class Encoded:
             "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
+            **({self.made.key: dict(self.made.said)} if self.made.key else {}),
         }
 
 
@@ -143,13 +166,13 @@ def encode_file(
         progress("reading", 1.0)
     model = (facts or SceneFacts()).applied(model)
     if encoder is not None:
-        result = encoder(model, options, progress)
+        made = encoder(model, options, progress)
     else:
-        result = _encoded(model, options, importance, prune_unseen, progress)
-    write_bytes(target, result.data)
+        made = Made(_encoded(model, options, importance, prune_unseen, progress))
+    write_bytes(target, made.result.data)
     if source_index is not None:
-        write_array(source_index, result.source_index)
-    return Encoded(result, tuple(findings), source_bytes, time.perf_counter() - start)
+        write_array(source_index, made.result.source_index)
+    return Encoded(made, tuple(findings), source_bytes, time.perf_counter() - start)
 
 
 def _encoded(

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import typer
 
-from csplat.encoder import EncodeOptions, EncodeResult
+from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_tools.convert import Encoder, Report
+from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
 
 __all__ = ["DEFAULT_VIEWS", "Simplifying"]
@@ -54,12 +54,13 @@ class Simplifying:
         except InputError as error:
             raise typer.BadParameter(str(error)) from None
 
-        def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> EncodeResult:
+        def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
             sights = find_sights(model, self.cameras, self.data, judged=target.max_loss is not None)
-            return encode_simplified(
+            file = encode_simplified(
                 model, sights.cameras, target=target, encoding=encoding,
                 options=replace(options, background=sights.background),
                 photographs=sights.photographs, progress=progress,
-            ).result  # fmt: skip
+            )  # fmt: skip
+            return Made(file.result, "simplified", file.report)
 
         return encode

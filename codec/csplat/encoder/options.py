@@ -23,6 +23,8 @@ class EncodeOptions:
         profile: "base" (every decoder reads it) or "archive" (Zstandard too).
         position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from splat sizes.
         position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
+        position_error: largest distance of a centre from where it was, scene units, > 0; overrides both. The step
+            follows from it, and tiles are cut until none needs a coarser one.
         means_coding: "auto", "morton" or "axis".
         scale_step: step of the log scales, > 0.
         opacity_levels: M, 1 to 65535.
@@ -55,6 +57,7 @@ class EncodeOptions:
     profile: str = "base"
     position_bits: int | None = None
     position_step: float | None = None
+    position_error: float | None = None
     means_coding: str = "auto"
     scale_step: float | None = None
     opacity_levels: int | None = None
@@ -144,6 +147,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "quality": (float, 10, 120),
     "position_bits": (int, 2, 16),
     "position_step": (float, _TINY, _HUGE),
+    "position_error": (float, _TINY, _HUGE),
     "scale_step": (float, 1e-6, 1e3),
     "opacity_levels": (int, 1, _spec.OPACITY_LEVELS_MAX),
     "quat_levels": (int, _spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX),

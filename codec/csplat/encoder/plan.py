@@ -25,6 +25,7 @@ _SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
 _EDGE = 0.02  # share of splats on either side that does not count as the scene's extent
 _MOST_BITS = 16  # per axis of a tile, in the profile base
 _LEAST_STEP = 1e-250
+_HALF_DIAGONAL = 3.0**0.5 / 2.0  # of a lattice cell, in steps: no centre is moved farther
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,9 @@ def _first(chosen: Any, otherwise: Any) -> Any:
 
 
 def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattice:
-    """Choose the means' step: given, from bits over the core of the scene, or what the quality asks for."""
+    """Choose the means' step: given, from an error, from bits over the core of the scene, or by the quality."""
+    if options.position_error is not None:
+        return Lattice(options.position_error / _HALF_DIAGONAL, _MOST_BITS, strict=True)
     if options.position_step is not None:
         return Lattice(options.position_step, _MOST_BITS)
     if len(model) == 0:

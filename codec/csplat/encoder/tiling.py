@@ -25,11 +25,13 @@ class Lattice:
         step: of the file, scene units, > 0.
         bits: per axis and tile at most, 1 to 16; a tile whose box needs more is cut or coarsened.
         finest: tiles use all their bits (a step given in bits) instead of stopping at `step`.
+        strict: no tile has a coarser step, however many tiles that takes.
     """
 
     step: float
     bits: int
     finest: bool = False
+    strict: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ def cut(means: F32, lattice: Lattice, tile_splats: int) -> list[Tile]:
         return []
     limit = float((1 << lattice.bits) - 1)
     wide = 4.0 if lattice.finest else 1.0  # a step given in bits follows the box; only outliers are cut off
+    few = 1 if lattice.strict else _FEW
     tiles: list[Tile] = []
     pending = [(np.arange(len(means), dtype=np.intp), np.ascontiguousarray(means.T))]
     while pending:
@@ -70,7 +73,7 @@ def cut(means: F32, lattice: Lattice, tile_splats: int) -> list[Tile]:
         high = points.max(axis=1).astype(np.float64)
         axis = int(np.argmax(high - low))
         extent = float(high[axis] - low[axis])
-        if extent / lattice.step > wide * limit and len(rows) > _FEW:
+        if extent / lattice.step > wide * limit and len(rows) > few:
             near = points[axis] < low[axis] + extent / 2
             halves = [np.flatnonzero(~near), np.flatnonzero(near)]
         elif len(rows) > tile_splats:

@@ -13,6 +13,7 @@ from csplat_tools.console import format_bytes, format_table, guarded, note, prog
 from csplat_tools.convert import Encoded, SceneFacts, encode_file
 from csplat_tools.inout import STANDARD_STREAM, check_outputs
 from csplat_tools.simplifying import DEFAULT_VIEWS, Simplifying
+from csplat_tools.targeting import Targeting, target_lines
 
 __all__ = ["encode"]
 
@@ -21,6 +22,8 @@ _PRECISION = "Precision (the preset decides where nothing is given)"
 _COLOUR = "Spherical harmonics"
 _SHAPE = "Codebook of shapes (wants --importance of `csplat sensitivity`)"
 _CODING = "Coding"
+_TARGET = "Targets: the encoder chooses, and judges the file (sizes and PSNRs need the render extra)"
+_VIEWS = "Views that judge and decide, for targets and simplification; else virtual ones"
 _LESS = "Simplification (needs the render extra)"
 
 
@@ -65,11 +68,33 @@ def encode(
     licence: Annotated[
         str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, help="Into the metadata.")
     ] = None,
+    target_size: Annotated[
+        str | None,
+        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="The best picture within so many bytes; or:"),
+    ] = None,
+    target_psnr: Annotated[
+        float | None,
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="The smallest file whose renders have this PSNR."),
+    ] = None,
+    max_error: Annotated[
+        str | None,
+        typer.Option(
+            metavar="means=0.001,...",
+            rich_help_panel=_TARGET,
+            help=f"No splat errs by more: {', '.join(MEASURE_NAMES.values())}. With mm where the unit is known.",
+        ),
+    ] = None,
+    keep_all: Annotated[
+        bool, typer.Option("--keep-all", rich_help_panel=_TARGET, help="Reach the target with every splat.")
+    ] = False,
     quality: Annotated[
         float | None, typer.Option(metavar="DB", rich_help_panel=_PRECISION, help="PSNR that each attribute keeps.")
     ] = None,
     position_bits: Annotated[
         int | None, typer.Option(metavar="2..16", rich_help_panel=_PRECISION, help="Bits per axis of a tile.")
+    ] = None,
+    position_error: Annotated[
+        float | None, typer.Option(metavar="UNITS", rich_help_panel=_PRECISION, help="Largest error of a mean.")
     ] = None,
     position_step: Annotated[
         float | None, typer.Option(metavar="UNITS", rich_help_panel=_PRECISION, help="Step of the means.")
@@ -147,21 +172,18 @@ def encode(
         float | None, typer.Option(metavar="SHARE", rich_help_panel=_LESS, help="Share of the splats that stay; or:")
     ] = None,
     max_loss: Annotated[
-        str | None, typer.Option(metavar="DB", rich_help_panel=_LESS, help="How far PSNR of photographs may fall; or:")
-    ] = None,
-    target_psnr: Annotated[
-        float | None,
-        typer.Option(metavar="DB", rich_help_panel=_LESS, help="PSNR of the file; the smallest of several."),
+        str | None,
+        typer.Option(metavar="DB", rich_help_panel=_LESS, help="How far PSNR of photographs may fall; or a target."),
     ] = None,
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="FILE.json", rich_help_panel=_LESS, help="Views that decide; else virtual ones."),
+        typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="A camera file."),
     ] = None,
     data: Annotated[
-        str | None, typer.Option(metavar="DATA", rich_help_panel=_LESS, help="A data set whose views decide.")
+        str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set with its photographs.")
     ] = None,
     views: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_LESS, help="Virtual views at most.")
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
     ] = DEFAULT_VIEWS,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report on standard output, for programs.")] = False,
@@ -179,6 +201,9 @@ def encode(
         csplat verify scene.csplat --source scene.ply --source-index scene.npy
       csplat sensitivity scene.ply scene.npz --data photographs && \
         csplat encode scene.ply scene.csplat --importance scene.npz
+      csplat encode scene.ply scene.csplat --target-size 5MB
+      csplat encode scene.ply scene.csplat --target-psnr 42 --keep-all
+      csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
       csplat encode scene.ply scene.csplat --simplify --keep 0.5
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
@@ -189,6 +214,7 @@ def encode(
             profile=profile,
             position_bits=position_bits,
             position_step=position_step,
+            position_error=position_error,
             means_coding=means_coding,
             scale_step=scale_step,
             opacity_levels=opacity_levels,
@@ -214,15 +240,17 @@ def encode(
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
     wanted = Simplifying(keep, max_loss, target_psnr, cameras, data, views, threads)
-    if not simplify and wanted.asked:
-        raise typer.BadParameter(
-            "--keep, --max-loss, --target-psnr, --cameras and --data say nothing without --simplify"
-        )
+    target_asked = Targeting(target_size, target_psnr, max_error, keep_all, importance, cameras, data, views, threads)
+    _check_ways(simplify, wanted, target_asked)
     if simplify and importance is not None:
         raise typer.BadParameter("--simplify measures the importance of splats itself")
     if prune_unseen and importance is None:
         raise typer.BadParameter("--prune-unseen wants --importance, which says what was seen")
+    if prune_unseen and target_asked.asked:
+        raise typer.BadParameter("--prune-unseen and a target: a target chooses itself what is left out")
     encoder = wanted.encoder(quiet=quiet) if simplify else None
+    if target_asked.asked and not simplify:
+        encoder = target_asked.encoder(quiet=quiet)
     if as_json and target == STANDARD_STREAM:
         raise typer.BadParameter("--json and - both want standard output")
     if source_index == STANDARD_STREAM:
@@ -253,8 +281,23 @@ def encode(
             _report(encoded)
 
 
+def _check_ways(simplify: bool, wanted: Simplifying, target: Targeting) -> None:
+    """Refuse options that say nothing together."""
+    if simplify and (target.size is not None or target.max_error is not None):
+        raise typer.BadParameter("--simplify has --keep, --max-loss and --target-psnr, and no other targets")
+    if not simplify and (wanted.keep is not None or wanted.max_loss is not None):
+        raise typer.BadParameter("--keep and --max-loss say nothing without --simplify")
+    if not simplify and not target.asked and (wanted.cameras is not None or wanted.data is not None):
+        raise typer.BadParameter("--cameras and --data say nothing without a target or --simplify")
+    if target.keep_all and (simplify or not target.asked):
+        raise typer.BadParameter("--keep-all says nothing without a target, and contradicts --simplify")
+
+
 def _report(encoded: Encoded) -> None:
     report = encoded.result.report
+    if encoded.made.key == "target":
+        for line in target_lines(encoded.made.said):
+            note(line)
     per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
     note(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from csplat_render.rasterise import Rasteriser
 __all__ = ["Judge", "loss_as_psnr", "render_pictures"]
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 
 def render_pictures(
@@ -61,14 +62,26 @@ class Judge:
 
     def psnr(self, model: SplatModel) -> float:
         """PSNR of the error pooled over views, pixels and channels, pictures clipped to 0..1; 99 dB at most."""
-        error, count = 0.0, 0
+        return psnr_of_mse(self.pooled(self.view_errors(model)))
+
+    def view_errors(self, model: SplatModel) -> F64:
+        """[V] mean squared error by view, pictures clipped to 0..1."""
+        errors = np.zeros(len(self.cameras))
         rasteriser = Rasteriser(gradients=False, threads=self.threads)
-        for camera, wanted in zip(self.cameras, self.wanted, strict=True):
+        for number, (camera, wanted) in enumerate(zip(self.cameras, self.wanted, strict=True)):
             picture = rasteriser.forward(model, camera, background=self.background, antialiased=model.antialiased).rgb
             difference = np.clip(picture, 0.0, 1.0) - np.clip(wanted, 0.0, 1.0)
-            error += float(np.sum(np.square(difference), dtype=np.float64))
-            count += difference.size
-        return psnr_of_mse(error / count)
+            errors[number] = np.sum(np.square(difference), dtype=np.float64) / difference.size
+        return errors
+
+    def pooled(self, errors: F64) -> float:
+        """The mean squared error over all pixels, of those by view."""
+        pixels = np.array([picture.size for picture in self.wanted], np.float64)
+        return float(np.sum(errors * pixels) / np.sum(pixels))
+
+    def some(self, views: Sequence[int]) -> Judge:
+        """A judge by some of the views."""
+        return replace(self, cameras=[self.cameras[i] for i in views], wanted=[self.wanted[i] for i in views])
 
 
 def loss_as_psnr(loss: float, photo_psnr: float) -> float:

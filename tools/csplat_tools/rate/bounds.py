@@ -1,0 +1,181 @@
+"""Largest errors as targets: steps are made finer, or coarser, until the file states no larger ones."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_tools.rate.targets import RateResult
+
+__all__ = ["Bounded", "meet_bounds"]
+
+Progress = Callable[[str, float], None]
+
+_TRIES = 12
+_NEAR = 0.9  # of a bound that is good enough; below it a coarser step is tried
+_AIM = 0.97
+_FASTEST = 8.0  # times finer or coarser from one try to the next
+_KNOBS = {
+    "means": ("position_error", "position_step", "position_bits"),
+    "covariance": ("scale_step", "quat_levels", "shape_codebook_size"),
+    "opacities": ("opacity_levels",),
+    "sh0": ("sh0_step",),
+    "sh": ("sh_step",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded:
+    """A file whose errors keep within bounds.
+
+    Attributes:
+        encoding: options of the encoder. result: their file.
+        bounds: largest error by measure, as asked.
+        encodes: how many files were made.
+        seconds: for all of them.
+    """
+
+    encoding: EncodeOptions
+    result: EncodeResult
+    bounds: Mapping[str, float]
+    encodes: int
+    seconds: float
+
+    def as_result(self) -> RateResult:
+        """The file, and a report."""
+        errors = self.result.report.errors
+        report = {
+            "goal": {"max_error": dict(self.bounds)},
+            "reached": {name: errors.get(name, (0.0, 0.0))[0] for name in self.bounds},
+            "size_bytes": len(self.result.data),
+            "renders": 0,
+            "encodes": self.encodes,
+            "seconds": round(self.seconds, 3),
+        }
+        return RateResult(self.result, report)
+
+
+def meet_bounds(
+    source: SplatModel,
+    encoding: EncodeOptions,
+    bounds: Mapping[str, float],
+    *,
+    importance: NDArray[Any] | Importance | None = None,
+    progress: Progress | None = None,
+) -> Bounded:
+    """Find steps with which no splat errs by more than is allowed.
+
+    Args:
+        source: the scene.
+        encoding: everything else; steps of measures that are not bounded stay as they are.
+        bounds: largest error by measure.
+        importance: how much splats matter, as for the encoder.
+        progress: is told the encoder's stages.
+
+    Returns:
+        The file. The largest errors that it states are within the bounds, and where float32 and the lattices allow it
+        near them.
+
+    Raises:
+        InputError: the caller fixed a step that a bound would have to choose, or no step keeps to a bound.
+    """
+    start = time.perf_counter()
+    options = _started(source, encoding, bounds)
+    best: tuple[EncodeOptions, EncodeResult] | None = None
+    files = 0
+    for files in range(1, _TRIES + 1):
+        result = encode_with_report(source, options, importance=importance, progress=progress)
+        ratios = {name: result.report.errors.get(name, (0.0, 0.0))[0] / bounds[name] for name in bounds}
+        if all(ratio <= 1.0 for ratio in ratios.values()):
+            if best is None or len(result.data) < len(best[1].data):
+                best = options, result
+            changed = _finer(options, {name: ratio for name, ratio in ratios.items() if 0.0 < ratio < _NEAR})
+            if changed == options or files > _TRIES // 2:
+                break
+        else:
+            wrong = {name: ratio for name, ratio in ratios.items() if ratio > 1.0}
+            if best is not None:
+                break  # a coarser step was one too many
+            changed = _finer(options, wrong)
+            if changed == options:
+                break
+        options = changed
+    if best is None:
+        worst = max(ratios, key=lambda name: ratios[name])
+        raise InputError(
+            f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best that was found is"
+            f" {result.report.errors[worst][0]:.3g}"
+        )
+    return Bounded(*best, bounds, files, time.perf_counter() - start)
+
+
+def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
+    """The options with first guesses for the steps of what is bounded."""
+    chosen: dict[str, Any] = {}
+    for name, bound in bounds.items():
+        knobs = _KNOBS[_family(name)]
+        fixed = [knob for knob in knobs if getattr(encoding, knob) is not None]
+        if fixed:
+            raise InputError(f"{fixed[0]} is given, and the largest error of {name} is to choose it: leave one out")
+        if name == "means":
+            chosen["position_error"] = bound
+        elif name == "opacities":
+            chosen["opacity_levels"] = _within(math.ceil(1.0 / bound), 1, 65535)
+        elif name == "covariance":
+            chosen["scale_step"] = min(max(0.4 * bound, 1e-6), 1e3)
+            chosen["quat_levels"] = _within(math.ceil(4.0 / bound), 8, 32767)
+        else:
+            step = min(max(_AIM * bound, 1e-6), 1e3)
+            chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
+    if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
+        if encoding.sh_coding == "codebook":
+            raise InputError("an SH codebook bounds no error of a splat: leave --sh-coding to the bound")
+        bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")
+        if encoding.sh_degree is not None and encoding.sh_degree < min(bounded, source.sh_degree):
+            raise InputError(f"SH degree {encoding.sh_degree} leaves out sh{bounded}, whose error is bounded")
+        chosen.update(sh_coding="scalar", adaptive=0.0)
+    return replace(encoding, **chosen)
+
+
+def _finer(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions:
+    """Steps for errors that are that many times what is allowed; coarser ones where they are less."""
+    chosen: dict[str, Any] = {}
+    for name, ratio in ratios.items():
+        factor = min(max(_AIM / max(ratio, 1e-9), 1.0 / _FASTEST), _FASTEST)
+        if name == "means":
+            chosen["position_error"] = (options.position_error or 1.0) * factor
+        elif name == "opacities":
+            levels = _levels(options.opacity_levels, factor)
+            chosen["opacity_levels"] = _within(levels, 1, 65535)
+        elif name == "covariance":
+            chosen["scale_step"] = min(max((options.scale_step or 1.0) * factor, 1e-6), 1e3)
+            chosen["quat_levels"] = _within(_levels(options.quat_levels, factor), 8, 32767)
+        else:
+            knob = _KNOBS[_family(name)][0]
+            before = getattr(options, knob)
+            step = min(max(before * factor, 1e-6), 1e3)
+            chosen[knob] = min(step, chosen.get(knob, step))
+    return replace(options, **chosen)
+
+
+def _levels(levels: int | None, factor: float) -> int:
+    """Levels for steps that are that many times as coarse."""
+    count = levels or 1
+    scaled = math.ceil(count / factor) if factor < 1.0 else math.floor(count / factor)
+    return scaled if scaled != count else count + (1 if factor < 1.0 else 0)
+
+
+def _family(name: str) -> str:
+    return "sh" if name in ("sh1", "sh2", "sh3") else name
+
+
+def _within(value: int, low: int, high: int) -> int:
+    return min(max(value, low), high)

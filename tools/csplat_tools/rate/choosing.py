@@ -1,0 +1,155 @@
+"""What to keep of SH and how to code it: tried at one quality, compared by what each would take to reach the goal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import PRESETS, EncodeOptions
+from csplat.model import SplatModel
+from csplat_tools.models import without_bands
+from csplat_tools.rate.trials import Choice, Part, Trial, Trials
+
+__all__ = ["BYTES_PER_DB", "Chooser"]
+
+#: Share of the bytes that a decibel costs, about: 0.035 without SH, 0.05 with it.
+BYTES_PER_DB = 0.045
+
+_FIRST_SHARE = 1 / 32  # entries of an SH codebook per splat
+_SHARE_STEP = 4.0
+_SHARES = (1 / 512, 1 / 8)
+_FAR = 0.15  # of the bytes; a choice that was so much dearer is not tried again
+_DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
+
+
+@dataclass
+class Chooser:
+    """Compares what may be kept of SH. Owns what it found out of the scene without its upper bands.
+
+    Attributes:
+        trials: makes the files.
+        source: the scene.
+        encoding: what the caller fixed is not chosen here.
+    """
+
+    trials: Trials
+    source: SplatModel
+    encoding: EncodeOptions
+
+    def __post_init__(self) -> None:
+        self._truncated: dict[int, float] = {}
+        self._costs: dict[Choice, float] = {}
+
+    def first(self) -> Choice:
+        """The choice that comparisons begin with, and the only one where nothing is left to choose."""
+        encoding = self.encoding
+        if not self._degree() or encoding.sh_coding == "none":
+            return Choice("none")
+        if encoding.sh_coding == "scalar" or PRESETS[encoding.preset].sh_coding == "scalar":
+            return Choice(encoding.sh_coding if encoding.sh_coding == "codebook" else "scalar")
+        return Choice("codebook", _FIRST_SHARE)
+
+    def best(self, part: Part, quality: float, goal: float | None, start: Trial | None = None) -> Choice:
+        """Compare.
+
+        Args:
+            part: the splats that are coded.
+            quality: of the encoder, at which all are tried.
+            goal: PSNR that is wanted; `None` where a size is: then what the first one tried reaches.
+            start: a file of these splats at this quality, where there is one.
+        """
+        if not self._degree() or self.encoding.sh_coding == "none":
+            return self.first()
+        before, costs = self._costs, dict[Choice, float]()
+        likely = min(before, key=lambda choice: before[choice]) if before else self.first()
+        start = self.trials.judged(start or self.trials.encode(part, likely, quality))
+        wanted = start.psnr if goal is None else goal
+        costs[start.choice] = _cost(start, start.psnr, wanted, self.floor(start))
+
+        def cost(choice: Choice) -> float:
+            if before.get(choice, -math.inf) > _FAR + min(before.values(), default=0.0):
+                return math.inf  # it was far behind with other splats
+            if choice not in costs:
+                trial = self.trials.encode(part, choice, quality)
+                reached = self.trials.glimpsed(decode(trial.result.data))
+                costs[choice] = _cost(trial, reached, wanted, self.floor(trial))
+            return costs[choice]
+
+        if start.choice.coding == "codebook" and self.encoding.codebook_size is None:
+            self._descend(start.choice, cost)
+        if self.encoding.sh_coding == "auto":
+            cost(Choice("scalar"))
+        best = min(costs, key=lambda choice: costs[choice])
+        if self.encoding.sh_degree is None:
+            self._try_degrees(best, wanted, cost)
+        self._costs = costs
+        return min(costs, key=lambda choice: costs[choice])
+
+    def floor(self, trial: Trial) -> float:
+        """PSNR with this file's SH and nothing else wrong: what the finest steps of the others do not get beyond."""
+        if trial.choice.coding == "none" and self._degree():
+            return self._without(0)
+        if trial.choice.coding != "codebook":
+            return math.inf if trial.choice.degree is None else self._without(trial.choice.degree)
+        decoded = decode(trial.result.data)
+        return self.trials.glimpsed(replace(trial.part.model.select(_rows(trial)), shN=decoded.shN))
+
+    def _descend(self, start: Choice, cost: Callable[[Choice], float]) -> None:
+        """Codebooks larger and smaller by steps, as long as it pays."""
+        for factor in (1 / _SHARE_STEP, _SHARE_STEP):
+            choice, gained = start, False
+            while True:
+                share = (choice.share or 0.0) * factor
+                if not _SHARES[0] <= share <= _SHARES[1]:
+                    break
+                after = replace(choice, share=share)
+                if cost(after) >= cost(choice):
+                    break
+                choice, gained = after, True
+            if gained:
+                break
+
+    def _try_degrees(self, best: Choice, wanted: float, cost: Callable[[Choice], float]) -> None:
+        """The fewest bands that hide what is missing from the goal, by what the scene itself shows without others."""
+        for degree in range(self._degree()):
+            if self._without(degree) >= wanted + _DROPPED or (degree == 0 and self._without(0) > wanted + 1.0):
+                cost(Choice("none", degree=0) if degree == 0 else replace(best, degree=degree))
+                if self._without(degree) >= wanted + _DROPPED:
+                    break
+
+    def _without(self, degree: int) -> float:
+        """PSNR of the source with the bands up to a degree and no others."""
+        if degree not in self._truncated:
+            self._truncated[degree] = self.trials.glimpsed(without_bands(self.source, degree))
+        return self._truncated[degree]
+
+    def _degree(self) -> int:
+        fixed = self.encoding.sh_degree
+        return self.source.sh_degree if fixed is None else min(fixed, self.source.sh_degree)
+
+
+def _rows(trial: Trial) -> NDArray[np.int64]:
+    """Which splat of its part each splat of a file is."""
+    index = trial.result.source_index
+    return index if trial.part.rows is None else np.searchsorted(trial.part.rows, index)
+
+
+def _cost(trial: Trial, reached: float, wanted: float, floor: float = math.inf) -> float:
+    """The logarithm of the bytes that a file would take at the PSNR that is wanted.
+
+    Args:
+        trial: the file.
+        reached: its PSNR.
+        wanted: PSNR that is wanted.
+        floor: PSNR with nothing wrong but what is left out; the finest steps do not get beyond it.
+    """
+    dropped = 10.0 ** (-floor / 10.0)
+    left, allowed = 10.0 ** (-reached / 10.0) - dropped, 10.0 ** (-wanted / 10.0) - dropped
+    if allowed <= 0.0:
+        return math.inf
+    return math.log(trial.size_bytes) + BYTES_PER_DB * 10.0 * math.log10(max(left, 1e-3 * allowed) / allowed)

@@ -1,0 +1,255 @@
+"""The smallest file at a PSNR, the best one within a size: quality, SH and splats are chosen, the file is judged.
+
+All steps follow from one number, the encoder's quality. What is kept of SH is compared at one quality; then the quality
+is found by false position; then splats go that are not worth their bits, and it is found again.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder import EncodeOptions, Importance
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render import Camera
+from csplat_tools.compare import comparison_cameras
+from csplat_tools.rate.bounds import meet_bounds
+from csplat_tools.rate.choosing import BYTES_PER_DB, Chooser
+from csplat_tools.rate.pruning import Pruner
+from csplat_tools.rate.search import Window, meet
+from csplat_tools.rate.summary import summary
+from csplat_tools.rate.targets import RateResult, RateTarget
+from csplat_tools.rate.trials import Choice, Part, Trial, Trials
+from csplat_tools.simplify.judge import Judge
+from csplat_tools.simplify.options import SimplifyOptions
+
+__all__ = ["encode_to_target"]
+
+Progress = Callable[[str, float], None]
+Colour = tuple[float, float, float]
+
+_QUALITIES = (24.0, 110.0)  # dB, between which the encoder's is looked for
+_LOSS = (4.0, 9.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
+_PSNR = (0.0, 0.25, 0.1)  # dB above the target: from, to, aimed at
+_SIZE = (0.97, 1.0, 0.987)  # of the target: from, to, aimed at
+_TRIES = 7
+_MOST_CAMERAS = 24  # of the user's own
+_STARVED = 30.0  # quality below which a size is better met by fewer splats
+_REMOVED = (0.6, 0.25)  # of the error that a PSNR allows, at most; the second where the first was too much
+_USUAL = ((6.5, 43.0), (7.2, 43.0))  # bytes per splat at a quality, without and with SH
+_APART = 0.3  # dB between two files that say what a decibel costs
+_SLOPES = (0.02, 0.1)
+_FEWER = 0.75  # of the splats, in steps, as long as pictures gain by what is left for the others
+
+
+def encode_to_target(
+    source: SplatModel,
+    target: RateTarget,
+    encoding: EncodeOptions | None = None,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    background: Colour = (0.0, 0.0, 0.0),
+    prune: bool = True,
+    views: int = 160,
+    importance: NDArray[Any] | Importance | None = None,
+    progress: Progress | None = None,
+) -> RateResult:
+    """Encode a scene so that its file has a size, its renders a PSNR, its splats largest errors.
+
+    Args:
+        source: the scene.
+        target: what is asked for.
+        encoding: knobs that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
+        cameras: from where renders of file and source are compared, relative to the source's origin; at most 24 of
+            them, evenly chosen. None for the virtual ones of `psnr`.
+        background: red, green, blue behind everything.
+        prune: splats may be left out that are not worth their bits; not where largest errors are bounded.
+        views: virtual views at most that decide which.
+        importance: how much splats matter, as for the encoder.
+        progress: is told the stages.
+
+    Raises:
+        InputError: there are no splats; or the target is out of reach; or a knob is set that the target has to choose.
+    """
+    start = time.perf_counter()
+    encoding = encoding or EncodeOptions()
+    if not len(source):
+        raise InputError("a scene without splats has no size or quality to choose")
+    if encoding.quality is not None:
+        raise InputError("quality is what a target chooses: give one of them")
+    files = 0
+    if target.max_error:
+        bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
+        if target.size_bytes is None and target.psnr is None:
+            return bounded.as_result()
+        encoding, files = bounded.encoding, bounded.encodes
+    judging = comparison_cameras(source) if cameras is None else _evenly(cameras, _MOST_CAMERAS)
+    judge = Judge.of_source(source, judging, background, encoding.threads)
+    trials = Trials(source, encoding, judge, importance, progress)
+    pruner = None
+    if prune and not target.max_error and encoding.preset != "fast" and not encoding.keep_extra:
+        options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
+        pruner = Pruner(source, None if cameras is None else list(cameras), options, progress)
+    search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
+    found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
+    removal_views = 0 if pruner is None else pruner.renders
+    report = summary(target, found, trials, source, removal_views, virtual=cameras is None)
+    seconds = round(time.perf_counter() - start, 3)
+    return RateResult(found.result, {**report, "encodes": files + len(trials.made), "seconds": seconds})
+
+
+def _evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
+    places = np.unique(np.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().astype(int))
+    return [cameras[i] for i in places]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Looks for the quality, the choice and the splats; every file goes through `trials`."""
+
+    source: SplatModel
+    encoding: EncodeOptions
+    trials: Trials
+    chooser: Chooser
+    pruner: Pruner | None
+
+    def at_psnr(self, goal: float) -> Trial:
+        """The smallest file that reaches a PSNR."""
+        whole = Part(self.source)
+        quality = self._bounded(goal + _LOSS[self.source.sh_degree > 0])
+        choice = self.chooser.best(whole, quality, goal)
+        best = self._with_psnr(whole, choice, goal, quality)
+        if best is None and choice != self.chooser.first():
+            best = self._with_psnr(whole, self.chooser.first(), goal, quality)
+        if best is None and self.source.sh_degree and self.encoding.sh_coding == "auto":
+            best = self._with_psnr(whole, Choice("scalar"), goal, quality)
+        if best is None:
+            raise InputError(f"no file reaches {goal:.2f} dB; the best of those tried has {self._highest():.2f} dB")
+        if self.pruner is None:
+            return best
+        floor, slope = self.chooser.floor(best), self._slope(best)
+        for most in _REMOVED:
+            part = self.pruner.at_psnr(goal, floor, slope, self.trials.seen, most)
+            if part is None:
+                break
+            choice = self.chooser.best(part, best.quality, goal)
+            pruned = self._with_psnr(part, choice, goal, best.quality - 10.0 * math.log10(1.0 - most))
+            if pruned is not None:
+                return min(best, pruned, key=lambda trial: trial.size_bytes)
+        return best
+
+    def at_size(self, goal: int) -> Trial:
+        """The file within a size whose renders are best."""
+        whole = Part(self.source)
+        first = self._with_size(whole, self.chooser.first(), goal, self._guess(goal))
+        if first is None or first.quality < _STARVED:
+            return self._starved(goal, first)
+        choice = self.chooser.best(whole, first.quality, None, first)
+        best = first if choice == first.choice else self._with_size(whole, choice, goal, first.quality)
+        best = self.trials.judged(first if best is None else best)
+        if self.pruner is None:
+            return best
+        part = self.pruner.at_size(best.psnr, self.chooser.floor(best), self._slope(best), self.trials.seen)
+        if part is None:
+            return best
+        finer = self._bounded(best.quality + math.log(len(self.source) / len(part.model)) / BYTES_PER_DB)
+        choice = self.chooser.best(part, finer, None)
+        return self._better(best, self._with_size(part, choice, goal, finer))
+
+    def _starved(self, goal: int, first: Trial | None) -> Trial:
+        """Fewer and fewer splats, as long as pictures gain by what that leaves for the others."""
+        best = None if first is None else self.trials.judged(first)
+        if self.pruner is None:
+            return self._found(best, goal)
+        smallest = min(self.trials.made, key=lambda trial: trial.size_bytes)
+        left = int(len(self.source) * (_FEWER if best is not None else _FEWER * goal / smallest.size_bytes))
+        choice, quality, before = self.chooser.first(), smallest.quality, len(self.source)
+        while left >= 1:
+            part = self.pruner.to_count(left)
+            if len(part.model) >= before:
+                break  # nobody saw the others
+            trial = self._with_size(part, choice, goal, max(quality, _STARVED))
+            if trial is not None:
+                trial = self.trials.judged(trial)
+                if best is not None and trial.psnr <= best.psnr:
+                    break
+                if best is first and trial.choice == self.chooser.first():
+                    choice = self.chooser.best(part, trial.quality, None, trial)
+                    trial = self._better(trial, self._with_size(part, choice, goal, trial.quality))
+                best, quality = trial, trial.quality
+            before, left = len(part.model), int(left * _FEWER)
+        return self._found(best, goal)
+
+    def _found(self, best: Trial | None, goal: int) -> Trial:
+        if best is None:
+            smallest = min(trial.size_bytes for trial in self.trials.made)
+            kept = "" if self.pruner is not None else " with all splats"
+            raise InputError(f"no file{kept} has {goal} bytes or fewer: the smallest of those tried has {smallest}")
+        return best
+
+    def _with_psnr(self, part: Part, choice: Choice, goal: float, quality: float) -> Trial | None:
+        """The smallest of some files of a choice that reaches a PSNR."""
+        found: list[Trial] = []
+
+        def measure(place: float) -> float:
+            found.append(self.trials.judged(self._file(part, choice, place)))
+            return found[-1].psnr
+
+        window = Window(goal + _PSNR[0], goal + _PSNR[1], goal + _PSNR[2])
+        meet(measure, window, start=quality, slope=1.0, bounds=_QUALITIES, tries=_TRIES)
+        good = [trial for trial in found if trial.psnr >= goal]
+        return min(good, key=lambda trial: trial.size_bytes, default=None)
+
+    def _with_size(self, part: Part, choice: Choice, goal: int, quality: float) -> Trial | None:
+        """The finest of some files of a choice within a size."""
+        found: list[Trial] = []
+
+        def measure(place: float) -> float:
+            found.append(self._file(part, choice, place))
+            return found[-1].size_bytes / goal
+
+        meet(measure, Window(*_SIZE), start=quality, slope=BYTES_PER_DB, bounds=_QUALITIES, tries=_TRIES)
+        good = [trial for trial in found if trial.size_bytes <= goal]
+        return max(good, key=lambda trial: trial.quality, default=None)
+
+    def _file(self, part: Part, choice: Choice, quality: float) -> Trial:
+        """A file, made before or now."""
+        for trial in self.trials.made:
+            if trial.part is part and trial.choice == choice and trial.quality == quality:
+                return trial
+        return self.trials.encode(part, choice, quality)
+
+    def _better(self, best: Trial, other: Trial | None) -> Trial:
+        """The one whose renders are nearer to the source's."""
+        if other is None:
+            return best
+        other = self.trials.judged(other)
+        return other if other.psnr > best.psnr else best
+
+    def _guess(self, goal: int) -> float:
+        """The quality that takes so many bytes, about."""
+        has_sh = self.source.sh_degree > 0
+        per_splat = goal / len(self.source)
+        return self._bounded(_USUAL[has_sh][1] + math.log(per_splat / _USUAL[has_sh][0]) / BYTES_PER_DB)
+
+    def _slope(self, best: Trial) -> float:
+        """The share of the bytes that a decibel costs here."""
+        for trial in self.trials.made:
+            apart = trial.psnr - best.psnr
+            if trial.part is best.part and trial.choice == best.choice and abs(apart) > _APART:
+                return min(max(math.log(trial.size_bytes / best.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
+        return BYTES_PER_DB
+
+    def _highest(self) -> float:
+        return max(trial.psnr for trial in self.trials.made if not math.isnan(trial.psnr))
+
+    @staticmethod
+    def _bounded(quality: float) -> float:
+        return min(max(quality, _QUALITIES[0]), _QUALITIES[1])

@@ -1,0 +1,82 @@
+"""One number looked for by trials: false position between what is too low and what is too high."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+__all__ = ["Window", "meet"]
+
+_STEEPEST, _FLATTEST = 4.0, 0.15  # of the slope that is expected; what two trials say may be noise
+_STALLED = 0.03  # of the bounds; over a shorter way values that do not grow may be noise
+_INSIDE = 0.08  # of a bracket: a trial never lies nearer to its ends
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where a value is to come to lie.
+
+    Attributes:
+        low, high: within is good enough.
+        aim: what a trial is made for.
+    """
+
+    low: float
+    high: float
+    aim: float
+
+
+def meet(
+    measure: Callable[[float], float],
+    window: Window,
+    *,
+    start: float,
+    slope: float,
+    bounds: tuple[float, float],
+    tries: int,
+    known: tuple[tuple[float, float], ...] = (),
+) -> list[tuple[float, float]]:
+    """Try places until a value that grows with them lies in a window.
+
+    Args:
+        measure: the value at a place; dear.
+        window: where the value is to lie.
+        start: where to try first, if nothing is known.
+        slope: of the value, about, above 0.
+        bounds: the least and the largest place.
+        tries: how many at most.
+        known: places and values that were tried before.
+
+    Returns:
+        Places and values, those known first, in the order in which they were tried; the last one lies in the window
+        where any does. Fewer than `tries` where a bound is the best that there is, or values grow no more.
+    """
+    points = list(known)
+    for _ in range(tries):
+        place = _next(points, window, slope, bounds) if points else min(max(start, bounds[0]), bounds[1])
+        if place is None:
+            break
+        value = measure(place)
+        points.append((place, value))
+        if window.low <= value <= window.high:
+            break
+    return points
+
+
+def _next(points: list[tuple[float, float]], window: Window, slope: float, bounds: tuple[float, float]) -> float | None:
+    """Where to try next; None where a bound was tried, or values grow no more."""
+    below = max((point for point in points if point[1] < window.low), default=None)
+    above = min((point for point in points if point[1] > window.high), default=None)
+    if below is not None and above is not None and above[0] > below[0]:
+        share = (window.aim - below[1]) / (above[1] - below[1])
+        share = min(max(share, _INSIDE), 1.0 - _INSIDE)
+        return below[0] + share * (above[0] - below[0])
+    place, value = points[-1]
+    if len(points) > 1 and points[-2][0] != place:
+        seen = (value - points[-2][1]) / (place - points[-2][0])
+        far = place - points[-2][0] >= _STALLED * (bounds[1] - bounds[0])
+        if far and seen < _FLATTEST * slope and value < window.low:
+            return None  # it grows no more
+        slope = min(max(seen, _FLATTEST * slope), _STEEPEST * slope)
+    wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])
+    return None if any(wanted == tried for tried, _ in points) else wanted

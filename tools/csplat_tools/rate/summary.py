@@ -1,0 +1,75 @@
+"""What a search for a target has to say: what was asked, reached and tried, why this file, and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from csplat.model import SplatModel
+from csplat_render.metrics import psnr_of_mse
+from csplat_tools.rate.targets import RateTarget
+from csplat_tools.rate.trials import Trial, Trials, spread_of
+
+__all__ = ["summary"]
+
+
+def summary(
+    target: RateTarget, found: Trial, trials: Trials, source: SplatModel, removal_views: int, *, virtual: bool
+) -> dict[str, Any]:
+    """Report a search, JSON-compatible.
+
+    Args:
+        target: what was asked.
+        found: the file.
+        trials: all that were tried.
+        source: the scene.
+        removal_views: small views in which the removal of splats was measured, counted pass by pass.
+        virtual: the views are the virtual ones of `psnr`.
+    """
+    goal: dict[str, Any] = {"size_bytes": target.size_bytes, "psnr": target.psnr, "max_error": dict(target.max_error)}
+    errors, spread = found.errors, spread_of(found.errors)
+    each = [psnr_of_mse(float(error)) for error in errors]
+    views = f"{len(errors)} {'virtual' if virtual else 'given'} views"
+    sure = f"measured on the file itself, in {views}: the worst has {min(each):.2f} dB"
+    if not math.isnan(spread):
+        sure += f", other such views would change the {found.psnr:.2f} dB by about {spread:.1f}"
+    return {
+        "goal": {name: value for name, value in goal.items() if value},
+        "size_bytes": found.size_bytes,
+        "psnr": found.psnr,
+        "splats": len(found.part.model),
+        "splats_before": len(source),
+        "chosen": found.as_json(),
+        "why": _why(found, trials, source),
+        "sure": sure,
+        "spread": None if math.isnan(spread) else round(spread, 3),
+        "worst_psnr": min(each),
+        "views": len(errors),
+        "renders": trials.renders,
+        "removal_views": removal_views,
+        "tried": [trial.as_json() for trial in trials.made],
+    }
+
+
+def _why(found: Trial, trials: Trials, source: SplatModel) -> list[str]:
+    """Sentences: how SH is coded and among what that was chosen, and how many splats went."""
+    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made))
+    lines = [f"{_coding(found)}, quality {found.quality:.1f}: all steps follow from it"]
+    others = [coding for coding in codings if coding != _coding(found)]
+    if others:
+        lines.append(f"at equal pictures these take more: {'; '.join(others)}")
+    gone = len(source) - len(found.part.model)
+    if gone:
+        share = 100.0 * gone / len(source)
+        lines.append(f"{gone} splats ({share:.0f} %) are left out: their bits buy more elsewhere than pictures lose")
+    return lines
+
+
+def _coding(trial: Trial) -> str:
+    options = trial.result.report.options
+    if options["sh_coding"] == "none":
+        return "no SH bands" if trial.part.model.sh_degree else "no SH to code"
+    bands = f"SH degree {options['sh_degree']}"
+    if options["sh_coding"] == "codebook":
+        return f"{bands} by a codebook of {'+'.join(map(str, options['codebook_sizes']))}"
+    return f"{bands} value by value"

@@ -1,0 +1,119 @@
+"""What is asked of a file, a size, a PSNR, largest errors, how a command line says so; and what came of it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from csplat._spec import MEASURE_NAMES
+from csplat.encoder import EncodeResult
+from csplat.errors import InputError
+
+__all__ = ["RateResult", "RateTarget", "parse_max_error", "parse_size_bytes"]
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+_NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
+_IN_UNITS = "means"  # the one measure that is a length
+
+
+@dataclass(frozen=True)
+class RateTarget:
+    """What a file is to keep to.
+
+    Attributes:
+        size_bytes: its size at most; the best picture within it is looked for.
+        psnr: dB of its renders against the source's at least; the smallest file that reaches them is looked for.
+        max_error: by measure of the format (means in scene units, covariance relative, opacities, sh0, sh1, sh2, sh3),
+            the largest error of any splat; alone, or beside one of the others.
+
+    Raises:
+        InputError: nothing is asked for, or size and PSNR both, or a value is out of range.
+    """
+
+    size_bytes: int | None = None
+    psnr: float | None = None
+    max_error: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.size_bytes is None and self.psnr is None and not self.max_error:
+            raise InputError("no target, wanted a size, a PSNR or largest errors")
+        if self.size_bytes is not None and self.psnr is not None:
+            raise InputError("a target size and a target PSNR, wanted one of them: the other follows")
+        if self.size_bytes is not None and self.size_bytes < 1:
+            raise InputError(f"the target size is {self.size_bytes} bytes, wanted 1 or more")
+        if self.psnr is not None and not 0.0 < self.psnr <= 99.0:
+            raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most 99")
+        for name, bound in self.max_error.items():
+            if name not in MEASURE_NAMES.values():
+                raise InputError(f"{name!r} is no measure of errors, wanted one of {', '.join(MEASURE_NAMES.values())}")
+            if not (math.isfinite(bound) and bound > 0.0):
+                raise InputError(f"the largest error of {name} is {bound:g}, wanted above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class RateResult:
+    """A file that keeps to a target.
+
+    Attributes:
+        result: of the encoder; its source index is into the source.
+        report: what was asked, reached, tried and chosen, why and how sure; JSON-compatible.
+    """
+
+    result: EncodeResult
+    report: dict[str, Any]
+
+
+def parse_size_bytes(text: str) -> int:
+    """Bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
+
+    Raises:
+        InputError: it is something else.
+    """
+    found = re.fullmatch(_NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
+    unit = None if found is None else _UNITS.get(found[2].lower())
+    size = None if found is None or unit is None else float(found[1]) * unit
+    if size is None or not 1.0 <= size < 2.0**63:
+        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
+    return int(size)
+
+
+def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
+    """Bounds by measure from `means=0.001,opacities=0.01`.
+
+    Args:
+        text: what a user wrote; lengths with a unit as `means=2mm` are taken where the scene's unit is known.
+        unit_metres: length of a scene unit; `None` where nobody knows.
+
+    Raises:
+        InputError: it is something else; or a length has a unit and the scene has none.
+    """
+    bounds: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        name = name.strip()
+        found = re.fullmatch(_NUMBER + r"\s*([a-zµ]*)", value.strip())
+        if found is None:
+            raise InputError(f"{part.strip()!r} bounds no error, wanted a measure and a number, as means=0.001")
+        if name in bounds:
+            raise InputError(f"the largest error of {name} is given twice")
+        bounds[name] = float(found[1]) * _factor(part.strip(), name, found[2], unit_metres)
+    return dict(RateTarget(max_error=bounds).max_error)
+
+
+def _factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:
+    """What a number has to be multiplied by to be in scene units."""
+    if not unit:
+        return 1.0
+    if name != _IN_UNITS or unit not in _LENGTHS:
+        wanted = f"one of {', '.join(_LENGTHS)}" if name == _IN_UNITS else "a number without one: it is no length"
+        raise InputError(f"{part!r} has the unit {unit!r}, wanted {wanted}")
+    if unit_metres is None:
+        raise InputError(
+            f"{part!r} has a unit, and the scene does not say how long its own is: give scene units (means=0.001),"
+            " or say it with --unit-metres"
+        )
+    return _LENGTHS[unit] / unit_metres
