@@ -18,6 +18,7 @@ from csplat_tools.commands.lint import lint
 from csplat_tools.commands.render import render
 from csplat_tools.commands.sensitivity import sensitivity
 from csplat_tools.commands.simplify import simplify
+from csplat_tools.commands.tradeoff import tradeoff
 from csplat_tools.commands.train import train
 from csplat_tools.commands.verify import verify
 from csplat_tools.commands.view import export_html, view
@@ -65,6 +66,7 @@ app.command()(info)
 app.command()(verify)
 app.command()(lint)
 app.command()(compare)
+app.command()(tradeoff)
 app.command()(render)
 app.command()(simplify)
 app.command()(sensitivity)

@@ -8,7 +8,7 @@ from importlib import import_module
 from csplat.errors import InputError
 from csplat_tools.console import note
 
-__all__ = ["need_photographs", "need_pictures", "need_renderer", "need_trainer", "prepare_renderer"]
+__all__ = ["need_photographs", "need_pictures", "need_plots", "need_renderer", "need_trainer", "prepare_renderer"]
 
 
 def need_renderer() -> None:
@@ -62,6 +62,15 @@ def need_pictures() -> None:
         InputError: pillow is not installed.
     """
     _need("PIL", "pillow")
+
+
+def need_plots() -> None:
+    """Import what drawing plots needs.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    _need("matplotlib")
 
 
 def need_photographs() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,22 +15,42 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodeResult
 from csplat.encoder.between import Between
 from csplat.encoder.freezing import encode_frozen, freeze
-from csplat.encoder.frozen import Seen
+from csplat.encoder.frozen import Frozen, Seen
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_tools.console import note, progress_bar, step_progress
+from csplat_tools.console import Report, note, progress_bar, step_progress
 from csplat_tools.convert import SceneFacts
 from csplat_tools.finetune_report import as_report
-from csplat_tools.finetune_sources import Looks, Sources, choose_splats
+from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
 from csplat_tools.inout import ply_path, write_array, write_bytes
 
 if TYPE_CHECKING:
-    from csplat_trainer.finetune import FinetuneOptions, Moment
+    from csplat_trainer.finetune import FinetuneOptions, Moment, Views
 
-__all__ = ["Clock", "Files", "Scene", "run_finetuning"]
+__all__ = [
+    "BYTE_COST",
+    "LEARNING_FACTOR",
+    "SHAPE_ENTRIES",
+    "Begun",
+    "Clock",
+    "Files",
+    "Scene",
+    "Tuned",
+    "begin",
+    "run_finetuning",
+    "tune",
+]
 
 I64 = NDArray[np.int64]
+
+#: Of learning rates, by whether the scene's own renders teach instead of photographs. Those can be met almost exactly:
+#: what long steps lose of that, short ones take long to find again.
+LEARNING_FACTOR = {False: 1.0, True: 0.03}
+#: Of bytes in the loss, which is that much smaller.
+BYTE_COST = {False: 1e-4, True: 2e-5}
+#: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
+SHAPE_ENTRIES = 4096
 
 
 @dataclass(frozen=True)
@@ -100,7 +120,6 @@ def run_finetuning(
     from csplat_render.jit import thread_count
     from csplat_render.lpips import load_lpips
     from csplat_render.warmup import warm_up
-    from csplat_trainer.finetune import finetune
     from csplat_trainer.report import write_log
 
     clock, threads = Clock(), encoding.threads
@@ -111,39 +130,134 @@ def run_finetuning(
     with thread_count(threads):
         warm_up(None if quiet else note)
         with progress_bar(quiet=quiet) as progress:
-            with clock.stage("choosing"):
-                views = looks.views(source, sources, threads)
-                chosen = choose_splats(source, looks, sources, files.importance, threads, progress)
-            with clock.stage("encoding"):
-                between = Between(len(source), chosen.rows)
-                frozen = freeze(
-                    chosen.model, encoding, importance=chosen.importance, between=between, source=source,
-                    progress=progress,
-                )  # fmt: skip
-                plain = encode_frozen(frozen, frozen.start())
+            begun = begin(source, looks, sources, encoding, clock, importance=files.importance, progress=progress)
         shown = step_progress("tuning", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
-        with clock.stage("tuning"), shown as show:
-            tuned = finetune(
-                frozen, views, options, progress=show, checkpoint=files.checkpoint,
-                checkpoint_every=files.checkpoint_every, resume=files.resume, threads=threads,
+        with shown as show:
+            tuned = tune(
+                begun, options, clock, checkpoint=files.checkpoint, checkpoint_every=files.checkpoint_every,
+                resume=files.resume, threads=threads, show=show,
             )  # fmt: skip
-        with clock.stage("encoding"):
-            said = {"views": len(views.train), "steps": tuned.log["best_iteration"], **chosen.said}
-            result = encode_frozen(frozen, tuned.held, said)
-            decoded = decode(result.data)
-        _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
+        result, plain = tuned.result, begun.plain
         write_bytes(files.output, result.data)
         if files.source_index is not None:
             write_array(files.source_index, result.source_index)
         with clock.stage("judging"):
-            models = {"source": source, "before tuning": decode(plain.data), "file": decoded}
+            models = {"source": source, "before tuning": decode(plain.data), "file": tuned.decoded}
             judged = looks.judge(source, models, distance, threads)
-    report = as_report(source, plain, result, judged, tuned.log, clock.seconds, chosen.said)
+    report = as_report(source, plain, result, judged, tuned.log, clock.seconds, begun.chosen.said)
     if files.log is not None:
         write_log(files.log, {**tuned.log, "encoding": result.report.options, "seconds_by_stage": clock.seconds})
     if files.report is not None:
         write_log(files.report, report)
     return report
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """All that is decided before values move.
+
+    Attributes:
+        views: that teach, and that judge while values move.
+        chosen: the splats that the file will hold.
+        frozen: the encoder's decisions.
+        plain: the file of the same decisions without tuning.
+    """
+
+    views: Views
+    chosen: Chosen
+    frozen: Frozen
+    plain: EncodeResult
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """A tuned file.
+
+    Attributes:
+        result: of the encoder. decoded: what a decoder sees of it, which is what was tuned, bit for bit.
+        log: of the tuning.
+    """
+
+    result: EncodeResult
+    decoded: SplatModel
+    log: dict[str, Any]
+
+
+def begin(
+    source: SplatModel,
+    looks: Looks,
+    sources: Sources,
+    encoding: EncodeOptions,
+    clock: Clock,
+    *,
+    importance: str | None = None,
+    progress: Report | None = None,
+) -> Begun:
+    """Choose the splats of the file, and freeze the encoder's decisions.
+
+    Args:
+        source: the scene.
+        looks, sources: what the file is to look like.
+        encoding: of the encoder.
+        clock: is told the seconds of `choosing` and `encoding`.
+        importance: as of `Files`.
+        progress: is told the stages.
+
+    Raises:
+        CsplatError: as `choose_splats` and the encoder.
+    """
+    with clock.stage("choosing"):
+        views = looks.views(source, sources, encoding.threads)
+        chosen = choose_splats(source, looks, sources, importance, encoding.threads, progress)
+    with clock.stage("encoding"):
+        between = Between(len(source), chosen.rows)
+        frozen = freeze(
+            chosen.model, encoding, importance=chosen.importance, between=between, source=source,
+            progress=progress,
+        )  # fmt: skip
+        plain = encode_frozen(frozen, frozen.start())
+    return Begun(views, chosen, frozen, plain)
+
+
+def tune(
+    begun: Begun,
+    options: FinetuneOptions,
+    clock: Clock,
+    *,
+    checkpoint: str | None = None,
+    checkpoint_every: int = 0,
+    resume: str | None = None,
+    threads: int | None = None,
+    show: Callable[[Moment], None] | None = None,
+) -> Tuned:
+    """Move the values until pictures look right, and encode them.
+
+    Args:
+        begun: by `begin`.
+        options: of the tuning.
+        clock: is told the seconds of `tuning` and `encoding`.
+        checkpoint, checkpoint_every, resume: as for `csplat_trainer.finetune.finetune`.
+        threads: how many; `None` for all.
+        show: is told where the run stands.
+
+    Raises:
+        CsplatError: as `finetune`.
+        RuntimeError: the file is not what was tuned: a fault of csplat.
+    """
+    from csplat_trainer.finetune import finetune
+
+    frozen = begun.frozen
+    with clock.stage("tuning"):
+        tuned = finetune(
+            frozen, begun.views, options, progress=show, checkpoint=checkpoint, checkpoint_every=checkpoint_every,
+            resume=resume, threads=threads,
+        )  # fmt: skip
+    with clock.stage("encoding"):
+        said = {"views": len(begun.views.train), "steps": tuned.log["best_iteration"], **begun.chosen.said}
+        result = encode_frozen(frozen, tuned.held, said)
+        decoded = decode(result.data)
+    _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
+    return Tuned(result, decoded, tuned.log)
 
 
 def _read(path: str, scene: Scene, encoding: EncodeOptions, *, quiet: bool) -> SplatModel:

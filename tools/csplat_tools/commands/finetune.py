@@ -23,14 +23,6 @@ _LIKE = "What the file is to look like (one of --data and --self)"
 _FILES = "Files on the way"
 _HOW = "How"
 
-# Of learning rates, by photographs and by the scene's own renders. Those can be met almost exactly: what long steps
-# lose of that, short ones take long to find again.
-_FACTOR = {False: 1.0, True: 0.03}
-# Of bytes in the loss, which is that much smaller.
-_COST = {False: 1e-4, True: 2e-5}
-# What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
-_SHAPES = 4096
-
 
 @guarded
 @with_encoder_knobs
@@ -163,7 +155,7 @@ def finetune(
     need_trainer()
     from csplat_tools.finetune_report import format_report
     from csplat_tools.finetune_sources import Sources
-    from csplat_tools.finetuning import Files, Scene, run_finetuning
+    from csplat_tools.finetuning import BYTE_COST, LEARNING_FACTOR, SHAPE_ENTRIES, Files, Scene, run_finetuning
     from csplat_trainer.finetune.options import FinetuneOptions
 
     if (data is None) != itself:
@@ -178,9 +170,9 @@ def finetune(
         options = FinetuneOptions(
             iterations=iterations,
             seed=encoding.seed,
-            byte_cost=_COST[itself] if byte_cost is None else byte_cost,
+            byte_cost=BYTE_COST[itself] if byte_cost is None else byte_cost,
             patience=patience,
-        ).scaled(_FACTOR[itself] if lr_factor is None else lr_factor)
+        ).scaled(LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
     if STANDARD_STREAM in (source_index, report, log, checkpoint):
@@ -214,7 +206,7 @@ def finetune(
     files = Files(source, output, importance, source_index, log, report, checkpoint, checkpoint_every, resume, lpips)
     scene = Scene(facts, strict)
     if encoding.shape_codebook_size is None:
-        encoding = replace(encoding, shape_codebook_size=_SHAPES)
+        encoding = replace(encoding, shape_codebook_size=SHAPE_ENTRIES)
     found = run_finetuning(files, scene, encoding, sources, options, quiet=quiet)
     if as_text:
         say_json(found)

@@ -1,0 +1,435 @@
+"""`csplat tradeoff`: what it measures, which files it marks, what it writes, and how it fails."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("matplotlib", reason="plots need matplotlib: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from captures import cameras, photograph, shell
+
+from csplat import EncodeOptions, decode, encode
+from csplat._spec import CHUNK_CODEBOOK
+from csplat.decoder import read_header
+from csplat.errors import InputError
+from csplat_render.cameras import save_cameras
+from csplat_tools.app import app
+from csplat_tools.models import without_bands
+from csplat_tools.tradeoff.fetching import fetched_bytes
+from csplat_tools.tradeoff.measuring import StageClock
+from csplat_tools.tradeoff.options import Wanted, parse_numbers, parse_words
+from csplat_tools.tradeoff.page import make_page, shown_points
+from csplat_tools.tradeoff.plots import PLOTS, draw_plot
+from csplat_tools.tradeoff.points import Failure, pareto_front
+from csplat_tools.tradeoff.running import measure_tradeoff
+from csplat_tools.tradeoff.setting import Inputs, read_setting
+from csplat_tools.tradeoff.tables import format_tradeoff
+
+POINT = {
+    "name", "family", "error", "settings", "size_bytes", "digest", "bytes_per_source_splat", "ratio", "splats",
+    "sh_degree", "psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "photographs", "seconds", "render",
+    "attribute_bytes", "first_picture_bytes", "partial",
+}  # fmt: skip
+QUICK = ["--what", "presets"]
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["tradeoff", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A scene, photographs of it, and cameras."""
+    folder = photograph(shell(8), tmp_path_factory.mktemp("capture"))
+    save_cameras(folder / "cameras.json", cameras(3))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def swept(capture, tmp_path_factory):
+    """A sweep over every group, judged by photographs; one point cannot be made: no splat is so opaque."""
+    folder = tmp_path_factory.mktemp("swept")
+    result = invoke(
+        capture / "scene.ply", "--data", capture, "--what", "presets,quality,strategies,targets,simplify",
+        "--with-finetune", "--quality", "40", "--psnr", "30", "--sizes", "9kB", "--keep", "0.5", "--opacities",
+        "0.3,0.97", "--kmeans", "16", "--iterations", "20", "-o", folder / "report.html", "--json",
+        folder / "report.json", "--plots", folder / "plots",
+    )  # fmt: skip
+    assert 0 == result.exit_code, (result.stderr, result.exception)
+    return folder, result, json.loads((folder / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def setting(capture):
+    return read_setting(Inputs(str(capture / "scene.ply"), cameras=str(capture / "cameras.json")), deciding=False)
+
+
+@pytest.fixture(scope="module")
+def measured(setting):
+    return measure_tradeoff(setting, Wanted(what=("presets", "quality"), quality=(36.0,)))
+
+
+# what is measured
+
+
+def test_every_group_has_its_points(swept):
+    _, _, report = swept
+    names = {one["name"]: one["family"] for one in report["points"]}
+    assert {
+        "fast": "presets", "balanced": "presets", "small": "presets", "quality 40": "quality", "SH 1": "strategies",
+        "SH 0": "strategies", "opacity > 0.3": "strategies", "opacity > 0.97": "strategies",
+        "SH 0, opacity > 0.97": "strategies", "k-means 16": "strategies", "SH 1, distilled": "strategies",
+        "SH 0, distilled": "strategies", "target 30 dB": "targets", "target 9.0 kB": "targets", "keep 0.5": "simplify",
+        "tuned": "finetune", "tuned, keep 0.5": "finetune",
+    } == names  # fmt: skip
+
+
+def test_the_json_says_everything_of_each_point(swept):
+    _, _, report = swept
+    assert {"scene", "views", "machine", "times", "source", "pareto", "pareto_photographs", "points"} == set(report)
+    for point in report["points"]:
+        if point["error"] is None:
+            assert set(point) == POINT
+            assert sum(point["attribute_bytes"].values()) == point["size_bytes"]
+            assert {"standard", "fast"} == set(point["render"])
+            assert point["photographs"]["views"] == report["views"]["count"]
+    assert report["machine"]["cores"] >= 1
+    assert "numpy" in report["machine"]["packages"]
+
+
+def test_a_point_that_cannot_be_made_says_why_and_takes_no_other_one_down(swept):
+    folder, result, report = swept
+    failed = [one for one in report["points"] if one["error"] is not None]
+    assert ["opacity > 0.97", "SH 0, opacity > 0.97"] == [one["name"] for one in failed]
+    assert "no splat has an opacity above 0.97" in failed[0]["error"]
+    assert "not measured: opacity > 0.97: no splat has an opacity above 0.97" in result.stdout
+    assert "no splat has an opacity above 0.97" in (folder / "report.html").read_text()
+
+
+def test_targets_are_reached(swept):
+    _, _, report = swept
+    points = {one["name"]: one for one in report["points"]}
+    assert points["target 9.0 kB"]["size_bytes"] <= 9000
+    assert {"goal", "chosen"} <= set(points["target 30 dB"]["settings"]["rate"])
+
+
+def test_simplified_and_tuned_files_hold_what_was_asked_for(swept):
+    _, _, report = swept
+    points = {one["name"]: one for one in report["points"]}
+    assert 150 == points["keep 0.5"]["splats"]
+    assert 301 == report["scene"]["splats"]
+    assert 300 == points["tuned"]["splats"]  # one lies where no photograph shows it
+    assert {"choosing", "encoding", "tuning"} == set(points["tuned"]["seconds"]["stages"])
+
+
+def test_numbers_are_those_of_compare(capture, swept, tmp_path):
+    _, _, report = swept
+    point = next(one for one in report["points"] if one["name"] == "small")
+    path = tmp_path / "small.csplat"
+    words = ["encode", str(capture / "scene.ply"), str(path), "--preset", "small", "--quiet"]
+    assert 0 == CliRunner().invoke(app, words).exit_code
+    assert path.stat().st_size == point["size_bytes"]
+    words = ["compare", str(capture / "scene.ply"), str(path), "--data", str(capture), "--json"]
+    compared = json.loads(CliRunner().invoke(app, words).stdout)
+    for name in ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim"):
+        assert compared[name] == point[name]
+    assert compared["photographs"]["b"]["psnr"] == point["photographs"]["psnr"]
+    assert compared["photographs"]["a"]["psnr"] == report["source"]["photographs"]["psnr"]
+    assert compared["ratio"] == point["ratio"]
+
+
+def test_the_same_scene_gives_the_same_files_and_numbers(setting, measured):
+    again = measure_tradeoff(setting, measured.wanted).as_json()
+    assert timeless(measured.as_json()) == timeless(again)
+
+
+def timeless(value):
+    if isinstance(value, dict):
+        times = {"seconds", "ms", "render_ms", "decode_seconds"}
+        return {key: timeless(one) for key, one in value.items() if key not in times}
+    return [timeless(one) for one in value] if isinstance(value, list) else value
+
+
+def test_fewer_layers_take_fewer_bytes_and_look_worse(measured):
+    for point in measured.measured:
+        assert (len(point.partial) == 3) == (point.family == "presets")
+        for fewer, more in zip(point.partial, point.partial[1:], strict=False):
+            assert fewer.size_bytes < more.size_bytes <= point.size_bytes
+            assert fewer.psnr < more.psnr
+        if point.partial:
+            assert point.first_picture_bytes == point.partial[0].size_bytes
+            assert point.psnr == point.partial[-1].psnr
+
+
+def test_what_is_fetched_suffices():
+    data = bytearray(encode(shell(15), EncodeOptions(preset="fast", tile_splats=100)))
+    header, wanted = read_header(bytes(data)), decode(bytes(data), sh_degree=1)
+    kept = len(data)
+    for tile in header.tiles:
+        for layer, record in tile.layers.items():
+            if layer > 1:
+                data[record.offset : record.offset + record.size] = bytes(record.size)
+                kept -= record.size
+    for chunk in header.directory:  # of a file without codebooks: what says something of the whole
+        data[chunk.offset + 8 : chunk.offset + chunk.size] = bytes(chunk.size - 8)
+        kept -= chunk.size
+    assert fetched_bytes(header, 1) == kept
+    np.testing.assert_array_equal(wanted.shN, decode(bytes(data), sh_degree=1).shN)
+
+
+def test_codebooks_are_fetched_with_their_layers():
+    options = EncodeOptions(sh_coding="codebook", codebook_size=16)
+    header = read_header(encode(shell(15), options))
+    books = [chunk for chunk in header.directory if chunk.type == CHUNK_CODEBOOK]
+    others = sum(chunk.size for chunk in header.directory) - sum(chunk.size for chunk in books)
+    assert {1, 2, 3} == {chunk.layer for chunk in books}
+    assert header.file_size - others == fetched_bytes(header, 3)
+    third = sum(tile.layers[3].size for tile in header.tiles) + sum(one.size for one in books if one.layer == 3)
+    assert third == fetched_bytes(header, 3) - fetched_bytes(header, 2)
+
+
+def test_stages_are_timed_by_their_names(monkeypatch):
+    now = iter([0.0, 1.0, 3.0, 3.5, 4.5, 9.0])
+    monkeypatch.setattr("csplat_tools.tradeoff.measuring.time.perf_counter", lambda: next(now))
+    heard = []
+    clock = StageClock()
+    told = clock.listening(lambda stage, done: heard.append((stage, done)))
+    for stage, done in (("codebook", 0.0), ("codebook", 0.5), ("codebook", 1.0), ("tiles", 0.2), ("tiles", 1.0)):
+        told(stage, done)
+    assert [("codebook", 0.0), ("codebook", 0.5), ("codebook", 1.0), ("tiles", 0.2), ("tiles", 1.0)] == heard
+    assert {"codebook": 2.5, "tiles": 5.5} == clock.seconds
+
+
+# which files no other one beats
+
+
+@pytest.mark.parametrize(
+    ("points", "front"),
+    [
+        ([], []),
+        ([(10, 30.0)], [0]),
+        ([(10, 30.0), (20, 40.0), (15, 35.0)], [0, 2, 1]),
+        ([(10, 30.0), (20, 29.0)], [0]),
+        ([(10, 30.0), (10, 31.0)], [1]),
+        ([(10, 30.0), (20, 30.0)], [0]),
+        ([(10, 30.0), (10, 30.0)], [0]),
+        ([(30, 50.0), (20, 45.0), (25, 40.0), (10, 20.0)], [3, 1, 0]),
+    ],
+)
+def test_the_front(points, front):
+    assert front == pareto_front(points)
+
+
+def test_marks_are_the_front_of_what_the_table_lists(swept):
+    _, result, report = swept
+    points = {one["name"]: one for one in report["points"] if one["error"] is None}
+    front = set()
+    for name, one in points.items():
+        others = [other for other in points.values() if other["size_bytes"] <= one["size_bytes"] and other is not one]
+        if all(other["psnr"] < one["psnr"] for other in others):
+            front.add(name)
+    assert front == set(report["pareto"])
+    table = result.stdout.split("\n\n")[1].splitlines()[1:-1]
+    assert front == {re.split(r"\s{2,}", line[2:])[0] for line in table if line.startswith("* ")}
+    sizes = [int(re.split(r"\s{2,}", line[2:])[1]) for line in table]
+    assert sorted(sizes) == sizes
+    assert len(points) == len(sizes)
+
+
+# the page and the plots
+
+
+def test_the_page_refers_to_nothing_outside(swept):
+    text = (swept[0] / "report.html").read_text()
+    assert {"data:image/webp;base64", "#"} == {
+        value.split(",")[0] if value.startswith("data:") else value[0]
+        for value in re.findall(r'(?:src|href|action|srcset)="([^"]*)"', text)
+    }
+    addresses = set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
+    assert addresses == {"http://www.w3.org/2000/svg"}  # the name of a language
+    assert "default-src 'none'" in text
+    assert ' style="' not in text
+    assert "@import" not in text
+    assert re.findall(r"url\((?!#)", text) == []
+    assert len(text) < 4_000_000
+
+
+def test_no_two_elements_of_the_page_have_one_id(swept):
+    text = (swept[0] / "report.html").read_text()
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(set(ids)) == len(ids) > 100
+    used = set(re.findall(r'href="#([^"]*)"', text)) | set(re.findall(r"url\(#([^)]*)\)", text))
+    assert used <= set(ids)
+
+
+def test_pictures_are_those_of_presets_and_front(measured):
+    shown = [one.name for one in shown_points(measured)]
+    assert {"fast", "balanced", "small"} <= set(shown)
+    assert set(shown) <= {"fast", "balanced", "small"} | {one.name for one in measured.front}
+
+
+def test_every_plot_is_written_that_the_sweep_has_something_for(swept, measured):
+    assert {f"{name}.svg" for name in PLOTS} == {path.name for path in (swept[0] / "plots").iterdir()}
+    assert draw_plot("size-photographs", measured, inline=False) is None
+
+
+def test_the_page_repeats_itself_and_names_of_scenes_are_no_markup(measured):
+    evil = replace(measured, setting=replace(measured.setting, name="<script>alert(1)</script>.ply"))
+    page = make_page(evil)
+    assert make_page(evil) == page
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+
+
+def test_the_page_opens_and_its_table_sorts(tab, swept):
+    tab.page.goto((swept[0] / "report.html").as_uri())
+    assert "scene.ply: size, quality and time" == tab.page.title()
+    names = "[...document.querySelectorAll('.sortable tbody tr')].map((row) => row.cells[{}].dataset.value)"
+    sizes = [int(value) for value in tab.page.evaluate(names.format(1))]
+    assert sorted(sizes) == sizes
+    for _ in range(2):
+        tab.page.click(".sortable th:nth-child(2) button")
+    assert sizes[::-1] == [int(value) for value in tab.page.evaluate(names.format(1))]
+    broken = "[...document.images].filter((one) => !one.naturalWidth).length"
+    assert 0 == tab.page.evaluate(broken)
+    coloured = "getComputedStyle(document.querySelector('.plot path[fill]:not([fill=none])')).fill"
+    assert tab.page.evaluate(coloured).startswith("rgb")
+
+
+# how it fails
+
+
+def test_without_one_point_that_can_be_measured_it_fails(setting):
+    wanted = Wanted(what=("strategies",), opacities=(0.99,), kmeans=())
+    with pytest.raises(InputError, match=r"no point could be measured; opacity > 0.99: no splat"):
+        measure_tradeoff(replace(setting, source=without_bands(setting.source, 0)), wanted)
+
+
+def test_a_scene_without_splats_is_swept(setting, make_model):
+    empty = replace(setting, source=make_model(0, 1), source_bytes=1000)
+    found = measure_tradeoff(empty, Wanted(what=("presets", "quality"), quality=(40.0,)))
+    assert [None] * 4 == [one.bytes_per_source_splat for one in found.measured]
+    assert {99.0} == {one.psnr for one in found.measured}
+    assert "0 splats" in format_tradeoff(found)
+    assert make_page(found).startswith("<!doctype html>")
+
+
+def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
+    def fail(*_args, **_options):
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr("csplat_tools.tradeoff.sweep.encode_with_report", fail)
+    with pytest.raises(RuntimeError, match="a defect"):
+        measure_tradeoff(setting, Wanted(what=("presets",)))
+
+
+def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
+    from csplat_tools.tradeoff import sweep
+
+    whole = sweep.encode_with_report
+
+    def fail(model, options, **others):
+        if options.preset == "small":
+            raise MemoryError
+        return whole(model, options, **others)
+
+    monkeypatch.setattr(sweep, "encode_with_report", fail)
+    found = measure_tradeoff(setting, Wanted(what=("presets",)))
+    assert [Failure("small", "presets", "out of memory")] == found.failures
+
+
+@pytest.mark.parametrize("option", ["-o", "--json", "--plots"])
+def test_nothing_is_overwritten_unless_forced(capture, tmp_path, option):
+    target = tmp_path / "there"
+    if option == "--plots":
+        target.mkdir()
+        (target / "sh-layers.svg").write_text("mine")
+        mine = target / "sh-layers.svg"
+    else:
+        target.write_text("mine")
+        mine = target
+    words = [capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--quiet", option, target]
+    refused = invoke(*words)
+    assert 1 == refused.exit_code
+    assert re.fullmatch(r"error: \S+ exists: --force replaces it\n", refused.stderr)
+    assert "mine" == mine.read_text()
+    assert 0 == invoke(*words, "--force").exit_code
+    assert "mine" != mine.read_text()
+
+
+def test_json_alone_is_on_standard_output_where_it_is_asked_for(capture):
+    result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json", "-", "--quiet")
+    assert {"fast", "balanced", "small"} == {one["name"] for one in json.loads(result.stdout)["points"]}
+    assert "" == result.stderr
+
+
+def test_what_it_does_is_said_on_standard_error(capture):
+    result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json")
+    assert "3 files to make and to measure: about" in result.stderr
+    assert re.search(r"2/3 balanced: [\d.]+ kB, [\d.]+ dB, [\d.]+ s\n", result.stderr)
+    assert "Times are single runs" in result.stdout
+
+
+def test_an_absent_file_is_one_line(tmp_path):
+    result = invoke(tmp_path / "absent.ply")
+    assert 1 == result.exit_code
+    assert f"error: {tmp_path / 'absent.ply'}: No such file or directory\n" == result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--what", "presets,everything"],
+        ["--what", ""],
+        ["--what", "strategies", "--preset", "huge"],
+        ["--quality", "forty"],
+        ["--quality", "500"],
+        ["--psnr", "100"],
+        ["--sizes", "5 parsecs"],
+        ["--keep", "0"],
+        ["--keep", "1.5"],
+        ["--opacities", "nan"],
+        ["--kmeans", "0"],
+        ["--modes", "quick"],
+        ["--modes", ""],
+        ["--iterations", "0"],
+        ["--size", "200x200"],
+        ["--data", "x", "--cameras", "y"],
+        ["--data", "x", "--size", "wide"],
+        ["-o", "-"],
+    ],
+)
+def test_a_wrong_command_line_has_status_2(capture, words):
+    assert 2 == invoke(capture / "scene.ply", *words).exit_code
+
+
+def test_lists_are_read_in_their_order():
+    assert ("b", "a") == parse_words(" b,a ,b,")
+    assert (0.5, 0.25) == parse_numbers("0.5,.25,0.50")
+    assert () == parse_numbers("")
+
+
+@pytest.mark.parametrize(("module", "words"), [("numba", []), ("matplotlib", ["-o", "report.html"])])
+def test_without_the_extra_packages_one_line_says_what_to_install(tmp_path, sample_path, module, words):
+    code = f"import sys; sys.modules[{module!r}] = None; from csplat_tools.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "tradeoff", str(sample_path), *words],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert 1 == done.returncode
+    assert f"error: this needs {module}: pip install 'csplat[render]'\n" == done.stderr
+
+
+def test_the_help_has_examples():
+    text = invoke("--help").stdout
+    assert "csplat tradeoff scene.ply -o report.html" in text

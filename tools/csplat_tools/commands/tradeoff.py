@@ -1,0 +1,178 @@
+"""`csplat tradeoff`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from csplat.encoder import PRESETS
+from csplat.errors import InputError
+from csplat_tools.console import guarded, note, say
+from csplat_tools.extras import need_pictures, need_plots, prepare_renderer
+from csplat_tools.inout import STANDARD_STREAM, check_outputs, write_bytes
+from csplat_tools.parsing import parse_mode, parse_size
+from csplat_tools.photographs import DataViews
+from csplat_tools.tradeoff.options import FAMILIES, USUAL, Wanted, parse_numbers, parse_sizes, parse_words
+
+__all__ = ["tradeoff"]
+
+_WHAT = "What is swept"
+_JUDGES = "What judges"
+
+
+@guarded
+def tradeoff(
+    source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
+    output: Annotated[
+        str | None, typer.Option("--output", "-o", metavar="REPORT.html", help="Write a page with plots and pictures.")
+    ] = None,
+    as_json: Annotated[
+        str | None, typer.Option("--json", metavar="FILE", help="Write everything for programs; - for standard output.")
+    ] = None,
+    plots: Annotated[str | None, typer.Option(metavar="FOLDER", help="Write the plots as SVG files.")] = None,
+    what: Annotated[
+        str, typer.Option(metavar="GROUP,…", rich_help_panel=_WHAT, help=f"Of {', '.join(FAMILIES)}.")
+    ] = ",".join(USUAL),
+    with_finetune: Annotated[
+        bool, typer.Option("--with-finetune", rich_help_panel=_WHAT, help="Fine-tuned files, too: minutes for each.")
+    ] = False,
+    preset: Annotated[
+        str, typer.Option(metavar="|".join(PRESETS), rich_help_panel=_WHAT, help="Of all that is not a preset.")
+    ] = Wanted.preset,
+    quality: Annotated[
+        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Values of `encode --quality`.")
+    ] = None,
+    psnr: Annotated[
+        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Targets: PSNR against the source.")
+    ] = None,
+    sizes: Annotated[
+        str | None, typer.Option(metavar="SIZE,…", rich_help_panel=_WHAT, help="Targets: sizes, 2MB,800kB; else none.")
+    ] = None,
+    keep: Annotated[
+        str | None, typer.Option(metavar="SHARE,…", rich_help_panel=_WHAT, help="Splats that simplification leaves.")
+    ] = None,
+    opacities: Annotated[
+        str | None, typer.Option(metavar="ALPHA,…", rich_help_panel=_WHAT, help="Splats below are left out.")
+    ] = None,
+    kmeans: Annotated[
+        str | None, typer.Option(metavar="K,…", rich_help_panel=_WHAT, help="Entries of codebooks per attribute.")
+    ] = None,
+    iterations: Annotated[
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_WHAT, help="Steps of fine-tuning at most.")
+    ] = Wanted.iterations,
+    modes: Annotated[
+        str, typer.Option(metavar="exact|standard|fast,…", rich_help_panel=_JUDGES, help="Of the renderer, timed.")
+    ] = ",".join(Wanted.modes),
+    cameras: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.json", rich_help_panel=_JUDGES, help="Cameras, instead of eight virtual ones."),
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(metavar="DATA", rich_help_panel=_JUDGES, help="Posed photographs: those held out judge."),
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", rich_help_panel=_JUDGES, help="Scale the photographs to this size.")
+    ] = None,
+    images: Annotated[
+        str | None, typer.Option(metavar="NAME", rich_help_panel=_JUDGES, help="COLMAP: folder of pictures, images_4.")
+    ] = None,
+    test_every: Annotated[
+        int, typer.Option(metavar="N", rich_help_panel=_JUDGES, help="Every Nth photograph was held out; see `train`.")
+    ] = 8,
+    lpips: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WEIGHTS.npz", rich_help_panel=_JUDGES, help="LPIPS (Alex) with these weights, or `auto`."
+        ),
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads, one per core by default.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
+) -> None:
+    """Show what a scene costs and what it keeps, over everything that can be chosen.
+
+    Encodes the scene in many ways, measures bytes, pictures and seconds of
+    each, and marks those that no other one beats: presets, values of
+    --quality, targets, simplification, fewer SH bands, fewer splats. A small
+    scene takes a few minutes. `psnr` is against the source's own renders, as
+    of `csplat compare`; photographs judge beside it. Needs the packages of
+    the render extra.
+
+    Examples:
+      csplat tradeoff scene.ply
+      csplat tradeoff scene.ply -o report.html --json report.json --plots plots
+      csplat tradeoff scene.ply --what presets,quality --quality 36,44,52
+      csplat tradeoff scene.ply --what targets --psnr 38,42 --sizes 1MB,500kB
+      csplat tradeoff scene.ply --data photographs --size 480x270 --with-finetune -o report.html
+    """
+    lists = {"quality": quality, "psnr": psnr, "sizes": sizes, "keep": keep, "opacities": opacities, "kmeans": kmeans}
+    wanted = _wanted(what, with_finetune, preset, lists, iterations, modes, threads)
+    if cameras is not None and data is not None:
+        raise typer.BadParameter("wanted one of --cameras and --data")
+    if data is None and (size is not None or images is not None):
+        raise typer.BadParameter("--size and --images are for the pictures of --data")
+    if STANDARD_STREAM in (output, plots):
+        raise typer.BadParameter("-o and --plots want names; --json alone may be -")
+    pixels = None if size is None else parse_size(size)
+    shots = None if data is None else DataViews(data, "test", pixels, images, test_every)
+    inputs = (source, cameras, None if lpips == "auto" else lpips)
+    for path in inputs:
+        if path not in (None, STANDARD_STREAM):
+            Path(str(path)).stat()  # an OSError that names it, before the seconds that the renderer may take
+    check_outputs((output, as_json), force=force, inputs=inputs)
+    if output is not None or plots is not None:
+        need_plots()
+    slow = bool({"strategies", "targets", "simplify", "finetune"} & set(wanted.what))
+    prepare_renderer(quiet=quiet, simplify=slow, ssim=True, lpips=lpips is not None)
+    need_pictures()
+    from csplat_tools.tradeoff.outputs import check_plots, write_page, write_plots
+    from csplat_tools.tradeoff.running import measure_tradeoff
+    from csplat_tools.tradeoff.setting import Inputs, read_setting
+    from csplat_tools.tradeoff.tables import format_tradeoff
+
+    check_plots(plots, force=force)
+    setting = read_setting(Inputs(source, shots, cameras, lpips), deciding=slow)
+    for finding in setting.findings:
+        if not quiet or finding.kind == "repair":
+            note(str(finding))
+    measured = measure_tradeoff(setting, wanted, quiet=quiet)
+    if as_json is not None:
+        write_bytes(as_json, json.dumps(measured.as_json(), indent=1, allow_nan=False).encode() + b"\n")
+    if plots is not None:
+        write_plots(plots, measured)
+    if output is not None:
+        write_page(output, measured)
+    if as_json != STANDARD_STREAM:
+        say(format_tradeoff(measured))
+
+
+def _wanted(
+    what: str,
+    with_finetune: bool,
+    preset: str,
+    lists: Mapping[str, str | None],
+    iterations: int,
+    modes: str,
+    threads: int | None,
+) -> Wanted:
+    """What is swept; a list that is not given is the usual one, an empty one asks for no such points."""
+    asked = (*parse_words(what), *(("finetune",) if with_finetune else ()))
+    try:
+        values: dict[str, Any] = {
+            name: parse_sizes(text) if name == "sizes" else parse_numbers(text)
+            for name, text in lists.items()
+            if text is not None
+        }
+        usual = Wanted()
+        return replace(
+            usual, what=tuple(dict.fromkeys(asked)), preset=preset, iterations=iterations,
+            modes=tuple(parse_mode(mode) for mode in parse_words(modes)), threads=threads, **values,
+        )  # fmt: skip
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None

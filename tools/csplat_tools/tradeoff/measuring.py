@@ -1,0 +1,214 @@
+"""Everything that is measured about one file: bytes, pictures, and seconds."""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import SceneHeader, decode, read_header
+from csplat.model import SplatModel
+from csplat_render import Camera, render
+from csplat_render.metrics import psnr_of_mse, squared_error
+from csplat_render.rasterise import Rasteriser
+from csplat_tools.compare import Comparison, SourceView, compare_models, render_source
+from csplat_tools.console import Report
+from csplat_tools.layout import describe
+from csplat_tools.photographs import PhotographScores, relative_to
+from csplat_tools.tradeoff.fetching import fetched_bytes
+from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
+from csplat_tools.tradeoff.setting import Setting
+from csplat_tools.tradeoff.showing import WorstView
+from csplat_tools.tradeoff.sweep import Candidate
+
+__all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer"]
+
+F32 = NDArray[np.float32]
+
+#: Decoding takes milliseconds: the median of so many runs is taken.
+DECODE_RUNS = 3
+#: Views at most from which rendering is timed.
+TIMED_VIEWS = 8
+
+_KEPT_BYTES = 1 << 30  # of the source's pictures; where they are more, they are rendered anew for each file
+
+
+@dataclass
+class StageClock:
+    """Seconds between the calls of a progress callback, by the name of the stage; calls come from any thread."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._lock = threading.Lock()
+        self._last = time.perf_counter()
+
+    def listening(self, report: Report) -> Report:
+        """Pass calls on, and note when they come. What passes before a stage is at 0 is not its own."""
+
+        def told(stage: str, done: float) -> None:
+            with self._lock:
+                now = time.perf_counter()
+                if done > 0.0:
+                    self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+                self._last = now
+            report(stage, done)
+
+        return told
+
+
+class Measurer:
+    """Measures files of one scene. Owns what the source looks like.
+
+    Args:
+        setting: the scene and its views.
+        modes: of the renderer, which are timed.
+        threads: how many; `None` for all.
+
+    Attributes:
+        source_modes: what rendering the source takes, by mode.
+        source_photographs: the source's scores against photographs, where there are some.
+    """
+
+    def __init__(self, setting: Setting, modes: Sequence[str], threads: int | None) -> None:
+        self._setting, self._modes, self._threads = setting, modes, threads
+        cameras, count = setting.cameras, min(TIMED_VIEWS, len(setting.cameras))
+        places = np.linspace(0, len(cameras) - 1, count).round().astype(int)
+        size = sum(camera.W * camera.H * 3 * 4 for camera in cameras)
+        self._views = list(self._rendered(cameras)) if size <= _KEPT_BYTES else None
+        chosen = [cameras[place] for place in places]
+        self._timed = list(self._rendered(chosen)) if self._views is None else [self._views[place] for place in places]
+        self.source_modes = {mode: self._mode_time(setting.source, mode) for mode in modes}
+        self.source_photographs = self._photograph_scores()
+
+    def measure(self, candidate: Candidate, progress: Report) -> Point:
+        """Make a file and measure it.
+
+        Raises:
+            CsplatError: it cannot be made.
+        """
+        clock, start = StageClock(), time.perf_counter()
+        made = candidate.make(clock.listening(progress))
+        encode_seconds = time.perf_counter() - start
+        setting, header = self._setting, read_header(made.data)
+        described = describe(made.data, header)
+        decoded, decode_seconds = self._decoded(made.data, None)
+        worst = WorstView()
+        quality, photographs = self._compared(decoded, worst)
+        modes = {mode: self._mode_time(decoded, mode) for mode in self._modes}
+        use = {name: int(one["size_bytes"]) for name, one in described["attributes"].items()}
+        return Point(
+            name=candidate.name,
+            family=candidate.family,
+            settings=made.settings,
+            size_bytes=len(made.data),
+            digest=header.digest.hex(),
+            splats=header.splat_count,
+            sh_degree=header.sh_degree,
+            source_splats=len(setting.source),
+            source_bytes=setting.source_bytes,
+            psnr=quality.psnr,
+            psnr_mean=quality.psnr_mean,
+            psnr_worst=quality.psnr_worst,
+            worst_view=quality.worst_view,
+            ssim=quality.ssim,
+            lpips=quality.lpips,
+            photographs=photographs,
+            encode_seconds=encode_seconds,
+            stages=made.stages or clock.seconds,
+            decode_seconds=decode_seconds,
+            modes=modes,
+            attribute_bytes={**use, "overhead": sum(described["overhead"].values())},
+            first_picture_bytes=fetched_bytes(header, 0),
+            partial=self._partial(made, header) if candidate.is_partial else (),
+            shown=worst.shown(),
+        )
+
+    def _partial(self, made: Made, header: SceneHeader) -> list[Partial]:
+        return [self._part(made.data, header, degree) for degree in range(header.sh_degree + 1)]
+
+    def _part(self, data: bytes, header: SceneHeader, degree: int) -> Partial:
+        decoded, seconds = self._decoded(data, degree)
+        quality, _ = self._compared(decoded, None)
+        return Partial(
+            sh_degree=degree,
+            size_bytes=fetched_bytes(header, degree),
+            psnr=quality.psnr,
+            psnr_worst=quality.psnr_worst,
+            ssim=quality.ssim,
+            decode_seconds=seconds,
+            render_milliseconds=self._mode_time(decoded, "standard").milliseconds,
+        )
+
+    def _decoded(self, data: bytes, sh_degree: int | None) -> tuple[SplatModel, float]:
+        """The scene, and seconds; the first run is one of those that count."""
+        seconds, models = [], list[SplatModel]()
+        for _ in range(DECODE_RUNS):
+            start = time.perf_counter()
+            models[:] = [decode(data, sh_degree=sh_degree, threads=self._threads)]
+            seconds.append(time.perf_counter() - start)
+        return models[0], statistics.median(seconds)
+
+    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Comparison, dict[str, Any] | None]:
+        """Against the source's renders; without a `WorstView` neither by LPIPS nor by photographs."""
+        setting, judge = self._setting, None if worst is None else self._judge()
+
+        def look(number: int, source: F32, other: F32) -> None:
+            if worst is not None:
+                worst.look(number, source, other)
+            if judge is not None:
+                judge.add(number, other)
+
+        quality = compare_models(
+            setting.source, decoded, setting.cameras, source_views=self._views, background=setting.background,
+            lpips=None if worst is None else setting.distance, on_view=look,
+        )  # fmt: skip
+        return quality, None if judge is None else judge.as_json()
+
+    def _judge(self) -> PhotographScores | None:
+        setting = self._setting
+        if setting.photographs is None:
+            return None
+        return PhotographScores(setting.photographs, setting.background, setting.distance)
+
+    def _photograph_scores(self) -> dict[str, Any] | None:
+        judge = self._judge()
+        if judge is None:
+            return None
+        for number, view in enumerate(self._views or self._rendered(self._setting.cameras)):
+            judge.add(number, view.picture)
+        return judge.as_json()
+
+    def _rendered(self, cameras: Sequence[Camera]) -> Iterator[SourceView]:
+        return render_source(self._setting.source, cameras, background=self._setting.background)
+
+    def _mode_time(self, model: SplatModel, mode: str) -> ModeTime:
+        """Render the timed views, after one that is not timed: it allocates."""
+        shift = np.subtract(model.origin, self._setting.source.origin)
+        cameras = [relative_to(shift, view.camera) for view in self._timed]
+        draw = self._renderer(model, mode)
+        if mode != "exact":  # it takes seconds a picture, and keeps nothing from one to the next
+            draw(cameras[0])
+        seconds, error, count = [], 0.0, 0
+        for view, camera in zip(self._timed, cameras, strict=True):
+            start = time.perf_counter()
+            picture = draw(camera)
+            seconds.append(time.perf_counter() - start)
+            squares = squared_error(view.picture, np.clip(picture, 0.0, 1.0).astype(np.float32, copy=False))
+            error, count = error + float(np.sum(squares)), count + squares.size
+        return ModeTime(1000.0 * statistics.median(seconds), psnr_of_mse(error / count))
+
+    def _renderer(self, model: SplatModel, mode: str) -> Callable[[Camera], NDArray[Any]]:
+        background = self._setting.background
+        if mode == "exact":
+            return lambda camera: render(model, camera, background=background, mode=mode).rgb
+        rasteriser = Rasteriser(mode, gradients=False, threads=self._threads)
+        return lambda camera: (
+            rasteriser.forward(model, camera, background=background, antialiased=model.antialiased).rgb
+        )

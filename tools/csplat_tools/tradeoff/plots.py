@@ -1,0 +1,235 @@
+"""The sweep drawn: size, quality and time, where the bytes go, and what fewer SH layers look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from csplat_tools.tradeoff.points import Point
+from csplat_tools.tradeoff.running import Tradeoff
+from csplat_tools.tradeoff.svg import INK, drawn, hover
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["PLOTS", "draw_plot"]
+
+_WIDE, _HIGH = 7.0, 4.4  # inches of 100 pixels
+
+# Colours that people tell apart whatever colours they see, on white and on black; markers say the same again.
+_STYLES = {
+    "presets": ("#d55e00", "s"),
+    "quality": ("#2f83c9", "o"),
+    "strategies": ("#cc79a7", "^"),
+    "targets": ("#e69f00", "D"),
+    "simplify": ("#009e73", "v"),
+    "finetune": ("#8b8be6", "P"),
+}
+_NAMES = {
+    "presets": "presets",
+    "quality": "--quality",
+    "strategies": "simple strategies",
+    "targets": "targets",
+    "simplify": "simplified",
+    "finetune": "fine-tuned",
+}
+_ATTRIBUTE_COLOURS = {
+    "opacities": "#88ccee",
+    "scales": "#4477aa",
+    "quats": "#44aa99",
+    "means": "#117733",
+    "sh0": "#ddcc77",
+    "sh1": "#cc6677",
+    "sh2": "#aa4499",
+    "sh3": "#882255",
+    "overhead": "#8a8a8a",
+}
+_OTHER = "#bbbbbb"
+_FEW, _MANY, _TICKS = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0), 15  # ticks in each decade, and in all
+_LARGE = 1_000_000  # bytes of a file, from which on they are counted in MB
+_LABELLED = ("presets", "simplify", "targets", "finetune")
+
+Value = Callable[[Point], "float | None"]
+
+
+def draw_plot(name: str, tradeoff: Tradeoff, *, inline: bool) -> str | None:
+    """Draw one of `PLOTS`.
+
+    Args:
+        name: which.
+        tradeoff: the sweep.
+        inline: for a page, whose colour of text it takes; else black on white.
+
+    Returns:
+        An SVG; `None` where the sweep has nothing for it.
+    """
+    return PLOTS[name](tradeoff, name, inline)
+
+
+def _quality(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    return _front_plot(tradeoff, name, inline, lambda one: one.psnr, tradeoff.front, "psnr against the source, dB")
+
+
+def _photographs(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    scores = tradeoff.source_photographs
+    if scores is None:
+        return None
+    front, label = tradeoff.photograph_front, "PSNR on held-out photographs, dB"
+    level = float(scores["psnr"])
+    return _front_plot(tradeoff, name, inline, lambda one: one.photograph_psnr, front, label, level=level)
+
+
+def _front_plot(
+    tradeoff: Tradeoff,
+    name: str,
+    inline: bool,
+    value: Value,
+    front: Sequence[Point],
+    label: str,
+    level: float | None = None,
+) -> str:
+    def draw(figure: Figure) -> None:
+        axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
+        size = _size_in(divisor)
+        axes.plot(
+            [size(one) or 0.0 for one in front], [value(one) or 0.0 for one in front], "--", color=INK, linewidth=1,
+            label="no other is better", zorder=1,
+        )  # fmt: skip
+        if level is not None:
+            axes.axhline(level, color=INK, linewidth=1, linestyle=":", label="the source itself")
+        _scatter(axes, tradeoff, size, value, name)
+        axes.set(xscale="log", xlabel=f"size, {unit}", ylabel=label)
+        _plain_ticks(axes, "x")
+        axes.legend(loc="lower right", fontsize="small")
+
+    return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
+
+
+def _encode_time(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    def draw(figure: Figure) -> None:
+        axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
+        size = _size_in(divisor)
+        _scatter(axes, tradeoff, size, lambda one: one.encode_seconds, name)
+        axes.set(xscale="log", yscale="log", xlabel=f"size, {unit}", ylabel="seconds to encode")
+        _plain_ticks(axes, "x")
+        _plain_ticks(axes, "y")
+        axes.legend(fontsize="small")
+
+    return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
+
+
+def _decode_time(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        _scatter(axes, tradeoff, lambda one: one.psnr, lambda one: 1000.0 * one.decode_seconds, name)
+        axes.set(xlabel="psnr against the source, dB", ylabel="milliseconds to decode", ylim=(0.0, None))
+        axes.legend(fontsize="small")
+
+    return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
+
+
+def _attributes(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    points = tradeoff.measured[::-1]
+    names = list(dict.fromkeys([*_ATTRIBUTE_COLOURS, *(key for one in points for key in one.attribute_bytes)]))
+    used = [key for key in names if any(one.attribute_bytes.get(key) for one in points)]
+
+    def draw(figure: Figure) -> None:
+        axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
+        left = [0.0] * len(points)
+        for key in used:
+            widths = [one.attribute_bytes.get(key, 0) / divisor for one in points]
+            colour = _ATTRIBUTE_COLOURS.get(key, _OTHER)
+            axes.barh(range(len(points)), widths, left=left, color=colour, height=0.75, label=key)
+            left = [a + b for a, b in zip(left, widths, strict=True)]
+        axes.set_yticks(range(len(points)), [one.name for one in points], fontsize="small")
+        axes.set(xlabel=f"size, {unit}", ylim=(-0.6, len(points) - 0.4))
+        axes.grid(visible=False, axis="y")
+        axes.legend(ncols=min(5, len(used)), loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small")
+
+    return drawn(draw, (_WIDE, 1.4 + 0.22 * len(points)), name, inline=inline)
+
+
+def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    points = [one for one in tradeoff.measured if len(one.partial) > 1]
+    if not points:
+        return None
+    styles = list(_STYLES.values())
+
+    def draw(figure: Figure) -> None:
+        axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
+        for number, point in enumerate(points):
+            colour, marker = styles[number % len(styles)]
+            sizes, scores = [one.size_bytes / divisor for one in point.partial], [one.psnr for one in point.partial]
+            axes.plot(sizes, scores, marker=marker, color=colour, label=point.name)
+            for one, x, y in zip(point.partial, sizes, scores, strict=True):
+                axes.annotate(
+                    f"SH {one.sh_degree}", (x, y), (7, -3), textcoords="offset points", fontsize="x-small",
+                    color=colour,
+                )  # fmt: skip
+        axes.set(xlabel=f"{unit} fetched", ylabel="psnr against the source, dB")
+        axes.margins(0.08)
+        axes.legend(loc="lower right", fontsize="small")
+
+    return drawn(draw, (_WIDE, _HIGH), name, inline=inline)
+
+
+#: By name of the file, which is that of the plot, too; drawn in this order.
+PLOTS: dict[str, Callable[[Tradeoff, str, bool], str | None]] = {
+    "size-quality": _quality,
+    "size-photographs": _photographs,
+    "size-encode-time": _encode_time,
+    "quality-decode-time": _decode_time,
+    "attribute-bytes": _attributes,
+    "sh-layers": _layers,
+}
+
+
+def _scatter(axes: Axes, tradeoff: Tradeoff, x: Value, y: Value, plot: str) -> None:
+    for family, (colour, marker) in _STYLES.items():
+        shown = [one for one in tradeoff.measured if one.family == family]
+        for number, one in enumerate(shown):
+            across, up = x(one) or 0.0, y(one) or 0.0
+            (line,) = axes.plot(
+                [across], [up], marker, color=colour, markersize=6.5, label="" if number else _NAMES[family]
+            )
+            line.set_gid(hover(plot, one.name))
+            if family in _LABELLED:
+                axes.annotate(
+                    _short(one.name), (across, up), (-5, 5), textcoords="offset points",
+                    fontsize="x-small", color=colour, ha="right",
+                )  # fmt: skip
+    axes.margins(0.08)
+
+
+def _short(name: str) -> str:
+    return name.removeprefix("target ")
+
+
+def _titles(tradeoff: Tradeoff, plot: str) -> dict[str, str]:
+    """What appears where the mouse rests on a point."""
+    return {
+        hover(plot, one.name): f"{one.name}: {one.size_bytes} bytes, {one.psnr:.2f} dB, encoded in"
+        f" {one.encode_seconds:.2f} s, decoded in {1000.0 * one.decode_seconds:.1f} ms"
+        for one in tradeoff.measured
+    }
+
+
+def _unit(tradeoff: Tradeoff) -> tuple[str, float]:
+    """In what sizes are told, and how many bytes it is."""
+    return ("MB", 1e6) if max(one.size_bytes for one in tradeoff.measured) >= _LARGE else ("kB", 1e3)
+
+
+def _size_in(divisor: float) -> Value:
+    return lambda one: one.size_bytes / divisor
+
+
+def _plain_ticks(axes: Axes, which: str) -> None:
+    """Numbers as people write them on a logarithmic axis; more of them where the axis is short."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(10.0, _FEW if high > 12.0 * low else _MANY, numticks=_TICKS))
+    axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,166 @@
+"""The sweep itself: point after point, none of which takes the others down with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from csplat.errors import CsplatError, InputError
+from csplat_render.jit import thread_count
+from csplat_tools.console import Report, format_bytes, note, progress_bar
+from csplat_tools.tradeoff.machine import describe_machine
+from csplat_tools.tradeoff.measuring import DECODE_RUNS, Measurer
+from csplat_tools.tradeoff.options import Wanted
+from csplat_tools.tradeoff.points import Failure, ModeTime, Point, pareto_front
+from csplat_tools.tradeoff.setting import Setting
+from csplat_tools.tradeoff.sweep import Candidate, candidates
+
+__all__ = ["Tradeoff", "estimated_seconds", "measure_tradeoff"]
+
+# Seconds by kind of point, on two cores: for each million splats, and for each second that eight
+# pictures of the source take; for an estimate that a person decides by, no more.
+_COSTS = {
+    "presets": (12.0, 15.0),
+    "quality": (12.0, 6.0),
+    "strategies": (12.0, 6.0),
+    "k-means": (250.0, 6.0),
+    "distilled": (40.0, 110.0),
+    "targets": (100.0, 60.0),
+    "simplify": (40.0, 250.0),
+    "finetune": (100.0, 500.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Tradeoff:
+    """What the sweep found.
+
+    Attributes:
+        setting: the scene and its views.
+        wanted: what was swept.
+        points: measured or not, in the order of the sweep.
+        source_modes: what rendering the source takes, by mode of the renderer.
+        source_photographs: the source's scores against photographs, where there are some.
+        machine: processor, system, versions.
+    """
+
+    setting: Setting
+    wanted: Wanted
+    points: Sequence[Point | Failure]
+    source_modes: dict[str, ModeTime]
+    source_photographs: dict[str, Any] | None
+    machine: dict[str, Any]
+
+    @property
+    def measured(self) -> list[Point]:
+        """What could be measured, the smallest file first."""
+        return sorted((one for one in self.points if isinstance(one, Point)), key=lambda one: one.size_bytes)
+
+    @property
+    def failures(self) -> list[Failure]:
+        """What could not."""
+        return [one for one in self.points if isinstance(one, Failure)]
+
+    @property
+    def front(self) -> list[Point]:
+        """What no other point beats in size and `psnr`, the smallest file first."""
+        measured = self.measured
+        return [measured[place] for place in pareto_front([(one.size_bytes, one.psnr) for one in measured])]
+
+    @property
+    def photograph_front(self) -> list[Point]:
+        """The same by PSNR of photographs; empty where there are none."""
+        known = [one for one in self.measured if one.photograph_psnr is not None]
+        return [known[at] for at in pareto_front([(one.size_bytes, one.photograph_psnr or 0.0) for one in known])]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        setting = self.setting
+        return {
+            "scene": {
+                "name": setting.name,
+                "size_bytes": setting.source_bytes,
+                "splats": len(setting.source),
+                "sh_degree": setting.source.sh_degree,
+                "defects": [str(one) for one in setting.findings],
+            },
+            "views": {
+                "cameras": setting.cameras_name,
+                "count": len(setting.cameras),
+                "sizes": sorted({(camera.W, camera.H) for camera in setting.cameras}),
+                "background": list(setting.background),
+            },
+            "machine": self.machine,
+            "times": f"single runs; decoding: the median of {DECODE_RUNS}; rendering: the median over views",
+            "source": {
+                "render": {name: one.as_json() for name, one in self.source_modes.items()},
+                "photographs": self.source_photographs,
+            },
+            "pareto": [one.name for one in self.front],
+            "pareto_photographs": [one.name for one in self.photograph_front],
+            "points": [one.as_json() for one in self.points],
+        }
+
+
+def measure_tradeoff(setting: Setting, wanted: Wanted, *, quiet: bool = True) -> Tradeoff:
+    """Make every file that is wanted, and measure it.
+
+    Args:
+        setting: the scene and its views.
+        wanted: what is swept.
+        quiet: say nothing; else how long it may take, and how far it has come.
+
+    Raises:
+        InputError: there is nothing to sweep, or not one point could be measured.
+    """
+    with thread_count(wanted.threads):
+        measurer = Measurer(setting, wanted.modes, wanted.threads)
+        tried = candidates(setting, wanted)
+        if not tried:
+            raise InputError("nothing to sweep: what is asked for has no values")
+        costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
+        if not quiet:
+            note(f"{len(tried)} files to make and to measure: about {_duration(sum(costs))}")
+        points = list[Point | Failure]()
+        with progress_bar(quiet=quiet) as bar:
+            report: Report = bar or (lambda _stage, _done: None)
+            for number, candidate in enumerate(tried):
+                report("the sweep", sum(costs[:number]) / sum(costs))
+                points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
+                if bar is None and not quiet:
+                    note(_line(points[-1], number + 1, len(tried)))
+    first = points[0]
+    if isinstance(first, Failure) and all(isinstance(one, Failure) for one in points):
+        raise InputError(f"no point could be measured; {first.name}: {first.error}")
+    machine = describe_machine(wanted.threads)
+    return Tradeoff(setting, wanted, points, measurer.source_modes, measurer.source_photographs, machine)
+
+
+def estimated_seconds(kind: str, setting: Setting, wanted: Wanted, modes: dict[str, ModeTime]) -> float:
+    """About how long a point takes that is like those of a family."""
+    by_splats, by_pictures = _COSTS[kind]
+    milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
+    steps = wanted.iterations / Wanted.iterations if kind == "finetune" else 1.0
+    return 0.5 + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
+
+
+def _measured(measurer: Measurer, candidate: Candidate, progress: Report) -> Point | Failure:
+    try:
+        return measurer.measure(candidate, progress)
+    except CsplatError as error:
+        return Failure(candidate.name, candidate.family, " ".join(str(error).split()))
+    except MemoryError:
+        return Failure(candidate.name, candidate.family, "out of memory")
+
+
+def _line(point: Point | Failure, number: int, count: int) -> str:
+    """One point, as soon as it is there."""
+    if isinstance(point, Failure):
+        return f"{number}/{count} {point.name}: {point.error}"
+    size, seconds = format_bytes(point.size_bytes), f"{point.encode_seconds:.1f} s"
+    return f"{number}/{count} {point.name}: {size}, {point.psnr:.2f} dB, {seconds}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} minutes"

@@ -1,0 +1,136 @@
+"""Plots as SVG that can stand inside a page whose policy allows no style attributes, and that repeat bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree as ET
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["INK", "drawn", "hover"]
+
+#: Stands for the colour of text until the picture is written: no other one is exactly this.
+INK = "#123457"
+
+_SVG = "{http://www.w3.org/2000/svg}"
+_XLINK = "{http://www.w3.org/1999/xlink}"
+_BLACK = "#1a1a1a"
+# `font` is no attribute of SVG; older versions of matplotlib write sizes so.
+_FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
+_SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
+    "svg.fonttype": "none",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.labelcolor": INK,
+    "legend.framealpha": 0.0,
+    "legend.edgecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.25,
+    "grid.color": INK,
+    "font.size": 11.0,
+    "text.parse_math": False,  # names of points may hold any character
+}
+
+
+def hover(plot: str, name: str) -> str:
+    """The id of what stands for a point in a plot, made of letters and digits alone."""
+    return f"point-{hashlib.sha256(f'{plot}/{name}'.encode()).hexdigest()[:12]}"
+
+
+def drawn(
+    draw: Callable[[Figure], None],
+    size: tuple[float, float],
+    name: str,
+    *,
+    inline: bool,
+    titles: Mapping[str, str] | None = None,
+) -> str:
+    """Draw a figure.
+
+    Args:
+        draw: is given an empty figure.
+        size: width and height, inches.
+        name: of the plot: ids inside begin with it, so that several plots can share a page.
+        inline: for a page: transparent, and lines and letters have the page's colour; else on white, with a prologue.
+        titles: by id, what appears where the mouse rests.
+
+    Returns:
+        The SVG, the same for the same figure and version of matplotlib.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({**_SETTINGS, "svg.hashsalt": name}):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        draw(figure)
+        buffer = io.StringIO()
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(buffer, format="svg", metadata=nothing, transparent=inline)
+    root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
+    _clean(root, name, titles or {})
+    if inline:
+        root.attrib.pop("height", None)
+        root.attrib.pop("width", None)
+    else:
+        root.set("font-family", "sans-serif")
+    text = ET.tostring(root, encoding="unicode").replace(INK, "currentColor" if inline else _BLACK)
+    return text if inline else f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'
+
+
+def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
+    """Styles become attributes, ids those of this plot, and points get titles."""
+    for element in list(root.iter()):
+        element.tag = element.tag.removeprefix(_SVG)
+        for child in list(element):
+            if child.tag == f"{_SVG}style":
+                element.remove(child)
+        attributes = {**_as_attributes(element.attrib.pop("style", "")), **element.attrib}
+        element.attrib.clear()
+        for key, value in attributes.items():
+            plain = "href" if key == f"{_XLINK}href" else key
+            element.set(plain, _own_id(plain, value, name, titles))
+        title = titles.get(element.get("id", ""))
+        if title is not None:
+            label = ET.Element("title")
+            label.text = title
+            element.insert(0, label)
+    # What matplotlib's own style element says, for this picture alone.
+    root.set("stroke-linejoin", "round")
+    root.set("stroke-linecap", "butt")
+    root.set("role", "img")
+    root.set("xmlns", _SVG.strip("{}"))
+
+
+def _own_id(key: str, value: str, name: str, titles: Mapping[str, str]) -> str:
+    if key == "id" and value not in titles:
+        return f"{name}-{value}"
+    if key == "href":
+        return value.replace("#", f"#{name}-", 1)
+    return value.replace("url(#", f"url(#{name}-")
+
+
+def _as_attributes(style: str) -> dict[str, str]:
+    """`fill: none; stroke: red` as attributes; the page chooses the font."""
+    found: dict[str, str] = {}
+    for part in style.split(";"):
+        key, _, value = (piece.strip() for piece in part.partition(":"))
+        if key == "font":
+            match = _FONT.match(value + " ")
+            if match is not None:
+                found["font-size"] = match["size"]
+        elif key and key != "font-family":
+            found[key] = value
+    return found

@@ -1,0 +1,163 @@
+"""The ways of storing a scene that are tried: each a name, a group, and how its file is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
+from csplat.model import SplatModel
+from csplat_tools.console import Report, format_bytes
+from csplat_tools.tradeoff.options import Wanted
+from csplat_tools.tradeoff.points import Made
+from csplat_tools.tradeoff.setting import Setting
+
+if TYPE_CHECKING:
+    from csplat_tools.strategies import Reduction
+
+__all__ = ["Candidate", "candidates"]
+
+_MOST_DISTILLED = 2  # degrees 0 and 1: each takes as long as a simplification
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A way of storing the scene.
+
+    Attributes:
+        name: unique.
+        family: one of `FAMILIES`.
+        make: makes the file; is told the callback that wants to know how far it has come.
+        is_partial: whether it is looked at with fewer SH layers, too.
+        cost: like which family's the time is that it takes; `None`: its own.
+    """
+
+    name: str
+    family: str
+    make: Callable[[Report], Made]
+    is_partial: bool = False
+    cost: str | None = None
+
+
+def candidates(setting: Setting, wanted: Wanted) -> list[Candidate]:
+    """List what is to be tried, what is quick first."""
+    makers = {
+        "presets": _presets,
+        "quality": _qualities,
+        "strategies": _strategies,
+        "targets": _targets,
+        "simplify": _simplified,
+        "finetune": _tuned,
+    }
+    return [one for family, list_of in makers.items() if family in wanted.what for one in list_of(setting, wanted)]
+
+
+def _presets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    for preset in PRESETS:
+        options = EncodeOptions(preset=preset, threads=wanted.threads)
+        has_bands = setting.source.sh_degree > 0
+        yield Candidate(preset, "presets", partial(_encode, setting.source, options), is_partial=has_bands)
+
+
+def _qualities(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    for quality in wanted.quality:
+        options = EncodeOptions(preset=wanted.preset, quality=quality, threads=wanted.threads)
+        yield Candidate(f"quality {quality:g}", "quality", partial(_encode, setting.source, options))
+
+
+def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    """Bands, splats and values taken away by simple rules; what looks at pictures comes last."""
+    from csplat_tools.strategies import Reduction, parse_kmeans
+
+    def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> Candidate:
+        how = replace(reduction, threads=wanted.threads)
+        return Candidate(name, "strategies", partial(_reduce, setting, wanted, how), cost=cost)
+
+    degree = setting.source.sh_degree
+    for kept in reversed(range(degree)):
+        yield strategy(f"SH {kept}", Reduction(sh_degree=kept))
+    for tau in wanted.opacities:
+        yield strategy(f"opacity > {tau:g}", Reduction(prune_opacity=tau))
+    if degree and wanted.opacities:
+        tau = wanted.opacities[-1]
+        yield strategy(f"SH 0, opacity > {tau:g}", Reduction(prune_opacity=tau, sh_degree=0))
+    for entries in wanted.kmeans:
+        yield strategy(f"k-means {entries:g}", Reduction(kmeans=parse_kmeans(f"{entries:g}")), "k-means")
+    for kept in reversed(range(min(degree, _MOST_DISTILLED))):
+        yield strategy(f"SH {kept}, distilled", Reduction(sh_degree=kept, distil=True), "distilled")
+
+
+def _targets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    for psnr in wanted.psnr:
+        yield Candidate(f"target {psnr:g} dB", "targets", partial(_reach, setting, wanted, psnr=psnr))
+    for size in wanted.sizes:
+        yield Candidate(f"target {format_bytes(size)}", "targets", partial(_reach, setting, wanted, size_bytes=size))
+
+
+def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    for keep in wanted.keep:
+        yield Candidate(f"keep {keep:g}", "simplify", partial(_simplify, setting, wanted, keep))
+
+
+def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    from csplat_tools.tradeoff.tuning import tune_file
+
+    yield Candidate("tuned", "finetune", partial(tune_file, setting, wanted, None))
+    for keep in wanted.keep[len(wanted.keep) // 2 :][:1]:  # the middle one: each takes minutes
+        yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(tune_file, setting, wanted, keep))
+
+
+def _encode(source: SplatModel, options: EncodeOptions, progress: Report) -> Made:
+    return _made(encode_with_report(source, options, progress=progress))
+
+
+def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Report) -> Made:
+    from csplat_tools.strategies import encode_reduced
+
+    return _made(
+        encode_reduced(
+            setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
+            cameras=setting.deciding, background=setting.background, progress=progress,
+        )
+    )  # fmt: skip
+
+
+def _reach(
+    setting: Setting,
+    wanted: Wanted,
+    progress: Report,
+    *,
+    psnr: float | None = None,
+    size_bytes: int | None = None,
+) -> Made:
+    from csplat_tools.rate.control import encode_to_target
+    from csplat_tools.rate.targets import RateTarget
+
+    target = RateTarget(size_bytes=size_bytes, psnr=psnr)
+    options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
+    # Which splats go is decided from the same views as the quality: from those of photographs that judge nothing.
+    cameras = setting.own_cameras if setting.deciding is None else setting.deciding
+    found = encode_to_target(
+        setting.source, target, options, cameras=cameras, background=setting.background, progress=progress
+    )
+    return _made(found.result, rate=found.report)
+
+
+def _simplify(setting: Setting, wanted: Wanted, keep: float, progress: Report) -> Made:
+    from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
+
+    found = encode_simplified(
+        setting.source,
+        setting.deciding,
+        target=Target(keep=keep),
+        encoding=EncodeOptions(preset=wanted.preset, threads=wanted.threads),
+        options=SimplifyOptions(background=setting.background, threads=wanted.threads),
+        progress=progress,
+    )
+    return _made(found.result, simplify={"keep": keep, **found.report})
+
+
+def _made(result: EncodeResult, **said: Any) -> Made:
+    return Made(result.data, {"encoding": result.report.options, **said})

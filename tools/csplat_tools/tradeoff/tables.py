@@ -1,0 +1,169 @@
+"""The sweep as tables: for a terminal, and the cells for a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from csplat_tools.console import format_bytes, format_table
+from csplat_tools.tradeoff.points import Partial, Point
+from csplat_tools.tradeoff.running import Tradeoff
+
+__all__ = ["MARK", "Column", "columns_of", "format_tradeoff", "mode_rows", "partial_rows", "views_line"]
+
+#: Before the names of points that no other one beats.
+MARK = "*"
+
+
+_LINE_MBITS = 10.0  # a phone on a middling day
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table of points.
+
+    Attributes:
+        title: above it.
+        hint: what it means, in a sentence.
+        value: of a point; `None` where it is not known.
+        digits: behind the decimal point.
+        detailed: for the page alone: a terminal is too narrow.
+    """
+
+    title: str
+    hint: str
+    value: Callable[[Point], float | None]
+    digits: int
+    detailed: bool = False
+
+    def text(self, point: Point) -> str:
+        """A cell."""
+        value = self.value(point)
+        return "-" if value is None else f"{value:.{self.digits}f}"
+
+
+def columns_of(tradeoff: Tradeoff) -> list[Column]:
+    """The columns that have anything to say for a sweep."""
+    columns = [
+        Column("bytes", "Size of the file.", lambda one: one.size_bytes, 0),
+        Column("B/splat", "Bytes of the file for each splat of the source.", lambda one: one.bytes_per_source_splat, 2),
+        Column("ratio", "How many times the file is smaller than the PLY.", lambda one: one.ratio, 1),
+        Column("psnr", "dB, of the squared error pooled over all views, against the source's renders.",
+               lambda one: one.psnr, 2),
+        Column("mean", "dB, mean over the views.", lambda one: one.psnr_mean, 2, detailed=True),
+        Column("worst", "dB, of the worst view.", lambda one: one.psnr_worst, 2),
+        Column("ssim", "Mean over the views.", lambda one: one.ssim, 4),
+    ]  # fmt: skip
+    if tradeoff.setting.distance is not None:
+        columns.append(Column("lpips", "Perceptual distance (Alex), mean over the views.", lambda one: one.lpips, 4))
+    if tradeoff.setting.photographs is not None:
+        columns.append(Column("photos", "dB against held-out photographs.", lambda one: one.photograph_psnr, 2))
+    columns += [
+        Column("splats", "Splats of the file.", lambda one: one.splats, 0),
+        Column("SH", "Degree of its spherical harmonics.", lambda one: one.sh_degree, 0, detailed=True),
+        Column("encode s", "Seconds from splats to bytes, one run.", lambda one: one.encode_seconds, 2),
+        Column("decode ms", "Milliseconds from bytes to splats.", lambda one: 1000.0 * one.decode_seconds, 1),
+        Column("first kB", "kB that a viewer fetches before the first picture: all but the SH bands.",
+               lambda one: one.first_picture_bytes / 1000.0, 1),
+        Column("loaded s", f"Seconds until a line of {_LINE_MBITS:g} Mbit/s has brought all of it.",
+               lambda one: _line_seconds(one.size_bytes), 2, detailed=True),
+        Column("first s", "Seconds until it has brought the first picture.",
+               lambda one: _line_seconds(one.first_picture_bytes), 2, detailed=True),
+    ]  # fmt: skip
+    for mode in tradeoff.source_modes:
+        hint = f"Milliseconds to render a view in mode {mode}, median over views."
+        columns.append(Column(f"{mode} ms", hint, _milliseconds(mode), 1))
+    return columns
+
+
+def format_tradeoff(tradeoff: Tradeoff) -> str:
+    """All tables as text."""
+    columns = [one for one in columns_of(tradeoff) if not one.detailed]
+    front = {one.name for one in tradeoff.front}
+    rows: list[Sequence[object]] = [
+        (f"{MARK if one.name in front else ' '} {one.name}", *(column.text(one) for column in columns))
+        for one in tradeoff.measured
+    ]
+    setting = tradeoff.setting
+    count = f"{len(setting.source)} splats, SH degree {setting.source.sh_degree}"
+    parts = [
+        f"{setting.name}: {count}, {format_bytes(setting.source_bytes)}; {views_line(tradeoff)}",
+        format_table(("  file", *(column.title for column in columns)), rows)
+        + f"\n{MARK} no other file is smaller and at least as good, by psnr",
+    ]
+    if tradeoff.failures:
+        parts.append("\n".join(f"not measured: {one.name}: {one.error}" for one in tradeoff.failures))
+    modes = mode_rows(tradeoff)
+    parts.append(format_table(("renderer", *modes[0]), modes[1:]))
+    partial = partial_rows(tradeoff)
+    if len(partial) > 1:
+        parts.append(format_table(("fewer SH layers", *partial[0]), partial[1:]))
+    if tradeoff.source_photographs is not None:
+        scores = tradeoff.source_photographs
+        parts.append(f"the source itself scores {scores['psnr']:.2f} dB against {scores['views']} held-out photographs")
+    machine = tradeoff.machine
+    parts.append(
+        f"Times are single runs with {machine['threads']} threads on {machine['cores']} cores ({machine['processor']}),"
+        f" csplat {machine['csplat']}, numpy {machine['packages']['numpy']}, numba {machine['packages']['numba']}."
+    )
+    return "\n\n".join(parts)
+
+
+def views_line(tradeoff: Tradeoff) -> str:
+    """From where the pictures are."""
+    setting = tradeoff.setting
+    sizes = sorted({(camera.W, camera.H) for camera in setting.cameras})
+    size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
+    where = "virtual views" if setting.cameras_name == "virtual" else f"views of {setting.cameras_name}"
+    return f"judged from {len(setting.cameras)} {where}, {size}"
+
+
+def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
+    """What the renderer's modes take and lose: a header without its first cell, and a row for each mode."""
+    shown = _presets(tradeoff) or tradeoff.front[-1:]
+    header: tuple[str, ...] = (
+        "source ms",
+        "source psnr",
+        *(f"{one.name} {what}" for one in shown for what in ("ms", "psnr")),
+    )
+    rows = list[tuple[str, ...]]([header])
+    for mode, source in tradeoff.source_modes.items():
+        cells = [mode, f"{source.milliseconds:.1f}", f"{source.psnr:.2f}"]
+        for one in shown:
+            cells += [f"{one.modes[mode].milliseconds:.1f}", f"{one.modes[mode].psnr:.2f}"]
+        rows.append(tuple(cells))
+    return rows
+
+
+def partial_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
+    """What files look like of which fewer SH layers are fetched: a header without its first cell, and the rows."""
+    rows: list[tuple[str, ...]] = [
+        ("bytes", "of the file", "psnr", "worst", "ssim", "decode ms", "render ms"),
+    ]
+    rows += [_partial_row(point, one) for point in tradeoff.measured for one in point.partial]
+    return rows
+
+
+def _partial_row(point: Point, part: Partial) -> tuple[str, ...]:
+    return (
+        f"{point.name}, SH {part.sh_degree}",
+        str(part.size_bytes),
+        f"{100.0 * part.size_bytes / point.size_bytes:.1f} %",
+        f"{part.psnr:.2f}",
+        f"{part.psnr_worst:.2f}",
+        "-" if part.ssim is None else f"{part.ssim:.4f}",
+        f"{1000.0 * part.decode_seconds:.1f}",
+        f"{part.render_milliseconds:.1f}",
+    )
+
+
+def _presets(tradeoff: Tradeoff) -> list[Point]:
+    return [one for one in tradeoff.measured if one.family == "presets"]
+
+
+def _line_seconds(size_bytes: int) -> float:
+    return 8.0 * size_bytes / (_LINE_MBITS * 1e6)
+
+
+def _milliseconds(mode: str) -> Callable[[Point], float | None]:
+    return lambda one: one.modes[mode].milliseconds
