@@ -12,8 +12,10 @@ from csplat.errors import InputError
 from csplat_tools.console import format_bytes, format_table, guarded, note, progress_bar, say_json
 from csplat_tools.convert import Encoded, SceneFacts, encode_file
 from csplat_tools.inout import STANDARD_STREAM, check_outputs
+from csplat_tools.reducing import Reducing
 from csplat_tools.simplifying import DEFAULT_VIEWS, Simplifying
 from csplat_tools.targeting import Targeting, target_lines
+from csplat_tools.ways import Ways
 
 __all__ = ["encode"]
 
@@ -24,6 +26,7 @@ _SHAPE = "Codebook of shapes (wants --importance of `csplat sensitivity`)"
 _CODING = "Coding"
 _TARGET = "Targets: the encoder chooses, and judges the file (sizes and PSNRs need the render extra)"
 _VIEWS = "Views that judge and decide, for targets and simplification; else virtual ones"
+_SIMPLE = "Simple strategies, for comparison: each costs more than a target or --simplify does"
 _LESS = "Simplification (needs the render extra)"
 
 
@@ -165,6 +168,24 @@ def encode(
         int | None,
         typer.Option(min=1, rich_help_panel=_CODING, help="Threads, one per core by default; the bytes stay the same."),
     ] = None,
+    prune_opacity: Annotated[
+        float | None, typer.Option(metavar="ALPHA", rich_help_panel=_SIMPLE, help="Leave out splats up to this alpha.")
+    ] = None,
+    distil_sh: Annotated[
+        bool,
+        typer.Option("--distil-sh", rich_help_panel=_SIMPLE, help="Fit --sh-degree to renders instead of cutting off."),
+    ] = False,
+    kmeans: Annotated[
+        str | None,
+        typer.Option(
+            metavar="256|means=4096,...",
+            rich_help_panel=_SIMPLE,
+            help="Cluster attributes: entries of each, or below 1 the share of its variance that may be lost.",
+        ),
+    ] = None,
+    residual_stages: Annotated[
+        int | None, typer.Option(metavar="1..4", rich_help_panel=_SIMPLE, help="Codebooks one after the other.")
+    ] = None,
     simplify: Annotated[
         bool, typer.Option("--simplify", rich_help_panel=_LESS, help="Remove what pictures need least, fit colours.")
     ] = False,
@@ -205,6 +226,7 @@ def encode(
       csplat encode scene.ply scene.csplat --target-psnr 42 --keep-all
       csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
       csplat encode scene.ply scene.csplat --simplify --keep 0.5
+      csplat encode scene.ply scene.csplat --prune-opacity 0.005 --sh-degree 0
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
     try:
@@ -239,18 +261,14 @@ def encode(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    wanted = Simplifying(keep, max_loss, target_psnr, cameras, data, views, threads)
-    target_asked = Targeting(target_size, target_psnr, max_error, keep_all, importance, cameras, data, views, threads)
-    _check_ways(simplify, wanted, target_asked)
-    if simplify and importance is not None:
-        raise typer.BadParameter("--simplify measures the importance of splats itself")
-    if prune_unseen and importance is None:
-        raise typer.BadParameter("--prune-unseen wants --importance, which says what was seen")
-    if prune_unseen and target_asked.asked:
-        raise typer.BadParameter("--prune-unseen and a target: a target chooses itself what is left out")
-    encoder = wanted.encoder(quiet=quiet) if simplify else None
-    if target_asked.asked and not simplify:
-        encoder = target_asked.encoder(quiet=quiet)
+    ways = Ways(
+        simplify,
+        Simplifying(keep, max_loss, target_psnr, cameras, data, views, threads),
+        Targeting(target_size, target_psnr, max_error, keep_all, importance, cameras, data, views, threads),
+        Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, sh_degree, seed, threads),
+        prune_unseen,
+    )
+    encoder = ways.encoder(quiet=quiet)
     if as_json and target == STANDARD_STREAM:
         raise typer.BadParameter("--json and - both want standard output")
     if source_index == STANDARD_STREAM:
@@ -279,18 +297,6 @@ def encode(
             note(line)
         if not quiet:
             _report(encoded)
-
-
-def _check_ways(simplify: bool, wanted: Simplifying, target: Targeting) -> None:
-    """Refuse options that say nothing together."""
-    if simplify and (target.size is not None or target.max_error is not None):
-        raise typer.BadParameter("--simplify has --keep, --max-loss and --target-psnr, and no other targets")
-    if not simplify and (wanted.keep is not None or wanted.max_loss is not None):
-        raise typer.BadParameter("--keep and --max-loss say nothing without --simplify")
-    if not simplify and not target.asked and (wanted.cameras is not None or wanted.data is not None):
-        raise typer.BadParameter("--cameras and --data say nothing without a target or --simplify")
-    if target.keep_all and (simplify or not target.asked):
-        raise typer.BadParameter("--keep-all says nothing without a target, and contradicts --simplify")
 
 
 def _report(encoded: Encoded) -> None:

@@ -50,9 +50,8 @@ class Chooser:
         encoding = self.encoding
         if not self._degree() or encoding.sh_coding == "none":
             return Choice("none")
-        if encoding.sh_coding == "scalar" or PRESETS[encoding.preset].sh_coding == "scalar":
-            return Choice(encoding.sh_coding if encoding.sh_coding == "codebook" else "scalar")
-        return Choice("codebook", _FIRST_SHARE)
+        coding = PRESETS[encoding.preset].sh_coding if encoding.sh_coding == "auto" else encoding.sh_coding
+        return Choice("scalar") if coding == "scalar" else Choice("codebook", _FIRST_SHARE)
 
     def best(self, part: Part, quality: float, goal: float | None, start: Trial | None = None) -> Choice:
         """Compare.

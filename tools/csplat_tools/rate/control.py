@@ -40,7 +40,8 @@ _LOSS = (4.0, 9.0)  # dB between what each attribute keeps by itself and what al
 _PSNR = (0.0, 0.25, 0.1)  # dB above the target: from, to, aimed at
 _SIZE = (0.97, 1.0, 0.987)  # of the target: from, to, aimed at
 _TRIES = 7
-_MOST_CAMERAS = 24  # of the user's own
+_MOST_CAMERAS = 24  # of the user's own judge
+_ENOUGH_CAMERAS = 40  # of the user's own decide what is left out; fewer would only keep what they show
 _STARVED = 30.0  # quality below which a size is better met by fewer splats
 _REMOVED = (0.6, 0.25)  # of the error that a PSNR allows, at most; the second where the first was too much
 _USUAL = ((6.5, 43.0), (7.2, 43.0))  # bytes per splat at a quality, without and with SH
@@ -68,7 +69,8 @@ def encode_to_target(
         target: what is asked for.
         encoding: knobs that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
         cameras: from where renders of file and source are compared, relative to the source's origin; at most 24 of
-            them, evenly chosen. None for the virtual ones of `psnr`.
+            them, evenly chosen. None for the virtual ones of `psnr`. If they are 40 or more, they also decide which
+            splats are left out; else virtual views do.
         background: red, green, blue behind everything.
         prune: splats may be left out that are not worth their bits; not where largest errors are bounded.
         views: virtual views at most that decide which.
@@ -96,7 +98,8 @@ def encode_to_target(
     pruner = None
     if prune and not target.max_error and encoding.preset != "fast" and not encoding.keep_extra:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
-        pruner = Pruner(source, None if cameras is None else list(cameras), options, progress)
+        deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
+        pruner = Pruner(source, deciding, options, progress)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
     removal_views = 0 if pruner is None else pruner.renders
@@ -148,14 +151,16 @@ class _Search:
     def at_size(self, goal: int) -> Trial:
         """The file within a size whose renders are best."""
         whole = Part(self.source)
-        first = self._with_size(whole, self.chooser.first(), goal, self._guess(goal))
-        if first is None or first.quality < _STARVED:
-            return self._starved(goal, first)
-        choice = self.chooser.best(whole, first.quality, None, first)
-        best = first if choice == first.choice else self._with_size(whole, choice, goal, first.quality)
-        best = self.trials.judged(first if best is None else best)
+        best = self._with_size(whole, self.chooser.first(), goal, self._guess(goal))
+        if best is None and self.source.sh_degree and self.encoding.sh_coding == "auto":
+            best = self._with_size(whole, Choice("none", degree=0), goal, _QUALITIES[0])
+        if best is not None:
+            choice = self.chooser.best(whole, best.quality, None, best)
+            best = self._better(self.trials.judged(best), self._with_size(whole, choice, goal, best.quality))
         if self.pruner is None:
-            return best
+            return self._found(best, goal)
+        if best is None or best.quality < _STARVED:
+            return self._starved(self.pruner, goal, best)
         part = self.pruner.at_size(best.psnr, self.chooser.floor(best), self._slope(best), self.trials.seen)
         if part is None:
             return best
@@ -163,16 +168,13 @@ class _Search:
         choice = self.chooser.best(part, finer, None)
         return self._better(best, self._with_size(part, choice, goal, finer))
 
-    def _starved(self, goal: int, first: Trial | None) -> Trial:
+    def _starved(self, pruner: Pruner, goal: int, whole: Trial | None) -> Trial:
         """Fewer and fewer splats, as long as pictures gain by what that leaves for the others."""
-        best = None if first is None else self.trials.judged(first)
-        if self.pruner is None:
-            return self._found(best, goal)
-        smallest = min(self.trials.made, key=lambda trial: trial.size_bytes)
-        left = int(len(self.source) * (_FEWER if best is not None else _FEWER * goal / smallest.size_bytes))
+        best, smallest = whole, min(self.trials.made, key=lambda trial: trial.size_bytes)
+        left = int(len(self.source) * _FEWER * min(1.0, goal / smallest.size_bytes))
         choice, quality, before = self.chooser.first(), smallest.quality, len(self.source)
         while left >= 1:
-            part = self.pruner.to_count(left)
+            part = pruner.to_count(left)
             if len(part.model) >= before:
                 break  # nobody saw the others
             trial = self._with_size(part, choice, goal, max(quality, _STARVED))
@@ -180,7 +182,7 @@ class _Search:
                 trial = self.trials.judged(trial)
                 if best is not None and trial.psnr <= best.psnr:
                     break
-                if best is first and trial.choice == self.chooser.first():
+                if best is whole:
                     choice = self.chooser.best(part, trial.quality, None, trial)
                     trial = self._better(trial, self._with_size(part, choice, goal, trial.quality))
                 best, quality = trial, trial.quality

@@ -1,0 +1,73 @@
+"""Which of its ways `csplat encode` goes: plainly, to a target, simplified, or by simple strategies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import typer
+
+from csplat_tools.convert import Encoder
+from csplat_tools.reducing import Reducing
+from csplat_tools.simplifying import Simplifying
+from csplat_tools.targeting import Targeting
+
+__all__ = ["Ways"]
+
+
+@dataclass(frozen=True)
+class Ways:
+    """What a command line says of all of them.
+
+    Attributes:
+        simplify: whether to simplify. simplifying: how.
+        targeting: the targets.
+        reducing: the simple strategies.
+        prune_unseen: whether what `importance` did not see goes.
+    """
+
+    simplify: bool
+    simplifying: Simplifying
+    targeting: Targeting
+    reducing: Reducing
+    prune_unseen: bool
+
+    def encoder(self, *, quiet: bool) -> Encoder | None:
+        """Return what makes a file of a scene; None for the plain encoder.
+
+        Raises:
+            InputError: the renderer is wanted and not installed.
+            typer.BadParameter: options contradict each other, or say nothing.
+        """
+        self._check()
+        if self.simplify:
+            return self.simplifying.encoder(quiet=quiet)
+        if self.targeting.asked:
+            return self.targeting.encoder(quiet=quiet)
+        return self.reducing.encoder(quiet=quiet) if self.reducing.asked else None
+
+    def _check(self) -> None:
+        simplifying, target, reducing = self.simplifying, self.targeting, self.reducing
+        importance = target.importance is not None
+        looks = target.cameras is not None or target.data is not None
+        both = (self.simplify or target.asked) and reducing.asked
+        refused = (
+            (self.simplify and (target.size is not None or target.max_error is not None),
+             "--simplify has --keep, --max-loss and --target-psnr, and no other targets"),
+            (not self.simplify and (simplifying.keep is not None or simplifying.max_loss is not None),
+             "--keep and --max-loss say nothing without --simplify"),
+            (both, "--prune-opacity, --distil-sh and --kmeans go with neither a target nor --simplify: those choose"),
+            (looks and not (self.simplify or target.asked or reducing.asked),
+             "--cameras and --data say nothing without a target, --simplify or --distil-sh"),
+            (target.keep_all and (self.simplify or not target.asked),
+             "--keep-all says nothing without a target, and contradicts --simplify"),
+            (self.simplify and importance, "--simplify measures the importance of splats itself"),
+            (reducing.asked and importance, "--prune-opacity, --distil-sh and --kmeans do not look at --importance"),
+            (self.prune_unseen and not importance, "--prune-unseen wants --importance, which says what was seen"),
+            (self.prune_unseen and target.asked,
+             "--prune-unseen and a target: a target chooses itself what is left out"),
+            (reducing.residual_stages is not None and reducing.kmeans is None,
+             "--residual-stages says nothing without --kmeans"),
+        )  # fmt: skip
+        for wrong, why in refused:
+            if wrong:
+                raise typer.BadParameter(why)
