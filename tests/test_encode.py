@@ -383,13 +383,28 @@ def test_progress_names_its_stages_and_ends_at_one(make_model):
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 
 
-def test_huge_values_that_coarsen_their_tile_are_named(make_model):
+def test_huge_values_get_tiles_of_their_own_and_are_named(make_model):
     model = make_model(300, 1)
     assert () == encode_with_report(model).report.notes
     rest = model.shN.copy()
     rest[5] = 1e9
-    (note,) = encode_with_report(replace(model, shN=rest)).report.notes
-    assert note.startswith("shN: huge values coarsen 1 of 1 tiles")
+    result = encode_with_report(replace(model, shN=rest), EncodeOptions(sh_coding="scalar"))
+    (note,) = result.report.notes
+    assert note.startswith("shN: huge values coarsen 1 of 2 tiles")
+    others = result.source_index != 5
+    error = np.abs(csplat.decode(result.data).shN - rest[result.source_index])[others]
+    assert error.max() <= encode_with_report(model, EncodeOptions(sh_coding="scalar")).report.errors["sh1"][0]
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_sh_that_no_codebook_can_escape_is_coded_by_itself(make_model, preset):
+    model = make_model(600, 2)
+    rest = model.shN.copy()
+    rest[5] = 3e38
+    _, result = round_trip(replace(model, shN=rest), preset=preset)
+    assert "scalar" == result.report.options["sh_coding"]
+    with pytest.raises(InputError, match="use scalar SH coding"):
+        encode_with_report(replace(model, shN=rest), EncodeOptions(preset=preset, sh_coding="codebook"))
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)

@@ -20,6 +20,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `infinite-logits` | opacities of exactly 0 or 1 | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
+| `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
 | `shuffled-columns` | columns in another order than usual | note |
 | `double-means` | positions in double precision: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |

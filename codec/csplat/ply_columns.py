@@ -30,6 +30,9 @@ LOGIT_OF_1 = 20.0
 #: scale of the file.
 _FLAT_SCALE_STEP = 4.605170
 
+_HUGE_LOG = 88.0  # standard deviations beyond leave float32
+_HUGE_COLOUR = 1e6
+
 
 @dataclass(eq=False)
 class Arrays:
@@ -54,6 +57,7 @@ class _Counts:
     unnormalised: int = 0
     infinite_logits: int = 0
     normals: int = 0
+    huge: int = 0
 
 
 def gather(
@@ -207,7 +211,19 @@ def _repair(part: Arrays, scale_count: int, counts: _Counts) -> int:
         counts.infinite_logits += int(np.count_nonzero(np.isinf(part.opacities)))
     part.opacities[:] = alpha_of_logits(part.opacities)
     _repair_quats(part.quats, counts)
+    counts.huge += _huge_rows(part, scale_count)
     return len(part.opacities)
+
+
+def _huge_rows(part: Arrays, scale_count: int) -> int:
+    """Count splats with values that no picture can be meant by."""
+    looked_at = ((part.scales[:, :scale_count], _HUGE_LOG), (part.sh0, _HUGE_COLOUR), (part.shN, _HUGE_COLOUR))
+    huge = None
+    for array, limit in looked_at:
+        if max(float(array.max(initial=0.0)), -float(array.min(initial=0.0))) > limit:
+            found = np.abs(array).reshape(len(array), -1).max(axis=1) > limit
+            huge = found if huge is None else huge | found
+    return 0 if huge is None else int(np.count_nonzero(huge))
 
 
 def _repair_quats(quats: F32, counts: _Counts) -> None:
@@ -250,6 +266,12 @@ def _findings(counts: _Counts) -> list[Finding]:
             "nonzero-normals",
             counts.normals,
             f"{counts.normals} splats have normals, which splats do not use: dropped",
+            "note",
+        ),
+        Finding(
+            "huge-values",
+            counts.huge,
+            f"{counts.huge} splats have log scales beyond ± {_HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}",
             "note",
         ),
     ]

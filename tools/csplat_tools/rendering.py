@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -121,23 +122,25 @@ def render_folder(
     need_pictures()
     names = picture_names([camera.image for camera in cameras])
     endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
+    is_new = not Path(folder).exists()
     target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
-    if prepare is not None:
-        prepare()
     files, ignored = [], 0
-    for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        if progress is not None:
-            progress("rendering", number / len(cameras))
-        result = render(model, camera, background=background, mode=mode)
-        ignored = max(ignored, result.ignored)
-        files.append(target / f"{name}.png")
-        write_png(files[-1], to_bytes(result.rgb))
-        if alpha:
-            files.append(target / f"{name}.alpha.png")
-            write_png(files[-1], to_bytes(result.alpha))
-        if depth:
-            files.append(target / f"{name}.depth.npy")
-            write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
+    with _removed_if_empty(target if is_new else None):
+        if prepare is not None:
+            prepare()
+        for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+            if progress is not None:
+                progress("rendering", number / len(cameras))
+            result = render(model, camera, background=background, mode=mode)
+            ignored = max(ignored, result.ignored)
+            files.append(target / f"{name}.png")
+            write_png(files[-1], to_bytes(result.rgb))
+            if alpha:
+                files.append(target / f"{name}.alpha.png")
+                write_png(files[-1], to_bytes(result.alpha))
+            if depth:
+                files.append(target / f"{name}.depth.npy")
+                write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
     if progress is not None:
         progress("rendering", 1.0)
     return Rendered(tuple(files), ignored)
@@ -186,6 +189,18 @@ def render_film(
         progress("rendering", 1.0)
     write_film(path, frames, fps)
     return Rendered((Path(path),), ignored)
+
+
+@contextmanager
+def _removed_if_empty(folder: Path | None) -> Iterator[None]:
+    """Leave no empty folder behind where the first picture is refused."""
+    try:
+        yield
+    except BaseException:
+        if folder is not None:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
+        raise
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:

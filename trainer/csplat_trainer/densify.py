@@ -23,6 +23,7 @@ F64 = NDArray[np.float64]
 _LARGE = 0.01  # of the extent: larger splats are split, smaller ones cloned
 _SHRINK = 1.6  # of the two halves of a split
 _RESET_ALPHA = 0.01
+_LARGEST_LOG = 60.0  # of a scale whose halves stay within float32
 
 
 @dataclass
@@ -119,6 +120,7 @@ def _halves(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
         ],
         1,
     )
-    drawn = rng.standard_normal((2, len(quats), 3)) * np.exp(scales.astype(np.float64))
+    deviations = np.exp(np.minimum(scales.astype(np.float64), _LARGEST_LOG))
+    drawn = rng.standard_normal((2, len(quats), 3)) * deviations
     first, second = (np.einsum("nij,nj->ni", rotation, one).astype(np.float32) for one in drawn)
     return first, second

@@ -24,6 +24,8 @@ __all__ = ["CpuEngine", "Engine"]
 
 F32 = NDArray[np.float32]
 
+_LARGEST_LOG = 40.0  # of a log scale whose slope Adam can square in float32
+
 
 class Engine(Protocol):
     """What trains: the numba kernels of the CPU, or gsplat's on a GPU."""
@@ -189,4 +191,4 @@ def _chain(
         by_logit[i] = (by_alpha[i] + opacity_weight) * alpha * (np.float32(1.0) - alpha)
         if scale_weight > np.float32(0.0):
             for k in range(3):
-                by_scale[i, k] += scale_weight * np.exp(scales[i, k])
+                by_scale[i, k] += scale_weight * np.exp(min(scales[i, k], np.float32(_LARGEST_LOG)))

@@ -146,6 +146,8 @@ def _noise(means: F32, quats: F32, scales: F32, logits: F32, strength: np.float3
         l0 = (r00 * n0 + r10 * n1 + r20 * n2) * min(gate * s0, _FARTHEST) * s0
         l1 = (r01 * n0 + r11 * n1 + r21 * n2) * min(gate * s1, _FARTHEST) * s1
         l2 = (r02 * n0 + r12 * n1 + r22 * n2) * min(gate * s2, _FARTHEST) * s2
-        means[i, 0] += r00 * l0 + r01 * l1 + r02 * l2
-        means[i, 1] += r10 * l0 + r11 * l1 + r12 * l2
-        means[i, 2] += r20 * l0 + r21 * l1 + r22 * l2
+        m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
+        m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
+        m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
+        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # a splat as wide as float32 stays where it is
+            means[i, 0], means[i, 1], means[i, 2] = m0, m1, m2

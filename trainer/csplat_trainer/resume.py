@@ -50,5 +50,5 @@ def _fit_degree(part: Splats, degree: int) -> None:
 
 def _most_visible(parameters: Parameters, count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     longer = np.sort(parameters.values["scales"].astype(np.float64), axis=1)[:, 1:]
-    weight = parameters.alphas * np.exp(longer.sum(axis=1))
+    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # below the end of float64
     return np.sort(np.argsort(-weight, kind="stable")[:count])

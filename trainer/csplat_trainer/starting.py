@@ -100,7 +100,7 @@ def starting_splats(
         colours: [P, 3] in 0..1, their colours.
 
     Raises:
-        InputError: there are no points, or no masks, to start from.
+        InputError: there are no points, or no masks, to start from; or points that are not finite.
     """
     have_points = points is not None and len(points) > 0
     have_masks = any(picture.has_alpha for picture in pictures)
@@ -110,14 +110,17 @@ def starting_splats(
         raise InputError("the pictures have no alpha channel to make a hull of: wanted --init points or box")
     if have_points and init in ("points", "auto"):
         assert points is not None
-        means, colour = _at_points(points, colours, count, rng)
+        bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
+        if bad:
+            raise InputError(f"{bad} of the data set's {len(points)} points are NaN or infinite: wanted finite ones")
+        means, colour = _at_points(points, colours, count, scene, rng)
     else:
         masked = have_masks and init in ("hull", "auto")
         means, colour = _in_box(pictures, scene, count, rng, masked=masked)
-    return _splats(means, colour, sh_degree, rng)
+    return _splats(means, colour, sh_degree, scene, rng)
 
 
-def _at_points(points: F32, colours: F32 | None, count: int, rng: Generator) -> tuple[F64, F64]:
+def _at_points(points: F32, colours: F32 | None, count: int, scene: Scene, rng: Generator) -> tuple[F64, F64]:
     """Some of the points, or all of them and more beside them where more are wanted."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
@@ -125,7 +128,7 @@ def _at_points(points: F32, colours: F32 | None, count: int, rng: Generator) -> 
     colour = np.full((len(points), 3), 0.5) if colours is None else np.asarray(colours, np.float64)
     beside = np.arange(len(chosen)) >= len(points)
     if beside.any():
-        spread = _neighbour_distances(points.astype(np.float64))[chosen[beside]]
+        spread = _neighbour_distances(points.astype(np.float64), scene)[chosen[beside]]
         means[beside] += rng.standard_normal((int(beside.sum()), 3)) * spread[:, None]
     return means, colour[chosen]
 
@@ -179,9 +182,9 @@ def _pixels_at(picture: Picture, points: F64) -> tuple[NDArray[np.int64], F64]:
     return inside, picture.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
 
 
-def _splats(means: F64, colour: F64, sh_degree: int, rng: Generator) -> Splats:
+def _splats(means: F64, colour: F64, sh_degree: int, scene: Scene, rng: Generator) -> Splats:
     count = len(means)
-    spacing = np.log(_neighbour_distances(means)).astype(np.float32)
+    spacing = np.log(_neighbour_distances(means, scene)).astype(np.float32)
     quats = rng.standard_normal((count, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return {
@@ -194,12 +197,16 @@ def _splats(means: F64, colour: F64, sh_degree: int, rng: Generator) -> Splats:
     }
 
 
-def _neighbour_distances(points: F64) -> F64:
-    """Root mean square distance to the nearest three others, never 0."""
+def _neighbour_distances(points: F64, scene: Scene) -> F64:
+    """Root mean square distance to the nearest three others, never 0.
+
+    Where most points have others in the very same place, that says nothing: then as if they filled the scene's box.
+    """
+    evenly = 2.0 * scene.half / max(1, len(points)) ** (1.0 / 3.0)
     if len(points) < 2:
-        return np.ones(len(points))
+        return np.full(len(points), evenly)
     k = min(_NEIGHBOURS, len(points) - 1)
     distances = KDTree(points).query(points, k + 1)[0][:, 1:]
     spacing: F64 = np.sqrt(np.square(distances).mean(axis=1))
-    floor = 1e-4 * max(float(np.median(spacing)), 1e-9)
-    return np.maximum(spacing, floor)
+    typical = float(np.median(spacing))
+    return np.maximum(spacing, 1e-4 * typical) if typical > 0.0 else np.where(spacing > 0.0, spacing, evenly)

@@ -16,7 +16,7 @@ from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
 from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
-from csplat.encoder.quantise import colour_integers
+from csplat.encoder.quantise import colour_integers, largest_exact
 from csplat.encoder.sparse import zero_book, zero_or_value_block
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
@@ -96,10 +96,10 @@ def choose_sh(
     scalar = Books(replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), tables)
     if plan.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
         return scalar
-    if plan.sh_coding == "auto" and len(model) < _LEAST:
-        return scalar
     fine = replace(plan, sh_coding="codebook", sh_step=plan.codebook_step)
     kept = (plan.sh_degree + 1) ** 2 - 1
+    if plan.sh_coding == "auto" and (len(model) < _LEAST or not _escapes_fit(model.shN[:, :kept], fine)):
+        return scalar
     judge = _Judge(weights, None if metric is None else metric.first(kept), measured)
     stages = _train(model, judge, fine, options, threads, report)
     books = _books(tables, stages, fine)
@@ -202,6 +202,11 @@ def _sizes(count: int, plan: Plan, options: EncodeOptions) -> tuple[int, ...]:
         wanted = max(count * plan.codebook_share, min(_ENOUGH * plan.codebook_share, count / _USERS))
         size = 1 << min(max(round(math.log2(max(1.0, wanted))), 4), 13)
     return (size,) * (options.codebook_stages or 1)
+
+
+def _escapes_fit(shN: F32, plan: Plan) -> bool:
+    """Whether every splat could be coded directly beside a codebook, whose lattice no tile makes coarser."""
+    return 2.0 * float(max(shN.max(initial=0.0), -shN.min(initial=0.0))) < largest_exact(plan.sh_step)
 
 
 def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan, judge: _Judge) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.encoder.apart import cut_scene
 from csplat.encoder.between import Between
 from csplat.encoder.codebook import Books, choose_sh, with_zero_books
 from csplat.encoder.container import write
@@ -25,7 +26,7 @@ from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, fi
 from csplat.encoder.shape_codebook import choose_shapes
 from csplat.encoder.shape_tables import SHAPE_BOOK, ShapeTables, shape_book
 from csplat.encoder.tile import EncodedTile, encode_tile
-from csplat.encoder.tiling import Tile, cut
+from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
 
 __all__ = ["Decisions", "EncodeReport", "EncodeResult", "decide", "encode", "encode_with_report", "write_decided"]
@@ -139,7 +140,7 @@ def decide(
     options = options or EncodeOptions()
     plan = make_plan(model, options, importance_given=importance is not None)
     extras = extra_columns(model, options)
-    tiles = cut(model.means, plan.lattice, plan.tile_splats)
+    tiles = cut_scene(model, plan)
     shapes = None
     if options.shape_codebook_size and len(model):
         by_shape = shape_weights(model, importance)

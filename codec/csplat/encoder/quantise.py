@@ -17,6 +17,7 @@ __all__ = [
     "check_finite",
     "colour_integers",
     "colour_lifted",
+    "largest_exact",
     "lattice_exponent",
     "lattice_step",
     "lattice_values",
@@ -53,6 +54,11 @@ def lattice_exponent(largest: float, step: float) -> int:
     """
     ratio = largest / step
     return 0 if ratio < _WIDE else math.ceil(math.log2(ratio / _WIDE)) + 1
+
+
+def largest_exact(step: float) -> float:
+    """Return the magnitude from which on `lattice_exponent` is above 0."""
+    return _WIDE * step
 
 
 def lattice_values(n: Integers, step: float) -> F32:

@@ -30,6 +30,7 @@ I64 = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
 _TRIES = 3  # fits on the way to a target PSNR
+_BANDS_WORTH = 1.0  # dB that absent SH bands may cost; a fit that loses more has failed
 _PSNR_VIEWS = (8, 640, 480)  # those of `psnr`
 
 
@@ -201,8 +202,9 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
         "fit_errors": [list(errors) for errors in fitted.errors],
     }
     model, stays = fitted.model, fitted.stays
-    if report["check_psnr"] < report["check_psnr_pruned"] and session.options.refit and stays is None:
-        model = pruned  # overfitted: what was not looked at is worse than before
+    worth = 0.0 if stays is None else _BANDS_WORTH
+    if report["check_psnr"] < report["check_psnr_pruned"] - worth and session.options.refit:
+        model, stays = pruned, None  # overfitted: what was not looked at is worse than before
         report["check_psnr"], report["refit_refused"] = report["check_psnr_pruned"], True
     if judge is not None:
         report["psnr_pruned"], report["psnr"] = judge.psnr(pruned), judge.psnr(model)

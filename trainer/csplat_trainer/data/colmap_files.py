@@ -106,7 +106,7 @@ def read_points(path: Path) -> tuple[F32, F32]:
 
     Returns:
         Points, [P, 3] float32, and their colours, [P, 3] float32 in 0..1. Points that are not
-        finite are left out.
+        finite, or beyond float32, are left out.
     """
     points: list[tuple[float, ...]] = []
     if path.suffix == ".txt":
@@ -122,8 +122,10 @@ def read_points(path: Path) -> tuple[F32, F32]:
             points.append((x, y, z, red, green, blue))
         data.end()
     table = np.array(points, np.float64).reshape(-1, 6)
-    table = table[np.isfinite(table).all(axis=1)]
-    return table[:, :3].astype(np.float32), (np.clip(table[:, 3:], 0.0, 255.0) / 255.0).astype(np.float32)
+    with np.errstate(over="ignore"):
+        points32 = table[:, :3].astype(np.float32)
+    good = np.isfinite(points32).all(axis=1) & np.isfinite(table).all(axis=1)
+    return points32[good], (np.clip(table[good, 3:], 0.0, 255.0) / 255.0).astype(np.float32)
 
 
 class _Bytes:

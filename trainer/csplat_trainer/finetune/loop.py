@@ -128,7 +128,7 @@ class _Run:
         self._scene = TunedScene(frozen)
         self._rasteriser = Rasteriser(threads=threads)
         self._antialiased = frozen.decided.model.antialiased
-        self._extent = float(np.exp(np.median(np.median(frozen.decided.model.scales, axis=1))))
+        self._extent = float(np.exp(np.clip(np.median(np.median(frozen.decided.model.scales, axis=1)), -80.0, 80.0)))
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _Buffers] = {}
@@ -202,6 +202,8 @@ class _Run:
         buffers = self._buffers(view)
         value, slope = buffers.loss(rendered, view.picture(self._views.background, buffers.wanted))
         if not math.isfinite(value.loss):
+            if self._iteration == 1:  # before anything has moved
+                raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._costs)
         self._log["losses"].append(float(f"{value.loss:.6g}"))

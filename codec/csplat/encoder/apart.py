@@ -1,0 +1,76 @@
+"""Tiles of a whole scene: splats with huge values get tiles of their own, as far outliers do (tiling.py).
+
+A tile's lattices grow coarser until the largest value fits 32 bits. One exploded colour would take those of up to
+65,535 neighbours along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.plan import Plan
+from csplat.encoder.quantise import largest_exact
+from csplat.encoder.tiling import Tile, cut
+from csplat.model import SplatModel
+
+__all__ = ["cut_scene"]
+
+F32 = NDArray[np.float32]
+Flags = NDArray[np.uint8]
+
+_BLOCK = 1 << 14  # splats that are looked at at a time
+
+
+def cut_scene(model: SplatModel, plan: Plan) -> list[Tile]:
+    """Cut a scene into tiles.
+
+    Args:
+        model: the scene.
+        plan: lattices and tile size.
+
+    Returns:
+        As `cut`, and after those the tiles of splats some of whose values their lattices hold with coarser steps
+        only, those alike in which attributes that are together.
+    """
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    # Colours go through sums and differences of two channels.
+    looked_at = (
+        (model.scales, largest_exact(plan.scale_step)),
+        (model.sh0, largest_exact(plan.sh0_step) / 2.0),
+        (model.shN[:, :kept], largest_exact(min(plan.sh_step, plan.codebook_step)) / 2.0),
+    )
+    kinds: Flags | None = None
+    for bit, (values, limit) in enumerate(looked_at):
+        if _may_exceed(values, limit):
+            kinds = np.zeros(len(model), np.uint8) if kinds is None else kinds
+            kinds |= _exceeds(values, limit).view(np.uint8) << np.uint8(bit)
+    if kinds is None or not kinds.any():
+        return cut(model.means, plan.lattice, plan.tile_splats)
+    tiles: list[Tile] = []
+    for kind in np.unique(kinds):
+        rows = np.flatnonzero(kinds == kind)
+        tiles += (
+            replace(tile, rows=rows[tile.rows]) for tile in cut(model.means[rows], plan.lattice, plan.tile_splats)
+        )
+    return tiles
+
+
+def _may_exceed(values: F32, limit: float) -> bool:
+    """Whether a value may reach the limit: one pass over memory, without a mask, by the sum of squares."""
+    flat: NDArray[Any] = values.reshape(-1) if values.flags.c_contiguous else values
+    with np.errstate(over="ignore"):
+        axes = "ijk"[: flat.ndim]
+        return not 4.0 * float(np.einsum(f"{axes},{axes}->", flat, flat)) < limit * limit  # float32 sums lose digits
+
+
+def _exceeds(values: F32, limit: float) -> NDArray[np.bool_]:
+    """[N], whether any value of a row reaches the limit."""
+    found = np.zeros(len(values), bool)
+    for at in range(0, len(values), _BLOCK):
+        part = values[at : at + _BLOCK]
+        found[at : at + _BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
+    return found

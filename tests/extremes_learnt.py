@@ -1,0 +1,101 @@
+"""What learning makes of scenes at the extremes: simplified, trained on, tuned. Wants the extra [render].
+
+`python tests/extremes_learnt.py` prints the figures of the guide's second table.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from extremes import COUNT, DRAWN, NAMES, judge, scene
+
+from csplat import EncodeOptions, SplatModel, decode
+from csplat.encoder.freezing import Frozen, encode_frozen, freeze
+from csplat_render.rasterise import Rasteriser
+from csplat_render.virtual import virtual_cameras
+from csplat_tools.simplify import Simplified, SimplifyOptions, Target, simplify
+from csplat_tools.simplify.judge import Judge
+from csplat_trainer.data import DataSet
+from csplat_trainer.finetune import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
+from csplat_trainer.loop import train
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.outputs import TrainResult
+from csplat_trainer.pictures import Picture
+
+COPIES = 2_000  # of a million: learning looks at each splat again and again, and all are alike
+SMALL = (160, 120)
+FEW = SimplifyOptions(views=10, view_size=(60, 45))
+QUICK = TrainOptions(
+    max_splats=COUNT, sh_degree=1, iterations=120, refine_start=20, refine_every=20, log_every=40, background="black"
+)
+SHORT = FinetuneOptions(iterations=250, warm_up=10, validate_every=50, log_every=50)
+COARSE = EncodeOptions(preset="small", quality=36.0)
+BLACK = np.zeros(3, np.float32)
+
+
+def learnt_from(name: str) -> SplatModel:
+    """The scene, in fewer copies where it is a million."""
+    return scene(name)[0].select(slice(COPIES))
+
+
+@cache
+def small_judge(name: str) -> Judge:
+    """Who compares pictures of 160×120 with those of the scene."""
+    if name in DRAWN:
+        return judge(name, SMALL)
+    model = learnt_from(name)
+    return Judge.of_source(model, virtual_cameras(model, 8, *SMALL), (0.0, 0.0, 0.0))
+
+
+@cache
+def half(name: str) -> Simplified:
+    """The scene with half its splats."""
+    return simplify(learnt_from(name), target=Target(keep=0.5), options=FEW)
+
+
+def photographs(name: str, points: np.ndarray | None = None) -> DataSet:
+    """Photographs of a scene in front of black, and points."""
+    model, rasteriser, shots = learnt_from(name), Rasteriser(gradients=False), []
+    for camera in virtual_cameras(model, 12, 48, 40):
+        pixels = np.clip(rasteriser.forward(model, camera).rgb, 0.0, 1.0)
+        shots.append(Picture(camera, np.rint(pixels * 255).astype(np.uint8)))
+    return DataSet("made", shots[:9], shots[9:], points)
+
+
+@cache
+def trained(name: str) -> TrainResult:
+    """Splats that began at the centres of the scene's, and learnt from photographs of it."""
+    return train(photographs(name, learnt_from(name).means[:COUNT]), QUICK)
+
+
+@cache
+def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
+    """The scene, tuned as a file, and who judges it by pictures that were kept aside."""
+    source = learnt_from(name)
+    views = split_views(renders_of(source, virtual_cameras(source, 52, 48, 36), BLACK, None), BLACK, aside=4)
+    frozen = freeze(source, COARSE)
+    aside = Judge([view.camera for view in views.validation], [view.wanted for view in views.validation])
+    return frozen, finetune(frozen, views, SHORT), aside
+
+
+def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:
+    """What the file decodes to without and with tuning."""
+    frozen, result, _ = tuned(name)
+    before, after = (decode(encode_frozen(frozen, held).data) for held in (frozen.start(), result.held))
+    return before, after
+
+
+def figures(name: str) -> list[str]:
+    """The row of a condition in the guide's second table."""
+    losses = trained(name).log["losses"]
+    cells = [name, f"{small_judge(name).psnr(half(name).model):.1f}"]
+    cells.append(f"{np.mean(losses[:10]):.2f} → {np.mean(losses[-10:]):.2f}")
+    if name == "exploded":
+        return [*cells, "refused"]
+    return [*cells, " → ".join(f"{tuned(name)[2].psnr(model):.1f}" for model in before_and_after(name))]
+
+
+if __name__ == "__main__":
+    for each in NAMES:
+        print("| " + " | ".join(figures(each)) + " |")

@@ -1,0 +1,120 @@
+"""Scenes at the extremes on the command line: exit codes, one-line errors, nothing half-written, no warnings."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from extremes import CONDITIONS, DRAWN, NAMES, write_columns, write_scene
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+from csplat import read_ply
+from csplat_tools.app import app
+
+pytestmark = pytest.mark.extremes
+
+
+def run(*words):
+    """Run a command; whatever NumPy warns of is an error here, and errors that are not ours are raised."""
+    done = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr
+    return done
+
+
+def refused(*words):
+    """Run a command that is to fail: one line says why."""
+    done = run(*words)
+    assert 1 == done.exit_code
+    errors = [line for line in done.stderr.splitlines() if not line.startswith(("note: ", "repair: "))]
+    assert 1 == len(errors)
+    assert errors[0].startswith("error: ")
+    return errors[0]
+
+
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_the_whole_chain(name, tmp_path):
+    ply, file, back = write_scene(tmp_path, name), tmp_path / "scene.csplat", tmp_path / "back.ply"
+    condition = CONDITIONS[name]
+    done = run("encode", ply, file, "--source-index", tmp_path / "index.npy")
+    assert 0 == done.exit_code
+    assert condition.repairs == tuple(re.findall(r"^repair: ([a-z-]+):", done.stderr, re.MULTILINE))
+    assert ("huge values coarsen" in done.stderr) == (name == "exploded")
+
+    done = run("verify", file, "--source", ply, "--source-index", tmp_path / "index.npy", "--json")
+    assert 0 == done.exit_code
+    assert json.loads(done.stdout)["proof"]["rms_and_counts_proved"]
+
+    assert 0 == run("decode", file, back).exit_code
+    assert len(condition.make()["means"]) - condition.dropped == len(read_ply(back, strict=True))
+
+    done = run("info", file, "--json")
+    assert (0, json.loads(done.stdout)["size_bytes"]) == (done.exit_code, file.stat().st_size)
+
+    assert 0 == run("render", file, "--orbit", 2, "--size", "64x48", "-o", tmp_path / "pictures", "--depth").exit_code
+    assert ["0000.depth.npy", "0000.png", "0001.depth.npy", "0001.png"] == names_in(tmp_path / "pictures")
+    assert np.isfinite(np.load(tmp_path / "pictures" / "0000.depth.npy")).all()
+
+    done = run("simplify", ply, tmp_path / "half.ply", "--keep", 0.5, "--views", 3, "--json")
+    assert 0 == done.exit_code
+    assert json.loads(done.stdout)["splats"] == len(read_ply(tmp_path / "half.ply", strict=True))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if CONDITIONS[name].repairs])
+def test_strict_refuses_in_one_line_and_writes_nothing(name, tmp_path):
+    ply = write_scene(tmp_path, name)
+    assert CONDITIONS[name].repairs[0] in refused("encode", ply, tmp_path / "scene.csplat", "--strict")
+    assert ["scene.ply"] == names_in(tmp_path)
+    assert 1 == run("lint", ply).exit_code
+
+
+def test_a_million_identical_splats_become_a_file_that_is_too_much_for_a_picture(tmp_path):
+    ply, file = write_scene(tmp_path, "a million identical"), tmp_path / "scene.csplat"
+    assert 0 == run("encode", ply, file, "--preset", "fast").exit_code
+    assert file.stat().st_size < 6_000
+    assert 0 == run("verify", file, "--source", ply).exit_code
+    assert "MAX_INTERSECTIONS" in refused("render", file, "--orbit", 1, "-o", tmp_path / "pictures")
+    assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
+    assert 1 == run("decode", file, tmp_path / "back.ply", "--max-splats", 999_999).exit_code
+    assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
+
+
+def test_what_no_file_can_state_is_refused_in_one_line_and_leaves_nothing(tmp_path):
+    """A lattice that holds a log scale of -3e38 takes one of -1000 for 0: the error of the covariance is infinite."""
+    columns = CONDITIONS["exploded"].make()
+    columns["scales"][50] = [-3e38, -1000.0, -1000.0]
+    ply = write_columns(tmp_path / "scene.ply", columns)
+    assert "the error of covariance is too large to be stated" in refused("encode", ply, tmp_path / "scene.csplat")
+    assert ["scene.ply"] == names_in(tmp_path)
+
+
+def test_a_scene_of_nothing_but_nan_becomes_an_empty_file(tmp_path):
+    columns = CONDITIONS["needles"].make()
+    columns["means"][:] = np.nan
+    ply, file = write_columns(tmp_path / "scene.ply", columns), tmp_path / "scene.csplat"
+    assert "300 splats hold NaN or infinity" in run("encode", ply, file).stderr
+    assert 0 == run("verify", file, "--source", ply).exit_code
+    assert "without splats cannot be simplified" in refused("simplify", ply, tmp_path / "half.ply", "--keep", 0.5)
+    assert 0 == run("render", file, "--orbit", 1, "--size", "32x24", "-o", tmp_path / "pictures").exit_code
+    assert ["pictures", "scene.csplat", "scene.ply"] == names_in(tmp_path)
+
+
+def test_a_process_of_its_own_says_no_more_than_what_was_repaired(tmp_path):
+    """With warnings as errors, as they would otherwise be on a user's terminal."""
+    ply = write_scene(tmp_path, "half the rows NaN")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "csplat_tools", "encode", str(ply), str(tmp_path / "scene.csplat"), "-q"],
+        capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+    assert (0, "") == (done.returncode, done.stdout)
+    assert "repair: nonfinite-rows: 150 splats hold NaN or infinity: dropped" == done.stderr.strip()
