@@ -19,6 +19,7 @@ from csplat_tools.rate.targets import RateTarget, parse_max_error, parse_size_by
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 
+import extremes
 from captures import cameras, shell
 
 from csplat.encoder.measure import measure_errors
@@ -234,6 +235,15 @@ def test_bounds_hold_beside_a_psnr(scene):
 def test_a_scene_without_splats_has_nothing_to_choose(scene):
     with pytest.raises(InputError, match="without splats"):
         encode_to_target(scene.select(np.zeros(0, np.int64)), RateTarget(psnr=30.0))
+
+
+@pytest.mark.extremes
+@pytest.mark.parametrize("name", ["one splat", "exploded", "all transparent", "float32 limits"])
+def test_extreme_scenes_meet_a_psnr(name):
+    source = extremes.scene(name)[0]
+    found = encode_to_target(source, RateTarget(psnr=17.0), views=24)
+    assert compare_models(source, decode(found.result.data), ssim=False).psnr >= 17.0
+    assert len(decode(found.result.data)) >= 1
 
 
 def test_the_same_target_gives_the_same_bytes(scene):

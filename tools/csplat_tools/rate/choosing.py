@@ -20,6 +20,7 @@ __all__ = ["BYTES_PER_DB", "Chooser"]
 #: Share of the bytes that a decibel costs, about: 0.035 without SH, 0.05 with it.
 BYTES_PER_DB = 0.045
 
+_LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _FIRST_SHARE = 1 / 32  # entries of an SH codebook per splat
 _SHARE_STEP = 4.0
 _SHARES = (1 / 512, 1 / 8)
@@ -50,7 +51,10 @@ class Chooser:
         encoding = self.encoding
         if not self._degree() or encoding.sh_coding == "none":
             return Choice("none")
-        coding = PRESETS[encoding.preset].sh_coding if encoding.sh_coding == "auto" else encoding.sh_coding
+        coding = encoding.sh_coding
+        if coding == "auto":
+            huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
+            coding = "scalar" if huge else PRESETS[encoding.preset].sh_coding
         return Choice("scalar") if coding == "scalar" else Choice("codebook", _FIRST_SHARE)
 
     def best(self, part: Part, quality: float, goal: float | None, start: Trial | None = None) -> Choice:

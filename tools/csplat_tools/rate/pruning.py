@@ -95,6 +95,7 @@ class Pruner:
         count = len(self._source)
         session = self._prepared(round(_LEAST_LEFT * count))
         errors = np.concatenate([[0.0], np.cumsum(session.order.errors) / session.views.removal.value_count])
+        errors = errors[:count]  # one stays
         left = 1.0 - np.arange(len(errors)) / count
         factor, gone = 1.0, 0
         for _ in range(_CALIBRATIONS):
