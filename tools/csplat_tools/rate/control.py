@@ -39,15 +39,17 @@ _QUALITIES = (24.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (4.0, 9.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
 _PSNR = (0.0, 0.25, 0.1)  # dB above the target: from, to, aimed at
 _SIZE = (0.97, 1.0, 0.987)  # of the target: from, to, aimed at
-_TRIES = 7
+_TRIES = 9
 _MOST_CAMERAS = 24  # of the user's own judge
 _ENOUGH_CAMERAS = 40  # of the user's own decide what is left out; fewer would only keep what they show
-_STARVED = 30.0  # quality below which a size is better met by fewer splats
+_STARVED = 40.0  # quality to begin with where a size is too small for all splats
+_ROUNDS = 4  # of leaving out splats for a size, each by what the one before taught
+_SAME = 0.03  # of the splats: fewer or more by less are not worth another round
 _REMOVED = (0.6, 0.25)  # of the error that a PSNR allows, at most; the second where the first was too much
 _USUAL = ((6.5, 43.0), (7.2, 43.0))  # bytes per splat at a quality, without and with SH
 _APART = 0.3  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
-_FEWER = 0.75  # of the splats, in steps, as long as pictures gain by what is left for the others
+_FEWER = 0.7  # of the splats, in steps, until a size holds them
 
 
 def encode_to_target(
@@ -159,35 +161,36 @@ class _Search:
             best = self._better(self.trials.judged(best), self._with_size(whole, choice, goal, best.quality))
         if self.pruner is None:
             return self._found(best, goal)
-        if best is None or best.quality < _STARVED:
-            return self._starved(self.pruner, goal, best)
-        part = self.pruner.at_size(best.psnr, self.chooser.floor(best), self._slope(best), self.trials.seen)
-        if part is None:
-            return best
-        finer = self._bounded(best.quality + math.log(len(self.source) / len(part.model)) / BYTES_PER_DB)
-        choice = self.chooser.best(part, finer, None)
-        return self._better(best, self._with_size(part, choice, goal, finer))
+        trial = best or self._starved(self.pruner, goal)
+        best = trial
+        for _ in range(_ROUNDS):
+            count, floor = len(trial.part.model), self.chooser.floor(trial)
+            part = self.pruner.at_size(trial.psnr, floor, count, self._slope(trial), self.trials.seen)
+            if part is None or abs(len(part.model) - count) < _SAME * len(self.source):
+                break
+            finer = self._bounded(trial.quality + math.log(count / len(part.model)) / BYTES_PER_DB)
+            after = self._with_size(part, self.chooser.best(part, finer, None), goal, finer)
+            if after is None:
+                break
+            trial = self.trials.judged(after)
+            if trial.psnr < best.psnr:
+                break
+            best = trial
+        return best
 
-    def _starved(self, pruner: Pruner, goal: int, whole: Trial | None) -> Trial:
-        """Fewer and fewer splats, as long as pictures gain by what that leaves for the others."""
-        best, smallest = whole, min(self.trials.made, key=lambda trial: trial.size_bytes)
-        left = int(len(self.source) * _FEWER * min(1.0, goal / smallest.size_bytes))
-        choice, quality, before = self.chooser.first(), smallest.quality, len(self.source)
+    def _starved(self, pruner: Pruner, goal: int) -> Trial:
+        """A file within a size that is too small for all splats."""
+        smallest = min(self.trials.made, key=lambda trial: trial.size_bytes)
+        left, before = int(len(self.source) * _FEWER * goal / smallest.size_bytes), len(self.source)
         while left >= 1:
             part = pruner.to_count(left)
             if len(part.model) >= before:
                 break  # nobody saw the others
-            trial = self._with_size(part, choice, goal, max(quality, _STARVED))
+            trial = self._with_size(part, self.chooser.first(), goal, _STARVED)
             if trial is not None:
-                trial = self.trials.judged(trial)
-                if best is not None and trial.psnr <= best.psnr:
-                    break
-                if best is whole:
-                    choice = self.chooser.best(part, trial.quality, None, trial)
-                    trial = self._better(trial, self._with_size(part, choice, goal, trial.quality))
-                best, quality = trial, trial.quality
+                return self.trials.judged(trial)
             before, left = len(part.model), int(left * _FEWER)
-        return self._found(best, goal)
+        return self._found(None, goal)
 
     def _found(self, best: Trial | None, goal: int) -> Trial:
         if best is None:

@@ -32,6 +32,7 @@ _ROOM = 3  # times fewer splats that an order allows for than are wanted now: th
 _CALIBRATIONS = 3
 _AGREED = 1.15  # times the error that was predicted
 _NOTHING = 1e-12
+_LEAST_QUANTISED = 0.1  # of the error of a file, that quantisation is taken to have
 _LEAST_GONE = 0.02  # share of the splats; fewer are not worth a file
 
 
@@ -77,23 +78,31 @@ class Pruner:
 
         return None if allowed <= 0.0 else self._least(cost, measure)
 
-    def at_size(self, psnr: float, floor: float, slope: float, measure: Measure) -> Part | None:
-        """Remove so many that a file of the size at which all splats have a PSNR is best; as `at_psnr`."""
+    def at_size(self, psnr: float, floor: float, count: int, slope: float, measure: Measure) -> Part | None:
+        """Remove so many that the file of a size is best; None where that is next to nothing.
+
+        Args:
+            psnr: of a file of that size, in dB.
+            floor: PSNR with its SH coding, without the splats that it lacks, and nothing else wrong.
+            count: splats that it holds.
+            slope, measure: as for `at_psnr`.
+        """
         power = slope * 10.0 / math.log(10.0)
-        quantised = max(_error(psnr) - _error(floor), _NOTHING)
+        quantised = max(_error(psnr) - _error(floor), _LEAST_QUANTISED * _error(psnr))
+        share = count / len(self._source)
 
         def cost(left: F64, removed: F64) -> F64:
-            return np.asarray(removed + quantised * left ** (1.0 / power))
+            return np.asarray(removed + quantised * (left / share) ** (1.0 / power))
 
-        return self._least(cost, measure)
+        return self._least(cost, measure, count)
 
-    def _least(self, cost: Callable[[F64, F64], F64], measure: Measure) -> Part | None:
+    def _least(self, cost: Callable[[F64, F64], F64], measure: Measure, count: int | None = None) -> Part | None:
         """Splats left where a cost of their share and of the error of the others is least.
 
         Views that judge show more or less of what is removed than those that decided: measured, and allowed for.
         """
+        session = self._prepared(max(1, round(_LEAST_LEFT * (len(self._source) if count is None else count))))
         count = len(self._source)
-        session = self._prepared(round(_LEAST_LEFT * count))
         errors = np.concatenate([[0.0], np.cumsum(session.order.errors) / session.views.removal.value_count])
         errors = errors[:count]  # one stays
         left = 1.0 - np.arange(len(errors)) / count
