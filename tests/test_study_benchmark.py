@@ -1,0 +1,180 @@
+"""The benchmark of simple strategies: its arithmetic, and a whole run on a small data set."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="the study wants the extra [render]")
+pytest.importorskip("scipy", reason="data sets want the extra [render]")
+pytest.importorskip("matplotlib", reason="plots want the extra [render]")
+Image = pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+
+BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+
+# They lie in the folder that is named above.
+import study  # noqa: E402
+import study_scenes  # noqa: E402
+from captures import cameras, photograph, shell  # noqa: E402
+from compression_scenes import Scene  # noqa: E402
+from study_claims import CLAIMS, claims  # noqa: E402
+from study_judge import Views, renders_at  # noqa: E402
+from study_rows import Row, measure_row, measure_taus, rows_of_baseline, rows_of_scene  # noqa: E402
+from study_scenes import Subject, baselines, larger  # noqa: E402
+from study_tables import MIB, PUBLISHED  # noqa: E402
+
+from csplat_render.metrics import psnr  # noqa: E402 - wants what is looked for above; so do all below
+from csplat_tools.strategies import Reduction  # noqa: E402
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def subject():
+    source = shell(3)
+    source = replace(source, shN=3.0 * source.shN)
+    views = renders_at(source, cameras(4), BLACK, None)
+    return Subject("shell", source, Path("shell.ply"), {}, views, None, "4 views of the source itself")
+
+
+def test_published_sizes_follow_from_the_rule_that_is_said():
+    for name, floats in (("baseline", 23), ("SH 0", 14), ("SH 0, τ 0.005", 14), ("SH 0, τ 0.02", 14)):
+        row = PUBLISHED[name]
+        assert row.mib == pytest.approx(4 * floats * row.splats / MIB, abs=6e-5)
+        assert row.ratio == pytest.approx(92_000 / (4 * floats * row.splats), abs=0.01)
+
+
+def test_our_codebooks_are_as_large_as_the_published_row(make_model):
+    source = make_model(1000, 1)
+    row = next(row for row in rows_of_baseline() if row.name == "k-means")
+    views = renders_at(source, cameras(1), BLACK, None)
+    found = measure_row(Subject("", source, Path(), {}, views, None, ""), row)
+    assert found["study_bytes"] / MIB == pytest.approx(PUBLISHED["k-means"].mib, abs=5e-5)
+
+
+def test_every_published_row_is_repeated():
+    names = [row.name for row in rows_of_baseline()]
+    assert set(PUBLISHED) <= set(names)
+    assert len(names) == len(set(names))
+
+
+def test_figures_are_means_and_deviations_over_views(subject):
+    pictures = [picture + np.float32(0.01 * (number + 1)) for number, picture in enumerate(subject.views.wanted)]
+    found = Views(subject.views.cameras, pictures, BLACK).score(subject.source)
+    each = [psnr(a, b) for a, b in zip(subject.views.wanted, pictures, strict=True)]
+    assert found["psnr_mean"] == pytest.approx(np.mean(each), abs=1e-4)
+    assert found["psnr_std"] == pytest.approx(np.std(each), abs=1e-4)
+    assert found["ssim"] < 1.0
+    assert found["lpips"] is None
+
+
+def test_a_row_has_both_sizes_and_scores_of_scene_and_file(subject):
+    raw = measure_row(subject, Row("pruned", Reduction(0.5, sh_degree=0)))
+    file = measure_row(subject, Row("pruned", Reduction(0.5, sh_degree=0), "small", decoded=True))
+    left = int(np.sum(subject.source.opacities > 0.5))
+    assert (left, 56 * left) == (raw["splats"], raw["study_bytes"])
+    assert raw["psnr_mean"] != raw["file_psnr_mean"]
+    assert file["psnr_mean"] == file["file_psnr_mean"]
+    assert file["csplat_bytes"] < raw["csplat_bytes"]
+
+
+def test_more_is_pruned_at_higher_thresholds(subject):
+    found = measure_taus(subject.source, subject.views)
+    counts = [point["splats"] for point in found]
+    assert counts == sorted(counts, reverse=True)
+    assert [300, int(np.sum(subject.source.opacities > 0.5))] == [counts[0], counts[-1]]
+    assert found[0]["psnr"] > found[-1]["psnr"]
+
+
+def test_renders_of_another_size_show_the_same(subject):
+    wide = larger(subject, 96, 2)
+    assert (80, 96, 3) == wide.views.wanted[0].shape
+    assert wide.views.wanted[0].mean() == pytest.approx(subject.views.wanted[0].mean(), rel=0.05)
+    assert 99.0 == wide.views.score(wide.source, quick=True)["psnr"]
+
+
+def test_claims_say_where_they_hold(subject):
+    rows = {row.name: measure_row(subject, row) for row in rows_of_scene(subject)}
+    facts = {"splats": 300, "bytes": 300 * 92, "judged_by": subject.judged_by}
+    found = claims({"shell": {"rows": rows, "facts": facts}})
+    assert set(CLAIMS) == set(found)
+    held = {claim: one["scenes"]["shell"]["holds"] for claim, one in found.items()}
+    assert not held["SH 0 is free"]  # wild SH, seen by its own renders
+    assert not held["τ = 0.005 removes 80 %"]  # nothing is as transparent as that
+    assert held["more pruning up to 0.02 costs nothing"]
+    assert held["k-means fails without pruning"]
+    assert not held["SH is the first place to save"]  # a file saves more for less
+    assert found["SH is the first place to save"]["scenes"]["shell"]["SH 0: % saved"] == pytest.approx(39.13, abs=0.01)
+
+
+@pytest.fixture
+def small(tmp_path, monkeypatch):
+    """The baselines on a capture of sixteen small photographs."""
+    (tmp_path / "capture").mkdir()
+    folder = photograph(shell(3), tmp_path / "capture")
+
+    def known(iterations, count):
+        return {
+            name: Scene(name, folder, None, BLACK, training=replace(one.training, background="black"))
+            for name, one in baselines(iterations, count).items()
+        }
+
+    monkeypatch.setattr(study, "baselines", known)
+    monkeypatch.setattr(study, "RENDERED", {64: 2})
+    monkeypatch.setattr(study_scenes, "RENDERED", {64: 2})
+    monkeypatch.setattr(study_scenes.importlib.util, "find_spec", {}.get)  # torch is absent
+    return tmp_path
+
+
+def run(folder, *words):
+    quick = ("--iterations", "30", "--splats", "80", "--lpips", "none", "--scenes", "")
+    return study.main([*words, *quick, "--out", str(folder / "out"), "--plots", str(folder / "plots")])
+
+
+def test_everything_is_trained_measured_printed_and_drawn(small, capsys):
+    assert 1 == run(small)  # what wants torch is left out, and that is said
+    said = capsys.readouterr()
+    assert "study1k-lpips: a loss with LPIPS needs torch" in said.err
+    assert "80 (1,000)" in said.out  # ours, and theirs
+    for name in (*PUBLISHED, "SH 0, τ 0.02, k-means residual", "study1k@64", "Claim: SH 0 is free"):
+        assert name in said.out
+    known = json.loads((small / "out" / "study1k.json").read_text())
+    assert 80 == known["facts"]["splats"]
+    assert known["facts"]["training_seconds"] > 0.0
+    assert 80 * 92 == known["rows"]["baseline"]["study_bytes"]
+    assert {"float32", "balanced", "small", "small, SH 0, τ 0.02"} == set(known["attributes"]["all"])
+    sizes = known["attributes"]["all"]["balanced"]
+    assert known["rows"]["file, balanced"]["csplat_bytes"] == sum(sizes.values())
+    assert ["attributes.svg", "pruning.svg", "sh.svg"] == sorted(path.name for path in (small / "plots").iterdir())
+    before = {path.name: path.read_bytes() for path in (small / "plots").iterdir()}
+
+    assert 0 == run(small, "baseline", "variants", "renders", "claims", "plots", "--markdown")  # nothing is done again
+    again = capsys.readouterr()
+    assert "rows" not in again.err
+    assert "| SH 0 | 80 (1,000) |" in again.out
+    assert before == {path.name: path.read_bytes() for path in (small / "plots").iterdir()}
+
+
+def test_a_row_that_is_told_otherwise_is_measured_again(small, monkeypatch, capsys):
+    monkeypatch.setattr(study, "rows_of_baseline", lambda: [Row("baseline"), Row("τ", Reduction(0.02))])
+    assert 0 == run(small, "baseline")
+    monkeypatch.setattr(study, "rows_of_baseline", lambda: [Row("baseline"), Row("τ", Reduction(0.3))])
+    capsys.readouterr()
+    assert 0 == run(small, "baseline")
+    assert ["rows τ"] == [
+        line.removeprefix("study1k ").partition(":")[0]
+        for line in capsys.readouterr().err.splitlines()
+        if " rows " in line
+    ]
+
+
+def test_wrong_words_are_refused(small, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(small, "bseline")
+    assert 2 == ended.value.code
+    assert 1 == study.main(["scenes", "--scenes", "nowhere", "--lpips", "none", "--out", str(small / "out")])
+    assert "no scene is called nowhere" in capsys.readouterr().err
