@@ -19,6 +19,8 @@ from csplat_tools.app import app
 from csplat_tools.proof import prove
 from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
 from csplat_tools.simplify.judge import Judge, render_pictures
+from csplat_tools.simplify.order import Order
+from csplat_tools.simplify.sizing import first_count, next_count
 from csplat_tools.simplify.views import camera_sequence
 
 SMALL = SimplifyOptions(views=16, view_size=(48, 36), steps=4, rounds=2)
@@ -283,3 +285,25 @@ def test_the_command_simplifies_encodes_and_its_file_is_proved(source, tmp_path)
 def test_words_that_do_not_go_together_are_a_wrong_command_line(source, tmp_path, words):
     write_ply(tmp_path / "scene.ply", source)
     assert invoke("encode", tmp_path / "scene.ply", tmp_path / "out.csplat", *words).exit_code == 2
+
+
+# a size
+
+
+def test_the_best_number_of_splats_balances_removal_and_quantisation():
+    order = Order(np.arange(90), np.linspace(0.0, 2.0, 90) ** 3, ())
+    # Nothing was removed yet, and quantisation costs all of the error: fewer splats are better.
+    assert next_count(order, 100, 90, 30.0, 60.0) < 90
+    # All of the error is that of what was removed: more are.
+    assert next_count(order, 100, 20, 30.0, 30.0) > 20
+    assert first_count(800, 1000, has_sh=False) == 100
+    assert first_count(10**9, 1000, has_sh=True) == 1000
+
+
+def test_a_size_is_filled_by_what_was_simplified(source):
+    file = encode_simplified(source, target=Target(size_bytes=4000), options=SMALL)
+    assert 0.9 * 4000 <= len(file.result.data) <= 4000
+    assert file.report["splats"] < 400
+    assert file.report["psnr"] == max(one["psnr"] for one in file.report["tried"])
+    with pytest.raises(InputError, match="no file has 200 bytes"):
+        encode_simplified(source, target=Target(size_bytes=200), options=SMALL)

@@ -310,7 +310,7 @@ def test_the_command_keeps_to_largest_errors(tmp_path, ply):
         (["--max-error", "means=1mm"], 1, "--unit-metres"),
         (["--target-size", "5kB", "--quality", "40"], 1, "quality is what a target chooses"),
         (["--keep-all"], 2, "says nothing without a target"),
-        (["--simplify", "--target-size", "5kB"], 2, "no other targets"),
+        (["--simplify", "--max-error", "means=1"], 2, "no bounds"),
         (["--cameras", "c.json"], 2, "without a target"),
         (["--max-error", "means=1", "--data", "d"], 2, "nothing is rendered"),
         (["--target-size", "10"], 1, "no file"),

@@ -11,6 +11,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
+from csplat_tools.rate.targets import parse_size_bytes
 
 __all__ = ["DEFAULT_VIEWS", "Simplifying"]
 
@@ -25,16 +26,11 @@ class Simplifying:
     keep: float | None
     max_loss: str | None
     target_psnr: float | None
+    target_size: str | None
     cameras: str | None
     data: str | None
     views: int
     threads: int | None
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything is said at all."""
-        given = (self.keep, self.max_loss, self.target_psnr, self.cameras, self.data)
-        return any(value is not None for value in given)
 
     def encoder(self, *, quiet: bool) -> Encoder:
         """Return what makes a file of a scene.
@@ -49,7 +45,8 @@ class Simplifying:
 
         try:
             loss = None if self.max_loss is None else parse_target(self.max_loss)
-            target = Target(self.keep, self.target_psnr, loss)
+            size = None if self.target_size is None else parse_size_bytes(self.target_size)
+            target = Target(self.keep, self.target_psnr, loss, size)
             options = SimplifyOptions(views=self.views, threads=self.threads)
         except InputError as error:
             raise typer.BadParameter(str(error)) from None

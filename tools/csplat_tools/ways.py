@@ -51,8 +51,8 @@ class Ways:
         looks = target.cameras is not None or target.data is not None
         both = (self.simplify or target.asked) and reducing.asked
         refused = (
-            (self.simplify and (target.size is not None or target.max_error is not None),
-             "--simplify has --keep, --max-loss and --target-psnr, and no other targets"),
+            (self.simplify and target.max_error is not None,
+             "--max-error goes with no --simplify: what is fitted has no bounds"),
             (not self.simplify and (simplifying.keep is not None or simplifying.max_loss is not None),
              "--keep and --max-loss say nothing without --simplify"),
             (both, "--prune-opacity, --distil-sh and --kmeans go with neither a target nor --simplify: those choose"),

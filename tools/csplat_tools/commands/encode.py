@@ -225,7 +225,7 @@ def encode(
       csplat encode scene.ply scene.csplat --target-size 5MB
       csplat encode scene.ply scene.csplat --target-psnr 42 --keep-all
       csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
-      csplat encode scene.ply scene.csplat --simplify --keep 0.5
+      csplat encode scene.ply scene.csplat --simplify --target-size 5MB
       csplat encode scene.ply scene.csplat --prune-opacity 0.005 --sh-degree 0
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
@@ -263,7 +263,7 @@ def encode(
         raise typer.BadParameter(str(error)) from None
     ways = Ways(
         simplify,
-        Simplifying(keep, max_loss, target_psnr, cameras, data, views, threads),
+        Simplifying(keep, max_loss, target_psnr, target_size, cameras, data, views, threads),
         Targeting(target_size, target_psnr, max_error, keep_all, importance, cameras, data, views, threads),
         Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, sh_degree, seed, threads),
         prune_unseen,

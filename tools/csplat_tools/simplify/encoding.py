@@ -22,10 +22,12 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.removal import measure_removal
+from csplat_tools.rate.search import Window, meet
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
 from csplat_tools.simplify.judge import Judge, loss_as_psnr
 from csplat_tools.simplify.options import SimplifyOptions, Target
+from csplat_tools.simplify.sizing import first_count, next_count
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
@@ -43,6 +45,12 @@ _TRIES = 5
 _NEAR = 0.15  # dB above the target that are good enough
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
 _BYTES_PER_DB = 0.08  # share of the bytes that a decibel costs, about
+_SIZED = (0.97, 1.0, 0.985)  # of the bytes that are wanted: from, to, aimed at
+_SIZED_QUALITY = 45.0  # dB, where to begin
+_SIZED_ROUNDS = 3
+_SIZE_SLOPE = 0.04  # by what the logarithm of the bytes grows with the encoder's quality, per dB
+_SAME = 0.04  # of the splats: what differs by less is not worth another fit
+_FEWER = 0.7  # of the splats, where a size holds none of their files
 _SHORT = 3  # steps of a fit that begins where another one ended
 
 
@@ -77,7 +85,8 @@ def encode_simplified(
         cameras: as for `simplify`.
         target: `keep`: the encoder's own options decide the rest. `psnr` and `max_loss`: of the file against the
             source or the photographs; number of splats and precision are chosen together, `encoding.quality` is not
-            looked at, and the smallest of several files is returned, that of the whole scene among them.
+            looked at, and the smallest of several files is returned, that of the whole scene among them. `size_bytes`:
+            the best of several files within it.
         encoding: of the encoder.
         options: of the simplification.
         photographs: as for `simplify`.
@@ -99,6 +108,8 @@ def encode_simplified(
         gone = min(len(source) - left, len(session.order.rows))
         return _Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0
+    if target.size_bytes is not None:
+        return _within(session, judge, target.size_bytes, encoding, has_sh=has_sh, progress=progress)
     codings = [encoding.sh_coding]
     if encoding.sh_coding == "auto" and has_sh:
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
@@ -124,6 +135,47 @@ def encode_simplified(
     best = min(reached, key=_size)
     tried = [{"splats": one.report["splats"], "size_bytes": _size(one), "psnr": one.report["psnr"]} for one in reached]
     return replace(best, report={**best.report, "goal": goal, "tried": tried})
+
+
+def _within(
+    session: Session, judge: Judge, goal: int, encoding: EncodeOptions, *, has_sh: bool, progress: Progress | None
+) -> SimplifiedFile:
+    """The best file within a size, of some numbers of splats, each of which says which to try next."""
+    splats, order = len(session.source), session.order
+    count = max(first_count(goal, splats, has_sh=has_sh), splats - len(order.rows))
+    found: list[SimplifiedFile] = []
+    quality = _SIZED_QUALITY
+    for _ in range(_SIZED_ROUNDS):
+        candidate = _Candidate(session, splats - count, judge, progress)
+        file = _at_size(candidate.encoded, encoding, goal, quality)
+        if file is None:
+            after = int(_FEWER * count)
+        else:
+            found.append(file)
+            quality = float(file.report["quality"])
+            after = next_count(order, splats, count, float(file.report["psnr"]), judge.psnr(candidate.fitted))
+        after = max(1, after, splats - len(order.rows))
+        if abs(after - count) <= _SAME * splats:
+            break
+        quality += math.log(count / after) / _SIZE_SLOPE
+        count = after
+    if not found:
+        raise InputError(f"no file has {goal} bytes or fewer: even few splats take more")
+    best = max(found, key=lambda file: float(file.report["psnr"]))
+    tried = [{"splats": one.report["splats"], "size_bytes": _size(one), "psnr": one.report["psnr"]} for one in found]
+    return replace(best, report={**best.report, "goal_bytes": goal, "tried": tried})
+
+
+def _at_size(encoded: Encoded, encoding: EncodeOptions, goal: int, quality: float) -> SimplifiedFile | None:
+    """The finest of some files within a size; None where the coarsest is too large."""
+    found: list[SimplifiedFile] = []
+
+    def measure(place: float) -> float:
+        found.append(encoded(encoding, place))
+        return _size(found[-1]) / goal
+
+    meet(measure, Window(*_SIZED), start=quality, slope=_SIZE_SLOPE, bounds=_QUALITIES, tries=_TRIES)
+    return max((file for file in found if _size(file) <= goal), key=_size, default=None)
 
 
 def _size(file: SimplifiedFile) -> int:

@@ -1,0 +1,48 @@
+"""How many splats the best file of a size holds, when what stays is fitted to what the source looks like.
+
+As in `csplat_tools.rate`: what was removed errs by P, growing with the errors of removal, quantisation by Q, falling
+with the bytes that are left for each splat; a file of one number of splats says how large both are, and where their
+sum is least.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from csplat_tools.simplify.order import Order
+
+__all__ = ["first_count", "next_count"]
+
+_USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, without and with SH
+_BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs
+_LEAST_QUANTISED = 0.1  # of the error of a file, that quantisation is taken to have
+_LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
+
+
+def first_count(size_bytes: int, splats: int, *, has_sh: bool) -> int:
+    """How many splats to begin with."""
+    return max(1, min(splats, int(size_bytes / _USUAL_BYTES[has_sh])))
+
+
+def next_count(order: Order, splats: int, count: int, psnr: float, fitted_psnr: float) -> int:
+    """How many splats are likely to be best.
+
+    Args:
+        order: in which splats go.
+        splats: of the source.
+        count: of those splats there is a file of that size.
+        psnr: of that file, dB.
+        fitted_psnr: of its splats before they were quantised.
+    """
+    error = math.pow(10.0, -psnr / 10.0)
+    removed = max(min(math.pow(10.0, -fitted_psnr / 10.0), error), _LEAST_REMOVED * error)
+    quantised = max(error - removed, _LEAST_QUANTISED * error)
+    sums = np.concatenate([[0.0], np.cumsum(order.errors)])[:splats]
+    here = sums[min(splats - count, len(sums) - 1)]
+    left = splats - np.arange(len(sums))
+    power = _BYTES_PER_DB * 10.0 / math.log(10.0)
+    grown = sums / here if here > 0.0 else sums
+    total = removed * grown + quantised * (left / count) ** (1.0 / power)
+    return int(left[np.argmin(total)])
