@@ -23,6 +23,7 @@ import extremes
 from captures import cameras, shell
 
 from csplat.encoder.measure import measure_errors
+from csplat_render.virtual import scene_frame
 from csplat_tools.compare import compare_models
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.trials import spread_of
@@ -237,6 +238,17 @@ def test_a_scene_without_splats_has_nothing_to_choose(scene):
         encode_to_target(scene.select(np.zeros(0, np.int64)), RateTarget(psnr=30.0))
 
 
+def test_of_surroundings_all_splats_stay_unless_asked(crowded):
+    surroundings = replace(
+        crowded, means=(crowded.means * np.where(np.arange(900) % 3, 1.0, 9.0)[:, None]).astype("f4")
+    )
+    assert scene_frame(surroundings).kind == "surrounding"
+    report = encode_to_target(surroundings, RateTarget(psnr=30.0), views=24).report
+    assert (report["splats"], report["removal_views"]) == (900, 0)
+    assert "all splats stay" in report["why"][-1]
+    assert encode_to_target(surroundings, RateTarget(psnr=30.0), views=24, prune=True).report["removal_views"] > 0
+
+
 @pytest.mark.extremes
 @pytest.mark.parametrize("name", ["one splat", "exploded", "all transparent", "float32 limits"])
 def test_extreme_scenes_meet_a_psnr(name):
@@ -309,7 +321,7 @@ def test_the_command_keeps_to_largest_errors(tmp_path, ply):
         (["--target-psnr", "120"], 2, "at most 99"),
         (["--max-error", "means=1mm"], 1, "--unit-metres"),
         (["--target-size", "5kB", "--quality", "40"], 1, "quality is what a target chooses"),
-        (["--keep-all"], 2, "says nothing without a target"),
+        (["--keep-all"], 2, "say nothing without a target"),
         (["--simplify", "--max-error", "means=1"], 2, "no bounds"),
         (["--cameras", "c.json"], 2, "without a target"),
         (["--max-error", "means=1", "--data", "d"], 2, "nothing is rendered"),

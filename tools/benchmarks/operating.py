@@ -93,7 +93,7 @@ def _measure(scene: Scene, out: Path) -> None:
 def _encoded(source: SplatModel, target: RateTarget | None, *, whole: bool) -> bytes:
     if target is None:
         return encode_with_report(source).data
-    return encode_to_target(source, target, EncodeOptions(), prune=not whole).result.data
+    return encode_to_target(source, target, EncodeOptions(), prune=False if whole else None).result.data
 
 
 def _judged(data: bytes, judge: Judge) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def _measure(scene: Scene, args: argparse.Namespace) -> None:
         start = time.perf_counter()
         options = EncodeOptions(preset=args.preset)
         try:
-            found = encode_to_target(source, target, options, prune=not args.keep_all)
+            found = encode_to_target(source, target, options, prune=False if args.keep_all else None)
         except InputError as error:
             kept["targets"][key] = {"error": str(error)}
         else:

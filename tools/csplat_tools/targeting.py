@@ -28,7 +28,7 @@ class Targeting:
 
     Attributes:
         size: as `5MB`. psnr: dB. max_error: as `means=0.001,opacities=0.01`.
-        keep_all: no splat may be left out.
+        prune: whether splats may be left out; None: where views show what matters.
         importance: a file of weights.
         cameras, data: views to judge by, a camera file or a data set.
         views: virtual views at most that decide what is left out.
@@ -38,7 +38,7 @@ class Targeting:
     size: str | None
     psnr: float | None
     max_error: str | None
-    keep_all: bool
+    prune: bool | None
     importance: str | None
     cameras: str | None
     data: str | None
@@ -67,7 +67,7 @@ class Targeting:
         if not rendered and (self.cameras is not None or self.data is not None):
             raise typer.BadParameter("--cameras and --data say nothing with --max-error alone: nothing is rendered")
         if rendered:
-            prepare_renderer(quiet=quiet, simplify=not self.keep_all)
+            prepare_renderer(quiet=quiet, simplify=self.prune is not False)
 
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
             bounds = {} if self.max_error is None else parse_max_error(self.max_error, model.unit_metres)
@@ -82,7 +82,7 @@ class Targeting:
             sights = find_sights(model, self.cameras, self.data, judged=False)
             done = encode_to_target(
                 model, RateTarget(size, self.psnr, bounds), encoding, cameras=sights.cameras,
-                background=sights.background, prune=not self.keep_all, views=self.views,
+                background=sights.background, prune=self.prune, views=self.views,
                 importance=weights, progress=progress,
             )  # fmt: skip
             return Made(done.result, "target", done.report)

@@ -87,9 +87,14 @@ def encode(
             help=f"No splat errs by more: {', '.join(MEASURE_NAMES.values())}. With mm where the unit is known.",
         ),
     ] = None,
-    keep_all: Annotated[
-        bool, typer.Option("--keep-all", rich_help_panel=_TARGET, help="Reach the target with every splat.")
-    ] = False,
+    prune: Annotated[
+        bool | None,
+        typer.Option(
+            "--prune/--keep-all",
+            rich_help_panel=_TARGET,
+            help="Leave out splats not worth their bits, or never. By default of objects, or with 40 cameras or more.",
+        ),
+    ] = None,
     quality: Annotated[
         float | None, typer.Option(metavar="DB", rich_help_panel=_PRECISION, help="PSNR that each attribute keeps.")
     ] = None,
@@ -264,7 +269,7 @@ def encode(
     ways = Ways(
         simplify,
         Simplifying(keep, max_loss, target_psnr, target_size, cameras, data, views, threads),
-        Targeting(target_size, target_psnr, max_error, keep_all, importance, cameras, data, views, threads),
+        Targeting(target_size, target_psnr, max_error, prune, importance, cameras, data, views, threads),
         Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, sh_degree, seed, threads),
         prune_unseen,
     )

@@ -19,6 +19,7 @@ from csplat.encoder import EncodeOptions, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.virtual import scene_frame
 from csplat_tools.compare import comparison_cameras
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.choosing import BYTES_PER_DB, Chooser
@@ -35,6 +36,10 @@ __all__ = ["encode_to_target"]
 Progress = Callable[[str, float], None]
 Colour = tuple[float, float, float]
 
+_ALL_STAY = (
+    "all splats stay: in surroundings virtual views do not show what cameras inside show; 40 cameras or more would say"
+    " which may go"
+)
 _QUALITIES = (24.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (4.0, 9.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
 _PSNR = (0.0, 0.25, 0.1)  # dB above the target: from, to, aimed at
@@ -59,7 +64,7 @@ def encode_to_target(
     *,
     cameras: Sequence[Camera] | None = None,
     background: Colour = (0.0, 0.0, 0.0),
-    prune: bool = True,
+    prune: bool | None = None,
     views: int = 160,
     importance: NDArray[Any] | Importance | None = None,
     progress: Progress | None = None,
@@ -74,7 +79,9 @@ def encode_to_target(
             them, evenly chosen. None for the virtual ones of `psnr`. If they are 40 or more, they also decide which
             splats are left out; else virtual views do.
         background: red, green, blue behind everything.
-        prune: splats may be left out that are not worth their bits; not where largest errors are bounded.
+        prune: splats may be left out that are not worth their bits; not where largest errors are bounded. None: where
+            40 cameras or more are given, or virtual views show all that there is to see, as of an object. In
+            surroundings cameras stand where virtual ones do not, and show what those hardly do.
         views: virtual views at most that decide which.
         importance: how much splats matter, as for the encoder.
         progress: is told the stages.
@@ -97,15 +104,19 @@ def encode_to_target(
     judging = comparison_cameras(source) if cameras is None else _evenly(cameras, _MOST_CAMERAS)
     judge = Judge.of_source(source, judging, background, encoding.threads)
     trials = Trials(source, encoding, judge, importance, progress)
-    pruner = None
+    pruner, deciding = None, None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
+    unsure = prune is None
+    if prune is None:
+        prune = deciding is not None or scene_frame(source).kind == "object"
     if prune and not target.max_error and encoding.preset != "fast" and not encoding.keep_extra:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
-        deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
         pruner = Pruner(source, deciding, options, progress)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
     removal_views = 0 if pruner is None else pruner.renders
     report = summary(target, found, trials, source, removal_views, virtual=cameras is None)
+    if unsure and not prune:
+        report["why"].append(_ALL_STAY)
     seconds = round(time.perf_counter() - start, 3)
     return RateResult(found.result, {**report, "encodes": files + len(trials.made), "seconds": seconds})
 
@@ -195,8 +206,8 @@ class _Search:
     def _found(self, best: Trial | None, goal: int) -> Trial:
         if best is None:
             smallest = min(trial.size_bytes for trial in self.trials.made)
-            kept = "" if self.pruner is not None else " with all splats"
-            raise InputError(f"no file{kept} has {goal} bytes or fewer: the smallest of those tried has {smallest}")
+            kept, advice = (" with all splats", "; fewer splats (prune) take less") if self.pruner is None else ("", "")
+            raise InputError(f"no file{kept} has {goal} bytes or fewer: of those tried one has {smallest}{advice}")
         return best
 
     def _with_psnr(self, part: Part, choice: Choice, goal: float, quality: float) -> Trial | None:
