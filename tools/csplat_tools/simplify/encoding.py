@@ -27,7 +27,7 @@ from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
 from csplat_tools.simplify.judge import Judge, loss_as_psnr
 from csplat_tools.simplify.options import SimplifyOptions, Target
-from csplat_tools.simplify.sizing import first_count, next_count
+from csplat_tools.simplify.sizing import count_at_psnr, first_count, next_count
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
@@ -38,16 +38,14 @@ Progress = Callable[[str, float], None]
 Encoded = Callable[[EncodeOptions, float], "SimplifiedFile"]
 
 _MARGIN = 1.0  # dB above the target to which splats are removed at first, before what stays is fitted
-_ROOM = (2.0, 4.0)  # dB that a fit leaves for quantisation, without and with SH, when a second number is tried
-_CAREFUL = 5.0  # dB to which splats are removed the second time, where the first was too many
+_ROUNDS = 3  # numbers of splats that are tried
+_MORE = 1.15  # times the splats, where too few were left
 _QUALITIES = (30.0, 80.0)  # dB, between which the encoder's is looked for
 _TRIES = 5
-_NEAR = 0.15  # dB above the target that are good enough
+_NEAR = 0.2  # dB above the target that are good enough
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
-_BYTES_PER_DB = 0.08  # share of the bytes that a decibel costs, about
 _SIZED = (0.97, 1.0, 0.985)  # of the bytes that are wanted: from, to, aimed at
 _SIZED_QUALITY = 45.0  # dB, where to begin
-_SIZED_ROUNDS = 3
 _SIZE_SLOPE = 0.04  # by what the logarithm of the bytes grows with the encoder's quality, per dB
 _SAME = 0.04  # of the splats: what differs by less is not worth another fit
 _FEWER = 0.7  # of the splats, where a size holds none of their files
@@ -114,21 +112,15 @@ def encode_simplified(
     if encoding.sh_coding == "auto" and has_sh:
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
     choices = [replace(encoding, sh_coding=coding) for coding in codings]
-    by_source, allowed = judge, goal
+    by_source, allowed, slope = judge, goal, 1.0
     if target.max_loss is not None and photographs is not None:
         # Photographs are missed by far more than what may be lost: room is measured by the source's renders.
         by_source, allowed = session.checked, loss_as_psnr(target.max_loss, goal + target.max_loss)
+        slope = 1.0 - 10.0 ** (-target.max_loss / 10.0)  # the share of the error that a file's own makes up
     quality = min(max(allowed + _LOSS[has_sh], _QUALITIES[0]), _QUALITIES[1])
-    found = [_smallest(partial(_plain, source, judge, progress), choices, goal, quality)]
-    margin = _MARGIN
-    for _ in range(2):
-        gone = most_gone(session, by_source, allowed + margin)
-        if not gone:
-            break
-        candidate = _Candidate(session, gone, judge, progress, allowed)
-        found.append(_smallest(candidate.encoded, choices, goal, quality))
-        spare = by_source.psnr(candidate.fitted) - allowed - _ROOM[has_sh]
-        margin = margin - spare if spare > 0.0 else _CAREFUL
+    search = _Search(goal, quality, slope)
+    found = [_smallest(partial(_plain, source, judge, progress), choices, search)]
+    found += _simplified(session, judge, by_source, allowed, choices, search, progress)
     reached = [one for one in found if one is not None]
     if not reached:
         raise InputError(f"no file reaches {goal:.2f} dB: the target is too high for this scene")
@@ -145,7 +137,7 @@ def _within(
     count = max(first_count(goal, splats, has_sh=has_sh), splats - len(order.rows))
     found: list[SimplifiedFile] = []
     quality = _SIZED_QUALITY
-    for _ in range(_SIZED_ROUNDS):
+    for _ in range(_ROUNDS):
         candidate = _Candidate(session, splats - count, judge, progress)
         file = _at_size(candidate.encoded, encoding, goal, quality)
         if file is None:
@@ -262,50 +254,72 @@ def _plain(
     return SimplifiedFile(result, {**report, "psnr": judge.psnr(decode(result.data))})
 
 
-def _smallest(encoded: Encoded, choices: Sequence[EncodeOptions], goal: float, quality: float) -> SimplifiedFile | None:
-    """The smallest file that reaches a PSNR, by the choice that is best at a first quality, or else the next best."""
-    first = [(choice, encoded(choice, quality)) for choice in choices]
+def _simplified(
+    session: Session,
+    judge: Judge,
+    by_source: Judge,
+    allowed: float,
+    choices: Sequence[EncodeOptions],
+    search: _Search,
+    progress: Progress | None,
+) -> list[SimplifiedFile]:
+    """Files that reach a PSNR, of some numbers of splats, each of which says which to try next.
 
-    def cost(one: tuple[EncodeOptions, SimplifiedFile]) -> float:
-        return math.log(_size(one[1])) - _BYTES_PER_DB * float(one[1].report["psnr"])
-
-    for choice, file in sorted(first, key=cost):
-        best = _at_quality(partial(encoded, choice), file, goal)
-        if best is not None:
-            return best
-    return None
-
-
-def _at_quality(encoded: Callable[[float], SimplifiedFile], file: SimplifiedFile, goal: float) -> SimplifiedFile | None:
-    """The smallest file that reaches a PSNR: false position on the encoder's quality from a first file; or None."""
-    low, high = _QUALITIES
-    quality: float = file.report["quality"]
-    best, points = None, list[tuple[float, float]]()
-    for number in range(_TRIES):
-        if number:
-            quality = high if number == _TRIES - 1 and best is None else min(max(quality, low), high)
-            file = encoded(quality)
-        reached = file.report["psnr"]
-        if reached >= goal:
-            high = quality
-            if best is None or _size(file) < _size(best):
-                best = file
-            if reached < goal + _NEAR:
-                break
-        else:
-            low = quality
-        points.append((quality, reached))
-        quality = _next_quality(points, goal + 0.5 * _NEAR, low, high)
-        if high - low < 0.1:
+    Args:
+        session: order of removal.
+        judge, by_source: of files, and of what stays against the source's renders.
+        allowed: what `by_source` is to say, dB.
+        choices: how SH may be coded; after the first number of splats, only the best.
+        search: what `judge` is to say, and where to begin.
+        progress: is told the stages.
+    """
+    splats = len(session.source)
+    count = splats - most_gone(session, by_source, allowed + _MARGIN)
+    found: list[SimplifiedFile] = []
+    for _ in range(_ROUNDS):
+        if count >= splats:
             break
-    return best
+        candidate = _Candidate(session, splats - count, judge, progress, allowed)
+        file = _smallest(candidate.encoded, choices, search)
+        after = count_at_psnr(session.order, splats, count, allowed, by_source.psnr(candidate.fitted))
+        if file is None:
+            after = max(after, int(_MORE * count) + 1)
+        else:
+            found.append(file)
+            search = replace(search, quality=float(file.report["quality"]))
+            choices = [one for one in choices if one.sh_coding == file.report["sh_coding"]]
+        if abs(after - count) <= _SAME * splats:
+            break
+        count = after
+    return found
 
 
-def _next_quality(points: list[tuple[float, float]], goal: float, low: float, high: float) -> float:
-    """Where a straight line through the last two points reaches the goal; a slope of 1 through one."""
-    quality, reached = points[-1]
-    slope = 1.0
-    if len(points) > 1 and points[-2][0] != quality:
-        slope = (reached - points[-2][1]) / (quality - points[-2][0])
-    step = (goal - reached) / min(max(slope, 0.15), 1.5)
-    return min(max(quality + step, low + 0.05 * (high - low)), high - 0.05 * (high - low))
+@dataclass(frozen=True)
+class _Search:
+    """A PSNR that is looked for.
+
+    Attributes:
+        goal: dB.
+        quality: of the encoder, to begin with.
+        slope: by what the PSNR grows with the quality, about: little, where a file's own error is little of it.
+    """
+
+    goal: float
+    quality: float
+    slope: float
+
+
+def _smallest(encoded: Encoded, choices: Sequence[EncodeOptions], search: _Search) -> SimplifiedFile | None:
+    """The smallest of some files that reach a PSNR, by the choice that is best there; None where none does."""
+    found: list[SimplifiedFile] = []
+    for choice in choices:
+
+        def measure(place: float, choice: EncodeOptions = choice) -> float:
+            file = encoded(choice, place)
+            found.append(replace(file, report={**file.report, "sh_coding": choice.sh_coding}))
+            return float(file.report["psnr"])
+
+        goal, near = search.goal, _NEAR * search.slope
+        window = Window(goal, goal + near, goal + 0.4 * near)
+        meet(measure, window, start=search.quality, slope=search.slope, bounds=_QUALITIES, tries=_TRIES)
+    return min((file for file in found if file.report["psnr"] >= search.goal), key=_size, default=None)
