@@ -54,6 +54,10 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/simplify.py files --psnr 40
 	$(BIN)/python tools/benchmarks/sensitivity.py
 	$(BIN)/python tools/benchmarks/compression.py
+	$(BIN)/python tools/benchmarks/rate.py
+	$(BIN)/python tools/benchmarks/distortion.py plain
+	$(BIN)/python tools/benchmarks/operating.py
+	$(BIN)/python tools/benchmarks/study.py
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400
