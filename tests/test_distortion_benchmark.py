@@ -198,7 +198,7 @@ class Pretended:
         self.best, self.gain, self.encoded = best, gain, []
         monkeypatch.setattr(distortion_simplified, "prepare", lambda *_: self)
         monkeypatch.setattr(distortion_simplified, "most_gone", lambda *args: round(20 * (60.0 - args[2])))
-        monkeypatch.setattr(distortion_simplified, "_Candidate", lambda *args: self.candidate(args[1]))
+        monkeypatch.setattr(distortion_simplified, "Candidate", lambda *args: self.candidate(args[1]))
         judge = SimpleNamespace(psnr=lambda room: room)
         self.shrinker = distortion_simplified.Shrinker("pretended", self, judge, None)
 

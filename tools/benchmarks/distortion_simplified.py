@@ -14,8 +14,8 @@ from distortion_curves import Point, Series, bracket, rate_at
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.simplify import SimplifyOptions
+from csplat_tools.simplify.candidate import Candidate
 from csplat_tools.simplify.core import Session, most_gone, prepare
-from csplat_tools.simplify.encoding import _Candidate  # what `encode_simplified` encodes, at a number and a quality
 from csplat_tools.simplify.judge import Judge
 
 __all__ = ["Shrinker"]
@@ -69,7 +69,7 @@ class Shrinker:
             left = len(self.source) - gone
             if not gone or any(how.startswith(f"{left} ") for how in found):
                 break
-            candidate = _Candidate(session, gone, self.judge, None, goal)
+            candidate = Candidate(session, gone, self.judge, None, goal)
             mine: dict[str, list[Point]] = {}
             for coding in codings:
                 best = rate_at({**plain, **found, **mine}, goal)
@@ -93,7 +93,7 @@ class Shrinker:
         return {"goal": goal, "points": points, "seconds": time.perf_counter() - start}
 
     def _enclose(
-        self, candidate: _Candidate, coding: str, goal: float, start_at: float, ceiling: float,
+        self, candidate: Candidate, coding: str, goal: float, start_at: float, ceiling: float,
         series: list[Point],
     ) -> None:  # fmt: skip
         """Encode one number of splats by one coding, from just below to just above a PSNR; into `series`."""

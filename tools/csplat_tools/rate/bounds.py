@@ -91,7 +91,8 @@ def meet_bounds(
     options = _started(source, encoding, bounds)
     best: tuple[EncodeOptions, EncodeResult] | None = None
     files = 0
-    for files in range(1, _TRIES + 1):
+    while True:
+        files += 1
         result = encode_with_report(source, options, importance=importance, progress=progress)
         ratios = {name: result.report.errors.get(name, (0.0, 0.0))[0] / bounds[name] for name in bounds}
         if all(ratio <= 1.0 for ratio in ratios.values()):
@@ -105,7 +106,7 @@ def meet_bounds(
             if best is not None:
                 break  # a coarser step was one too many
             changed = _finer(options, wrong)
-            if changed == options:
+            if changed == options or files == _TRIES:
                 break
         options = changed
     if best is None:

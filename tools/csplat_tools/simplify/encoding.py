@@ -10,32 +10,27 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
-from csplat.encoder.between import Between
+from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.removal import measure_removal
 from csplat_tools.rate.search import Window, meet
-from csplat_tools.simplify.colours import fit
+from csplat_tools.simplify.candidate import Candidate, SimplifiedFile
 from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
 from csplat_tools.simplify.judge import Judge, loss_as_psnr
 from csplat_tools.simplify.options import SimplifyOptions, Target
 from csplat_tools.simplify.sizing import count_at_psnr, first_count, next_count
-from csplat_trainer.sensitivity import measure_sensitivity
-from csplat_trainer.sensitivity_file import StoredSensitivity
 
 __all__ = ["SimplifiedFile", "encode_simplified"]
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str, float], None]
-Encoded = Callable[[EncodeOptions, float], "SimplifiedFile"]
+Encoded = Callable[[EncodeOptions, float], SimplifiedFile]
 
 _MARGIN = 1.0  # dB above the target to which splats are removed at first, before what stays is fitted
 _ROUNDS = 3  # numbers of splats that are tried
@@ -49,20 +44,6 @@ _SIZED_QUALITY = 45.0  # dB, where to begin
 _SIZE_SLOPE = 0.04  # by what the logarithm of the bytes grows with the encoder's quality, per dB
 _SAME = 0.04  # of the splats: what differs by less is not worth another fit
 _FEWER = 0.7  # of the splats, where a size holds none of their files
-_SHORT = 3  # steps of a fit that begins where another one ended
-
-
-@dataclass(frozen=True, eq=False)
-class SimplifiedFile:
-    """A file, and what was done for it.
-
-    Attributes:
-        result: of the encoder; its source index is into the source.
-        report: JSON-compatible.
-    """
-
-    result: EncodeResult
-    report: dict[str, Any]
 
 
 def encode_simplified(
@@ -104,7 +85,7 @@ def encode_simplified(
         judge = Judge.of_source(source, judged_by, options.background, options.threads)
     if left is not None:
         gone = min(len(source) - left, len(session.order.rows))
-        return _Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
+        return Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0
     if target.size_bytes is not None:
         return _within(session, judge, target.size_bytes, encoding, has_sh=has_sh, progress=progress)
@@ -138,7 +119,7 @@ def _within(
     found: list[SimplifiedFile] = []
     quality = _SIZED_QUALITY
     for _ in range(_ROUNDS):
-        candidate = _Candidate(session, splats - count, judge, progress)
+        candidate = Candidate(session, splats - count, judge, progress)
         file = _at_size(candidate.encoded, encoding, goal, quality)
         if file is None:
             after = int(_FEWER * count)
@@ -172,77 +153,6 @@ def _at_size(encoded: Encoded, encoding: EncodeOptions, goal: int, quality: floa
 
 def _size(file: SimplifiedFile) -> int:
     return len(file.result.data)
-
-
-class _Candidate:
-    """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins.
-
-    Attributes:
-        fitted: what stays, before anything is quantised.
-    """
-
-    def __init__(
-        self, session: Session, gone: int, judge: Judge, progress: Progress | None, allowed: float | None = None
-    ) -> None:
-        self._session, self._judge, self._progress = session, judge, progress
-        self._rows = session.pruned(gone)
-        self._error = None if allowed is None else 10.0 ** (-allowed / 10.0) * session.views.removal.value_count
-        self._pruned = session.source.select(self._rows)
-        self._last: SplatModel | None = None
-        options = session.options
-        self.fitted = fit(
-            self._pruned, session.views.used, session.wanted, replace(options, bands=False), progress=progress
-        ).model
-        self._weights = measure_removal(
-            self.fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
-        ).squared_weight
-        self._importance: Importance | None = None
-
-    def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
-        """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
-        session = self._session
-        report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
-
-        def colours(seen: SplatModel) -> tuple[F32, F32]:
-            start, options = seen, replace(session.options, steps=_SHORT)
-            if self._last is not None:
-                start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
-            fitted = fit(
-                start, session.views.used, session.wanted, options, error=self._error, centre=self._pruned,
-                fixed=True, progress=self._progress,
-            )  # fmt: skip
-            self._last = fitted.model
-            if fitted.stays is not None:
-                report["zero_bands"] = (~fitted.stays).sum(axis=0).tolist()
-            report["check_psnr"] = session.checked.psnr(fitted.model)
-            return fitted.model.sh0, fitted.model.shN
-
-        def figures(data: bytes) -> dict[str, float]:
-            report["psnr"] = self._judge.psnr(decode(data))
-            return {"psnr": round(report["psnr"], 3), "check_psnr": round(report["check_psnr"], 3)}
-
-        said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
-        adjusted = session.options.refit and session.options.adjust
-        between = Between(len(session.source), self._rows, colours, said, adjusted=adjusted, figures=figures)
-        result = encode_with_report(
-            self.fitted,
-            replace(encoding, quality=quality),
-            importance=self._by_shape() if encoding.shape_codebook_size else self._weights,
-            between=between,
-            progress=self._progress,
-        )
-        return SimplifiedFile(result, report)
-
-    def _by_shape(self) -> Importance:
-        """How much pictures depend on shapes, too."""
-        if self._importance is None:
-            session, options = self._session, self._session.options
-            found = measure_sensitivity(
-                self.fitted, session.views.used, background=options.background, threads=options.threads,
-                progress=self._progress,
-            )  # fmt: skip
-            self._importance = replace(StoredSensitivity.of(self.fitted, found).importance(), sh=self._weights)
-        return self._importance
 
 
 def _plain(
@@ -279,7 +189,7 @@ def _simplified(
     for _ in range(_ROUNDS):
         if count >= splats:
             break
-        candidate = _Candidate(session, splats - count, judge, progress, allowed)
+        candidate = Candidate(session, splats - count, judge, progress, allowed)
         file = _smallest(candidate.encoded, choices, search)
         after = count_at_psnr(session.order, splats, count, allowed, by_source.psnr(candidate.fitted))
         if file is None:

@@ -1,0 +1,112 @@
+"""A number of splats, fitted to what the source looks like, that become files of several qualities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
+from csplat.encoder.between import Between
+from csplat.model import SplatModel
+from csplat_render.removal import measure_removal
+from csplat_tools.simplify.colours import fit
+from csplat_tools.simplify.core import Session
+from csplat_tools.simplify.judge import Judge
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
+
+__all__ = ["Candidate", "SimplifiedFile"]
+
+F32 = NDArray[np.float32]
+Progress = Callable[[str, float], None]
+
+_SHORT = 3  # steps of a fit that begins where another one ended
+
+
+@dataclass(frozen=True, eq=False)
+class SimplifiedFile:
+    """A file, and what was done for it.
+
+    Attributes:
+        result: of the encoder; its source index is into the source.
+        report: JSON-compatible.
+    """
+
+    result: EncodeResult
+    report: dict[str, Any]
+
+
+class Candidate:
+    """A number of splats, encoded at several qualities. Owns the colours of the last fit, where the next one begins.
+
+    Attributes:
+        fitted: what stays, before anything is quantised.
+    """
+
+    def __init__(
+        self, session: Session, gone: int, judge: Judge, progress: Progress | None, allowed: float | None = None
+    ) -> None:
+        self._session, self._judge, self._progress = session, judge, progress
+        self._rows = session.pruned(gone)
+        self._error = None if allowed is None else 10.0 ** (-allowed / 10.0) * session.views.removal.value_count
+        self._pruned = session.source.select(self._rows)
+        self._last: SplatModel | None = None
+        options = session.options
+        self.fitted = fit(
+            self._pruned, session.views.used, session.wanted, replace(options, bands=False), progress=progress
+        ).model
+        self._weights = measure_removal(
+            self.fitted, session.views.used, background=options.background, threads=options.threads, progress=progress
+        ).squared_weight
+        self._importance: Importance | None = None
+
+    def encoded(self, encoding: EncodeOptions, quality: float | None) -> SimplifiedFile:
+        """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
+        session = self._session
+        report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
+
+        def colours(seen: SplatModel) -> tuple[F32, F32]:
+            start, options = seen, replace(session.options, steps=_SHORT)
+            if self._last is not None:
+                start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
+            fitted = fit(
+                start, session.views.used, session.wanted, options, error=self._error, centre=self._pruned,
+                fixed=True, progress=self._progress,
+            )  # fmt: skip
+            self._last = fitted.model
+            if fitted.stays is not None:
+                report["zero_bands"] = (~fitted.stays).sum(axis=0).tolist()
+            report["check_psnr"] = session.checked.psnr(fitted.model)
+            return fitted.model.sh0, fitted.model.shN
+
+        def figures(data: bytes) -> dict[str, float]:
+            report["psnr"] = self._judge.psnr(decode(data))
+            return {"psnr": round(report["psnr"], 3), "check_psnr": round(report["check_psnr"], 3)}
+
+        said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
+        adjusted = session.options.refit and session.options.adjust
+        between = Between(len(session.source), self._rows, colours, said, adjusted=adjusted, figures=figures)
+        result = encode_with_report(
+            self.fitted,
+            replace(encoding, quality=quality),
+            importance=self._by_shape() if encoding.shape_codebook_size else self._weights,
+            between=between,
+            progress=self._progress,
+        )
+        return SimplifiedFile(result, report)
+
+    def _by_shape(self) -> Importance:
+        """How much pictures depend on shapes, too."""
+        if self._importance is None:
+            session, options = self._session, self._session.options
+            found = measure_sensitivity(
+                self.fitted, session.views.used, background=options.background, threads=options.threads,
+                progress=self._progress,
+            )  # fmt: skip
+            self._importance = replace(StoredSensitivity.of(self.fitted, found).importance(), sh=self._weights)
+        return self._importance
