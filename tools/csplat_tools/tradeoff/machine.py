@@ -11,7 +11,7 @@ from typing import Any
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
-__all__ = ["describe_machine"]
+__all__ = ["describe_machine", "package_version", "processor_name"]
 
 _PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "pillow")
 
@@ -24,18 +24,19 @@ def describe_machine(threads: int | None) -> dict[str, Any]:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return {
-        "processor": _processor(),
+        "processor": processor_name(),
         "cores": cores,
         "threads": threads or cores,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "csplat": csplat.__version__,
         "format": f"{VERSION_MAJOR}.{VERSION_MINOR}",
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: package_version(name) for name in _PACKAGES},
     }
 
 
-def _processor() -> str:
+def processor_name() -> str:
+    """The processor's model, as far as the system tells."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text("utf-8", "replace").splitlines():
@@ -44,7 +45,8 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
+    """The version of an installed package, or `absent`."""
     try:
         return version(name)
     except PackageNotFoundError:
