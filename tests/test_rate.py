@@ -23,6 +23,7 @@ import extremes
 from captures import cameras, shell
 
 from csplat.encoder.measure import measure_errors
+from csplat_render.cameras import intrinsics, look_at
 from csplat_render.virtual import scene_frame
 from csplat_tools.compare import compare_models
 from csplat_tools.rate.control import encode_to_target
@@ -145,6 +146,7 @@ def test_outliers_keep_to_a_bound_of_the_means(scene):
     coarse = encode_with_report(far, EncodeOptions(position_step=1e-4)).report.errors["means"][0]
     bounded = meet_bounds(far, EncodeOptions(), {"means": 1e-4}).result
     assert bounded.report.errors["means"][0] <= 1e-4 < coarse
+    assert any("tiles" in note for note in meet_bounds(far, EncodeOptions(), {"means": 1e-7}).result.report.notes)
 
 
 def test_a_bound_that_no_lattice_keeps_is_refused(scene):
@@ -155,6 +157,9 @@ def test_a_bound_that_no_lattice_keeps_is_refused(scene):
 def test_a_knob_and_its_bound_contradict_each_other(scene):
     with pytest.raises(InputError, match="position_step is given"):
         meet_bounds(scene, EncodeOptions(position_step=0.1), {"means": 0.1})
+    for fixed in (EncodeOptions(sh_coding="none"), EncodeOptions(adaptive=0.5)):
+        with pytest.raises(InputError, match="error"):
+            meet_bounds(scene, fixed, {"sh1": 0.1})
     with pytest.raises(InputError, match="codebook bounds no error"):
         meet_bounds(scene, EncodeOptions(sh_coding="codebook"), {"sh1": 0.1})
 
@@ -200,6 +205,28 @@ def test_a_size_that_starves_all_splats_is_met_by_fewer(crowded):
     found = encode_to_target(crowded, RateTarget(size_bytes=2200), views=24)
     assert len(found.result.data) <= 2200
     assert found.report["splats"] < 900
+    without = encode_to_target(crowded, RateTarget(size_bytes=2200), EncodeOptions(sh_degree=0), views=24)
+    assert found.report["psnr"] > without.report["psnr"] - 0.2
+
+
+def test_cameras_that_see_nothing_are_refused(scene):
+    K = intrinsics(48, 40, 60.0)
+    away = look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)
+    with pytest.raises(InputError, match="cameras of this scene"):
+        encode_to_target(scene, RateTarget(psnr=30.0), cameras=[away])
+
+
+def test_splats_that_have_to_stay_are_not_asked_to_go(scene):
+    with pytest.raises(InputError, match="no splat can be left out by the preset fast"):
+        encode_to_target(scene, RateTarget(psnr=30.0), EncodeOptions(preset="fast"), prune=True)
+    with pytest.raises(InputError, match="where errors are bounded"):
+        encode_to_target(scene, RateTarget(psnr=30.0, max_error={"means": 0.01}), prune=True)
+
+
+def test_a_psnr_below_all_files_is_exceeded_and_said_to_be(scene):
+    report = encode_to_target(scene, RateTarget(psnr=2.0), prune=False).report
+    assert report["psnr"] > 2.3
+    assert "no smaller file of those tried reaches the target" in report["why"]
 
 
 def test_a_size_below_all_files_is_refused(scene):
@@ -271,6 +298,9 @@ def test_the_report_says_what_why_and_how_sure(crowded):
     assert report["worst_psnr"] <= report["psnr"]
     assert "8 virtual views" in report["sure"]
     assert any("left out" in line for line in report["why"])
+    chosen = [one for one in report["tried"] if one["splats"] == report["splats"]]
+    others = next((line for line in report["why"] if "expected to take more" in line), "")
+    assert others.count("codebook of") <= len({tuple(one["codebook_sizes"]) for one in chosen})
     json.dumps(report)
 
 

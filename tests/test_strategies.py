@@ -336,7 +336,7 @@ def test_impossible_reductions_are_refused(make_model):
 
 def reducing(**words):
     nothing = dict.fromkeys(("prune_opacity", "kmeans", "residual_stages", "cameras", "data", "sh_degree", "threads"))
-    return Reducing(**{**nothing, "distil_sh": False, "seed": 0, **words})
+    return Reducing(**{**nothing, "distil_sh": False, "views": 160, "seed": 0, **words})
 
 
 def test_what_is_asked_is_done(source, shell):

@@ -25,6 +25,7 @@ class Reducing:
         kmeans: `256`, `means=4096,quats=256`, `0.01`: entries or shares of the variance.
         residual_stages: codebooks per attribute; None: one.
         cameras, data: views to distil by, a camera file or a data set.
+        views: virtual ones at most.
         sh_degree: of the file, as the encoder's options have it.
         seed: of the clustering.
         threads: how many.
@@ -36,6 +37,7 @@ class Reducing:
     residual_stages: int | None
     cameras: str | None
     data: str | None
+    views: int
     sh_degree: int | None
     seed: int
     threads: int | None
@@ -61,7 +63,9 @@ class Reducing:
         try:
             stages = 1 if self.residual_stages is None else self.residual_stages
             kmeans = None if self.kmeans is None else parse_kmeans(self.kmeans, stages=stages, seed=self.seed)
-            reduction = Reduction(self.prune_opacity, self.sh_degree, self.distil_sh, kmeans, threads=self.threads)
+            reduction = Reduction(
+                self.prune_opacity, self.sh_degree, self.distil_sh, kmeans, self.views, threads=self.threads
+            )
         except InputError as error:
             raise typer.BadParameter(str(error)) from None
         if self.distil_sh:

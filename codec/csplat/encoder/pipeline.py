@@ -21,7 +21,7 @@ from csplat.encoder.geometry import quantised_geometry
 from csplat.encoder.importance import Importance, sh_metric, shape_metric, shape_weights, splat_weights
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Progress, make_plan
+from csplat.encoder.plan import Plan, Progress, make_plan
 from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene, stated_errors
 from csplat.encoder.shape_codebook import choose_shapes
 from csplat.encoder.shape_tables import SHAPE_BOOK, ShapeTables, shape_book
@@ -30,6 +30,8 @@ from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
 
 __all__ = ["Decisions", "EncodeReport", "EncodeResult", "decide", "encode", "encode_with_report", "write_decided"]
+
+_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of one, that nobody has to be told of
 
 
 @dataclass(frozen=True)
@@ -197,7 +199,7 @@ def write_decided(
     rows = np.concatenate([part.rows for part in encoded]) if encoded else np.zeros(0, np.int64)
     rows = rows.astype(np.int64, copy=False)
     stated = stated_errors(errors, between)
-    summary = EncodeReport(settings, stated, len(model), len(tiles), len(data), _notes(encoded))
+    summary = EncodeReport(settings, stated, len(model), len(tiles), len(data), _notes(encoded, plan))
     return EncodeResult(data, rows if between is None else between.source_index[rows], summary)
 
 
@@ -218,8 +220,15 @@ def _encode_tiles(decided: Decisions, threads: int, report: Progress) -> list[En
         return list(pool.map(one, tiles))
 
 
-def _notes(encoded: Sequence[EncodedTile]) -> tuple[str, ...]:
-    """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours."""
+def _notes(encoded: Sequence[EncodedTile], plan: Plan) -> tuple[str, ...]:
+    """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours.
+
+    And where a bound of the means, finer than 16 bits of a tile of many, took tiles of few.
+    """
+    splats = sum(len(part.rows) for part in encoded)
+    if plan.lattice.strict and len(encoded) > max(_FEW_TILES, splats // _SMALL_TILE):
+        note = f"means: so small an error takes {len(encoded)} tiles, each of which takes bytes of its own"
+        return (note, *_notes(encoded, replace(plan, lattice=replace(plan.lattice, strict=False))))
     counts = Counter(name for part in encoded for name in part.coarsened)
     return tuple(
         f"{name}: huge values coarsen {count} of {len(encoded)} tiles; remove them, or see the stated errors"

@@ -24,9 +24,9 @@ _PRECISION = "Precision (the preset decides where nothing is given)"
 _COLOUR = "Spherical harmonics"
 _SHAPE = "Codebook of shapes (wants --importance of `csplat sensitivity`)"
 _CODING = "Coding"
-_TARGET = "Targets: the encoder chooses, and judges the file (sizes and PSNRs need the render extra)"
-_VIEWS = "Views that judge and decide, for targets and simplification; else virtual ones"
-_SIMPLE = "Simple strategies, for comparison: each costs more than a target or --simplify does"
+_TARGET = "Targets (sizes and PSNRs need the render extra)"
+_VIEWS = "Views that judge and decide; else virtual ones"
+_SIMPLE = "Simple strategies, to compare with"
 _LESS = "Simplification (needs the render extra)"
 
 
@@ -270,7 +270,7 @@ def encode(
         simplify,
         Simplifying(keep, max_loss, target_psnr, target_size, cameras, data, views, threads),
         Targeting(target_size, target_psnr, max_error, prune, importance, cameras, data, views, threads),
-        Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, sh_degree, seed, threads),
+        Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, views, sh_degree, seed, threads),
         prune_unseen,
     )
     encoder = ways.encoder(quiet=quiet)
@@ -306,9 +306,11 @@ def encode(
 
 def _report(encoded: Encoded) -> None:
     report = encoded.result.report
-    if encoded.made.key == "target":
-        for line in target_lines(encoded.made.said):
-            note(line)
+    for line in target_lines(encoded.made.said) if encoded.made.key == "target" else ():
+        note(line)
+    if encoded.made.key == "simplified":
+        said = encoded.made.said
+        note(f"simplified: {said['splats']} of {said['splats_before']} splats, PSNR {said['psnr']:.2f} dB of the file")
     per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
     note(

@@ -137,6 +137,10 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
             step = min(max(_AIM * bound, 1e-6), 1e3)
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
     if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
+        if encoding.sh_coding == "none":
+            raise InputError("SH coding none leaves out the SH bands whose error is bounded")
+        if encoding.adaptive:
+            raise InputError("adaptive steps bound no error of a splat: leave them out")
         if encoding.sh_coding == "codebook":
             raise InputError("an SH codebook bounds no error of a splat: leave --sh-coding to the bound")
         bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")

@@ -95,6 +95,9 @@ def encode_to_target(
         raise InputError("a scene without splats has no size or quality to choose")
     if encoding.quality is not None:
         raise InputError("quality is what a target chooses: give one of them")
+    blocked = _blocked(target, encoding)
+    if prune and blocked is not None:
+        raise InputError(f"no splat can be left out {blocked}")
     files = 0
     if target.max_error:
         bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
@@ -104,21 +107,31 @@ def encode_to_target(
     judging = comparison_cameras(source) if cameras is None else _evenly(cameras, _MOST_CAMERAS)
     judge = Judge.of_source(source, judging, background, encoding.threads)
     trials = Trials(source, encoding, judge, importance, progress)
-    pruner, deciding = None, None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
-    unsure = prune is None
-    if prune is None:
-        prune = deciding is not None or scene_frame(source).kind == "object"
-    if prune and not target.max_error and encoding.preset != "fast" and not encoding.keep_extra:
+    if cameras is not None and all(np.ptp(wanted, axis=(0, 1)).max() == 0.0 for wanted in judge.wanted):
+        raise InputError("no splat shows in the views given: are these cameras of this scene?")
+    deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
+    unsure = prune is None and deciding is None and scene_frame(source).kind == "surrounding"
+    pruner = None
+    if blocked is None and prune is not False and not unsure:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
         pruner = Pruner(source, deciding, options, progress)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
     removal_views = 0 if pruner is None else pruner.renders
     report = summary(target, found, trials, source, removal_views, virtual=cameras is None)
-    if unsure and not prune:
+    if unsure and blocked is None:
         report["why"].append(_ALL_STAY)
     seconds = round(time.perf_counter() - start, 3)
     return RateResult(found.result, {**report, "encodes": files + len(trials.made), "seconds": seconds})
+
+
+def _blocked(target: RateTarget, encoding: EncodeOptions) -> str | None:
+    """Why all splats have to stay, if they have to."""
+    if target.max_error:
+        return "where errors are bounded: what is gone has none"
+    if encoding.preset == "fast":
+        return "by the preset fast"
+    return "where extra columns are carried" if encoding.keep_extra else None
 
 
 def _evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
@@ -173,7 +186,7 @@ class _Search:
         if self.pruner is None:
             return self._found(best, goal)
         trial = best or self._starved(self.pruner, goal)
-        best = trial
+        best = trial = self.trials.judged(trial)
         for _ in range(_ROUNDS):
             count, floor = len(trial.part.model), self.chooser.floor(trial)
             part = self.pruner.at_size(trial.psnr, floor, count, self._slope(trial), self.trials.seen)
@@ -190,24 +203,33 @@ class _Search:
         return best
 
     def _starved(self, pruner: Pruner, goal: int) -> Trial:
-        """A file within a size that is too small for all splats."""
-        smallest = min(self.trials.made, key=lambda trial: trial.size_bytes)
-        left, before = int(len(self.source) * _FEWER * goal / smallest.size_bytes), len(self.source)
+        """A file within a size that is too small for all splats, by the better of the choices that were tried."""
+        best = None
+        for choice in dict.fromkeys(trial.choice for trial in self.trials.made):
+            trial = self._starved_by(choice, pruner, goal)
+            if trial is not None:
+                best = self._better(best, trial) if best is not None else self.trials.judged(trial)
+        return self._found(best, goal)
+
+    def _starved_by(self, choice: Choice, pruner: Pruner, goal: int) -> Trial | None:
+        """A file of fewer and fewer splats, until a size holds them."""
+        smallest = min(trial.size_bytes for trial in self.trials.made if trial.choice == choice)
+        left, before = max(1, int(len(self.source) * _FEWER * goal / smallest)), len(self.source)
         while left >= 1:
             part = pruner.to_count(left)
             if len(part.model) >= before:
                 break  # nobody saw the others
-            trial = self._with_size(part, self.chooser.first(), goal, _STARVED)
+            trial = self._with_size(part, choice, goal, _STARVED)
             if trial is not None:
-                return self.trials.judged(trial)
+                return trial
             before, left = len(part.model), int(left * _FEWER)
-        return self._found(None, goal)
+        return None
 
     def _found(self, best: Trial | None, goal: int) -> Trial:
         if best is None:
             smallest = min(trial.size_bytes for trial in self.trials.made)
-            kept, advice = (" with all splats", "; fewer splats (prune) take less") if self.pruner is None else ("", "")
-            raise InputError(f"no file{kept} has {goal} bytes or fewer: of those tried one has {smallest}{advice}")
+            kept = " with all splats" if self.pruner is None else ""
+            raise InputError(f"no file{kept} has {goal} bytes or fewer: of those tried one has {smallest}")
         return best
 
     def _with_psnr(self, part: Part, choice: Choice, goal: float, quality: float) -> Trial | None:

@@ -34,24 +34,22 @@ def meet(
     slope: float,
     bounds: tuple[float, float],
     tries: int,
-    known: tuple[tuple[float, float], ...] = (),
 ) -> list[tuple[float, float]]:
     """Try places until a value that grows with them lies in a window.
 
     Args:
         measure: the value at a place; dear.
         window: where the value is to lie.
-        start: where to try first, if nothing is known.
+        start: where to try first.
         slope: of the value, about, above 0.
         bounds: the least and the largest place.
         tries: how many at most.
-        known: places and values that were tried before.
 
     Returns:
-        Places and values, those known first, in the order in which they were tried; the last one lies in the window
+        Places and values in the order in which they were tried; the last one lies in the window
         where any does. Fewer than `tries` where a bound is the best that there is, or values grow no more.
     """
-    points = list(known)
+    points: list[tuple[float, float]] = []
     for _ in range(tries):
         place = _next(points, window, slope, bounds) if points else min(max(start, bounds[0]), bounds[1])
         if place is None:

@@ -12,6 +12,8 @@ from csplat_tools.rate.trials import Trial, Trials, spread_of
 
 __all__ = ["summary"]
 
+_FAR = 0.3  # dB above a target
+
 
 def summary(
     target: RateTarget, found: Trial, trials: Trials, source: SplatModel, removal_views: int, *, virtual: bool
@@ -29,10 +31,12 @@ def summary(
     goal: dict[str, Any] = {"size_bytes": target.size_bytes, "psnr": target.psnr, "max_error": dict(target.max_error)}
     errors, spread = found.errors, spread_of(found.errors)
     each = [psnr_of_mse(float(error)) for error in errors]
-    views = f"{len(errors)} {'virtual' if virtual else 'given'} views"
+    views = f"{len(errors)} {'virtual' if virtual else 'given'} view{'s' if len(errors) > 1 else ''}"
     sure = f"measured on the file itself, in {views}: the worst has {min(each):.2f} dB"
     if not math.isnan(spread):
-        sure += f", other such views would change the {found.psnr:.2f} dB by about {spread:.1f}"
+        sure += (
+            f", other such views would change the {found.psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
+        )
     return {
         "goal": {name: value for name, value in goal.items() if value},
         "size_bytes": found.size_bytes,
@@ -40,7 +44,7 @@ def summary(
         "splats": len(found.part.model),
         "splats_before": len(source),
         "chosen": found.as_json(),
-        "why": _why(found, trials, source),
+        "why": _why(target, found, trials, source),
         "sure": sure,
         "spread": None if math.isnan(spread) else round(spread, 3),
         "worst_psnr": min(each),
@@ -51,13 +55,16 @@ def summary(
     }
 
 
-def _why(found: Trial, trials: Trials, source: SplatModel) -> list[str]:
+def _why(target: RateTarget, found: Trial, trials: Trials, source: SplatModel) -> list[str]:
     """Sentences: how SH is coded and among what that was chosen, and how many splats went."""
-    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made))
+    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
     lines = [f"{_coding(found)}, quality {found.quality:.1f}: all steps follow from it"]
     others = [coding for coding in codings if coding != _coding(found)]
     if others:
-        lines.append(f"at equal pictures these take more: {'; '.join(others)}")
+        expected = "take more" if target.psnr is not None else "look worse"
+        lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
+    if target.psnr is not None and found.psnr > target.psnr + _FAR:
+        lines.append("no smaller file of those tried reaches the target")
     gone = len(source) - len(found.part.model)
     if gone:
         share = 100.0 * gone / len(source)

@@ -95,7 +95,7 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
     for part in text.split(","):
         name, _, value = part.partition("=")
         name = name.strip()
-        found = re.fullmatch(_NUMBER + r"\s*([a-zµ]*)", value.strip())
+        found = re.fullmatch(_NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
         if found is None:
             raise InputError(f"{part.strip()!r} bounds no error, wanted a measure and a number, as means=0.001")
         if name in bounds:

@@ -118,7 +118,7 @@ def _within(
     count = max(first_count(goal, splats, has_sh=has_sh), splats - len(order.rows))
     found: list[SimplifiedFile] = []
     quality = _SIZED_QUALITY
-    for _ in range(_ROUNDS):
+    while len(found) < _ROUNDS:
         candidate = Candidate(session, splats - count, judge, progress)
         file = _at_size(candidate.encoded, encoding, goal, quality)
         if file is None:
@@ -128,12 +128,12 @@ def _within(
             quality = float(file.report["quality"])
             after = next_count(order, splats, count, float(file.report["psnr"]), judge.psnr(candidate.fitted))
         after = max(1, after, splats - len(order.rows))
-        if abs(after - count) <= _SAME * splats:
+        if abs(after - count) <= (_SAME * splats if file is not None else 0):
             break
         quality += math.log(count / after) / _SIZE_SLOPE
         count = after
     if not found:
-        raise InputError(f"no file has {goal} bytes or fewer: even few splats take more")
+        raise InputError(f"no file has {goal} bytes or fewer: {count} splats take more")
     best = max(found, key=lambda file: float(file.report["psnr"]))
     tried = [{"splats": one.report["splats"], "size_bytes": _size(one), "psnr": one.report["psnr"]} for one in found]
     return replace(best, report={**best.report, "goal_bytes": goal, "tried": tried})

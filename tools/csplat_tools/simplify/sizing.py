@@ -17,6 +17,7 @@ from csplat_tools.simplify.order import Order
 __all__ = ["count_at_psnr", "first_count", "next_count"]
 
 _USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, without and with SH
+_FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated errors
 _BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs
 _POWER = _BYTES_PER_DB * 10.0 / math.log(10.0)
 _LEAST_SPARE = 0.3  # of the error that a PSNR allows, for quantisation
@@ -26,7 +27,7 @@ _LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
 
 def first_count(size_bytes: int, splats: int, *, has_sh: bool) -> int:
     """How many splats to begin with."""
-    return max(1, min(splats, int(size_bytes / _USUAL_BYTES[has_sh])))
+    return max(1, min(splats, int((size_bytes - _FRAME_BYTES) / _USUAL_BYTES[has_sh])))
 
 
 def next_count(order: Order, splats: int, count: int, psnr: float, fitted_psnr: float) -> int:
