@@ -25,7 +25,7 @@ import numpy as np
 
 import csplat
 from csplat import _spec
-from csplat.encoder import blocks, container, pipeline, streams, tile
+from csplat.encoder import apart, blocks, container, pipeline, streams, tile
 from csplat.model import normalise_quats
 from csplat_conformance.encoders import LEVELS, EncoderChoice, run_encoder
 from csplat_conformance.mutate import mapped
@@ -313,7 +313,7 @@ MISTAKES = {
         "a tile may have any number of splats",
         ("L1", "TIL-1"),
         "ordinary/two_tiles",
-        stage=replaced(pipeline, "cut", lambda cut: lambda means, lattice, _: cut(means, lattice, len(means))),
+        stage=replaced(apart, "cut", lambda cut: lambda means, lattice, _: cut(means, lattice, len(means))),
         options={"means_coding": "axis"},
     ),
     # bytes
