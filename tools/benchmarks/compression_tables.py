@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from printing import laid_out
+
 from csplat.files import atomic_writer
-from csplat_tools.console import format_table
 from csplat_tools.finetune_report import PLY_SPLAT_BYTES
 
 __all__ = ["plot_curve", "tables"]
@@ -66,7 +67,7 @@ def _summary(results: Results, *, markdown: bool) -> str:
         "", "splats", "PSNR / mean", "untuned B/splat", "PSNR", "mean", "tuned B/splat", "ratio", "PSNR", "mean",
         "SSIM", "LPIPS", "s", "% of training",
     )  # fmt: skip
-    return _titled("Files, before and after tuning", _laid_out(header, lines, markdown=markdown)) if lines else ""
+    return _titled("Files, before and after tuning", laid_out(header, lines, markdown=markdown)) if lines else ""
 
 
 def _pairs(source: dict[str, Any], after: dict[str, Any]) -> list[str]:
@@ -114,7 +115,7 @@ def _ablation(rows: Sequence[dict[str, Any]], facts: dict[str, Any], *, markdown
         for row in rows
     ]  # fmt: skip
     header = ("", "stored as", "bytes", "B/splat", "ratio", *_SCORE_NAMES, "s")
-    return _laid_out(header, lines, markdown=markdown)
+    return laid_out(header, lines, markdown=markdown)
 
 
 def _files(rows: dict[str, dict[str, Any]], facts: dict[str, Any], *, markdown: bool) -> str:
@@ -138,7 +139,7 @@ def _files(rows: dict[str, dict[str, Any]], facts: dict[str, Any], *, markdown: 
         "", "kept %", "SH", "escape %", "shapes", "escape %", "untuned B/splat", "PSNR", "tuned B/splat", "ratio",
         *_SCORE_NAMES, "to source", "mean to source", "best step", "s",
     )  # fmt: skip
-    return _laid_out(header, lines, markdown=markdown)
+    return laid_out(header, lines, markdown=markdown)
 
 
 def _control(one: dict[str, Any], facts: dict[str, Any], *, markdown: bool) -> str:
@@ -159,7 +160,7 @@ def _control(one: dict[str, Any], facts: dict[str, Any], *, markdown: bool) -> s
         lines.append(
             (f"{row['steps']} steps on the file", *_sizes(row["after_bytes"], facts), *_scores(row["after"]), seconds)
         )
-    return _laid_out(("", "B/splat", "ratio", *_SCORE_NAMES, "s"), lines, markdown=markdown)
+    return laid_out(("", "B/splat", "ratio", *_SCORE_NAMES, "s"), lines, markdown=markdown)
 
 
 def _sh0(known: dict[str, Any], facts: dict[str, Any], *, markdown: bool) -> str:
@@ -174,7 +175,7 @@ def _sh0(known: dict[str, Any], facts: dict[str, Any], *, markdown: bool) -> str
             for row in rows
         ]  # fmt: skip
     header = ("", "entries", "escape %", "colour B/splat", *_SCORE_NAMES, "to pruned")
-    return _laid_out(header, lines, markdown=markdown)
+    return laid_out(header, lines, markdown=markdown)
 
 
 def _histogram(found: dict[str, Any], *, markdown: bool) -> str:
@@ -188,7 +189,7 @@ def _histogram(found: dict[str, Any], *, markdown: bool) -> str:
         )
         for name, shares in found["shares"].items()
     ]
-    return _laid_out(header, lines, markdown=markdown)
+    return laid_out(header, lines, markdown=markdown)
 
 
 def _attributes(results: Results, *, markdown: bool) -> str:
@@ -201,7 +202,7 @@ def _attributes(results: Results, *, markdown: bool) -> str:
         sizes += [row["after_bytes"] - sum(sizes), row["after_bytes"]]
         lines.append((name, *(f"{size / splats:.2f}" for size in sizes)))
     header = ("bytes per source splat", *attributes, "the rest", "all")
-    return _titled("The file by attribute", _laid_out(header, lines, markdown=markdown)) if lines else ""
+    return _titled("The file by attribute", laid_out(header, lines, markdown=markdown)) if lines else ""
 
 
 def _times(results: Results, *, markdown: bool) -> str:
@@ -220,7 +221,7 @@ def _times(results: Results, *, markdown: bool) -> str:
             )
         )  # fmt: skip
     header = ("seconds", "splats", *_WORK, "all", "training", "% of it")
-    return _titled("Time", _laid_out(header, lines, markdown=markdown)) if lines else ""
+    return _titled("Time", laid_out(header, lines, markdown=markdown)) if lines else ""
 
 
 def _memory(measured: dict[str, Any], *, markdown: bool) -> str:
@@ -235,7 +236,7 @@ def _memory(measured: dict[str, Any], *, markdown: bool) -> str:
             )
         )  # fmt: skip
     header = ("splats", "peak MB", "before MB", "growth, B/splat", "steps", "file, B/splat")
-    return _titled("Peak memory of `csplat finetune`", _laid_out(header, lines, markdown=markdown)) if lines else ""
+    return _titled("Peak memory of `csplat finetune`", laid_out(header, lines, markdown=markdown)) if lines else ""
 
 
 def plot_curve(results: Results, path: Path) -> bool:
@@ -303,10 +304,3 @@ def _book(entries: int, escapes: float | None) -> tuple[str, str]:
 def _seconds(row: dict[str, Any]) -> float:
     """Of all that the compression takes; reading and judging left out."""
     return float(sum(row["seconds"].get(stage, 0.0) for stage in _WORK))
-
-
-def _laid_out(header: Sequence[str], rows: Sequence[Sequence[str]], *, markdown: bool) -> str:
-    if not markdown:
-        return format_table(header, rows)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

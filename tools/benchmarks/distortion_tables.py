@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from distortion_curves import Point, Rate, Series, front, psnr_at, rate_at
-
-from csplat_tools.console import format_table
+from printing import laid_out
 
 __all__ = ["FIGURES", "Figure", "Measured", "aims", "tables"]
 
@@ -138,7 +137,7 @@ def _peer_table(results: Mapping[str, Measured], name: str, *, markdown: bool) -
     aim = ["aim"] if judged else []
     beside = f"of {name}'s bytes"
     header = ["B/splat at dB", "splats, SH", name, "csplat", beside, *aim, "simplified", beside, *aim]
-    return _format(header, rows, markdown=markdown)
+    return laid_out(header, rows, markdown=markdown)
 
 
 def _bytes(one: Measured, rate: Rate | None) -> str:
@@ -169,7 +168,7 @@ def _share_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
         cells = _reached(one, one.plain(), whole), _reached(one, one.plain(), fewer), _reached(one, either, fewer)
         rows.append((scene, f"{peer.psnr:.1f}", f"{whole:.2f}", cells[0], f"{fewer:.2f}", *cells[1:]))
     header = ("PSNR, dB", "SPZ", "whole: B/splat", "csplat", "simplified: B/splat", "whole", "whole or simplified")
-    return _format(header, rows, markdown=markdown)
+    return laid_out(header, rows, markdown=markdown)
 
 
 def _figure_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
@@ -189,7 +188,7 @@ def _figure_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
                 )
             )  # fmt: skip
     header = ("elsewhere", "format", "B/splat", "dB", "csplat at these bytes, dB", "at these dB, B/splat")
-    return _format(header, rows, markdown=markdown)
+    return laid_out(header, rows, markdown=markdown)
 
 
 def _reached(one: Measured, series: Series, bytes_per_splat: float) -> str:
@@ -232,7 +231,7 @@ def _simplified_table(results: Mapping[str, Measured], *, markdown: bool) -> str
                 )
             )  # fmt: skip
     header = ("simplified", "dB", "B/splat of the source", "SH", "splats %", "whole", "of that", "encodes", "s")
-    return _format(header, rows, markdown=markdown)
+    return laid_out(header, rows, markdown=markdown)
 
 
 def _cost_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
@@ -251,12 +250,4 @@ def _cost_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
             )
         )  # fmt: skip
     header = ("cost", "encodes", "s in all", "s median", "SPZ s", "SOG s")
-    return _format(header, rows, markdown=markdown)
-
-
-def _format(header: Sequence[str], rows: Sequence[Sequence[str]], *, markdown: bool) -> str:
-    if not rows:
-        return ""
-    if not markdown:
-        return format_table(header, rows)
-    return "\n".join("| " + " | ".join(line) + " |" for line in (header, ["---"] * len(header), *rows))
+    return laid_out(header, rows, markdown=markdown)

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from machine import describe_machine
-from scenes import ROOT, Scene, find_scenes
+from printing import laid_out
+from scenes import ROOT, Scene, named_scenes
 
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions, encode_with_report
@@ -26,7 +27,6 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.compare import BLACK, comparison_cameras
-from csplat_tools.console import format_table
 from csplat_tools.models import without_bands
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.targets import RateTarget
@@ -51,7 +51,7 @@ def main() -> None:
     if not args.tables:
         for key, value in describe_machine(("numpy", "numba", "deflate")).items():
             print(f"{key}: {value}", file=sys.stderr)
-        for scene in find_scenes(args.scenes.split(","), ROOT / "out" / "bench"):
+        for scene in named_scenes(args.scenes.split(","), ROOT / "out" / "bench"):
             _measure(scene, args.out)
     results = [json.loads(path.read_text()) for path in sorted(args.out.glob("*.json"))]
     for name, options, _, _ in _POINTS:
@@ -113,10 +113,7 @@ def _table(results: list[dict[str, Any]], rate: float, *, markdown: bool) -> str
         for one in results
         for name, point in one["points"].items()
     ]
-    if not markdown:
-        return format_table(_HEAD, rows)
-    lines = [_HEAD, ("---",) * len(_HEAD), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return laid_out(_HEAD, rows, markdown=markdown)
 
 
 def _cells(ply_bytes: int, point: dict[str, Any], rate: float) -> tuple[str, ...]:

@@ -20,7 +20,8 @@ from typing import Any
 
 from machine import describe_machine
 from peers import find_splat_transform, spz_and_back
-from scenes import DATA, ROOT, Scene, describe_ply, find_scenes
+from printing import laid_out
+from scenes import DATA, ROOT, Scene, describe_ply, named_scenes
 
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, encode_with_report
@@ -29,7 +30,6 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_tools.compare import SourceView, compare_models, render_source
-from csplat_tools.console import format_table
 from csplat_tools.extras import need_renderer
 
 __all__ = ["decoded_presets"]
@@ -44,12 +44,8 @@ def main() -> None:
         need_renderer()
     except InputError as error:
         sys.exit(f"error: {error}")
-    names = [name for name in args.scenes.split(",") if name]
-    scenes = find_scenes(names, args.cache) if names else []
+    scenes = named_scenes([name for name in args.scenes.split(",") if name], args.cache)
     scenes += [describe_ply(path.stem, path) for path in args.extra]
-    missing = set(names) - {scene.name for scene in scenes}
-    if missing:
-        print(f"absent: {', '.join(sorted(missing))}", file=sys.stderr)
     args.cache.mkdir(parents=True, exist_ok=True)
     command, remark = (None, "left out") if args.no_peers else find_splat_transform(args.peers)
     machine = describe_machine(("numpy", "numba", "deflate"))
@@ -119,10 +115,7 @@ def _table(results: list[dict[str, Any]], columns: Sequence[str], *, markdown: b
         [one["name"], f"{one['splats']:,}, {one['sh_degree']}", *(_cell(one["columns"][name]) for name in columns)]
         for one in results
     ]
-    if not markdown:
-        return format_table(header, rows)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return laid_out(header, rows, markdown=markdown)
 
 
 def _cell(column: dict[str, Any]) -> str:

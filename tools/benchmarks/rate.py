@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from machine import describe_machine
-from scenes import DATA, ROOT, Scene, find_scenes
+from printing import laid_out
+from scenes import DATA, ROOT, Scene, named_scenes
 
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions
@@ -28,7 +29,6 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_tools.compare import BLACK, comparison_cameras
-from csplat_tools.console import format_table
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.targets import RateTarget
 from csplat_tools.simplify.judge import Judge
@@ -59,11 +59,7 @@ def main() -> None:
     if not args.tables:
         for key, value in describe_machine(("numpy", "numba", "deflate")).items():
             print(f"{key}: {value}", file=sys.stderr)
-        names = args.scenes.split(",")
-        scenes = find_scenes(names, ROOT / "out" / "bench")
-        for name in sorted(set(names) - {scene.name for scene in scenes}):
-            print(f"absent: {name}", file=sys.stderr)
-        for scene in scenes:
+        for scene in named_scenes(args.scenes.split(","), ROOT / "out" / "bench"):
             _measure(scene, args)
     print(_table([json.loads(path.read_text()) for path in sorted(args.out.glob("*.json"))], markdown=args.markdown))
 
@@ -129,10 +125,7 @@ def _table(results: list[dict[str, Any]], *, markdown: bool) -> str:
         for one in results
         for asked, found in one["targets"].items()
     ]
-    if not markdown:
-        return format_table(_HEAD, rows)
-    lines = [_HEAD, ("---",) * len(_HEAD), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return laid_out(_HEAD, rows, markdown=markdown)
 
 
 def _cells(splats: int, found: dict[str, Any]) -> tuple[str, ...]:

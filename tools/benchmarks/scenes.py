@@ -23,6 +23,7 @@ __all__ = [
     "blow_up",
     "describe_ply",
     "find_scenes",
+    "named_scenes",
 ]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -105,6 +106,15 @@ def find_scenes(names: list[str], cache: Path) -> list[Scene]:
                 subprocess.run(convert, check=True, stdout=subprocess.DEVNULL)
             chosen.append(describe_ply(name, path))
     return chosen
+
+
+def named_scenes(names: list[str], cache: Path) -> list[Scene]:
+    """As `find_scenes`, of names only; those that are absent are told of on standard error."""
+    scenes = find_scenes(names, cache) if names else []
+    missing = set(names) - {scene.name for scene in scenes}
+    if missing:
+        print(f"absent: {', '.join(sorted(missing))}", file=sys.stderr)
+    return scenes
 
 
 def blow_up(model: SplatModel, count: int, seed: int = 0) -> SplatModel:

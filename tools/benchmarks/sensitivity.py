@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 from machine import describe_machine
-from scenes import DATA, ROOT, describe_ply, find_scenes
+from printing import laid_out
+from scenes import DATA, ROOT, describe_ply, named_scenes
 
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, Importance, encode_with_report
@@ -30,7 +31,6 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_tools.compare import SourceView, compare_models, render_source
-from csplat_tools.console import format_table
 from csplat_tools.extras import need_renderer
 from csplat_tools.importances import Measured, Wanted, measure_scene
 from csplat_trainer.sensitivity_file import read_sensitivity
@@ -47,12 +47,8 @@ def main() -> None:
     except InputError as error:
         sys.exit(f"error: {error}")
     args.cache.mkdir(parents=True, exist_ok=True)
-    names = [name for name in args.scenes.split(",") if name]
-    scenes = find_scenes(names, args.cache) if names else []
+    scenes = named_scenes([name for name in args.scenes.split(",") if name], args.cache)
     scenes += [describe_ply(path.stem, path) for path in args.extra]
-    missing = set(names) - {scene.name for scene in scenes}
-    if missing:
-        print(f"absent: {', '.join(sorted(missing))}", file=sys.stderr)
     machine = describe_machine(("numpy", "numba", "deflate"))
     for key, value in machine.items():
         print(f"{key}: {value}", file=sys.stderr)
@@ -162,7 +158,7 @@ def _table(rows: Sequence[dict[str, Any]], *, markdown: bool) -> str:
         ]
         for row in rows
     ]
-    return _lines(_HEADER, lines, markdown=markdown)
+    return laid_out(_HEADER, lines, markdown=markdown)
 
 
 def _histogram(measured: Measured, *, markdown: bool) -> str:
@@ -174,14 +170,7 @@ def _histogram(measured: Measured, *, markdown: bool) -> str:
         low = [float(np.mean((values >= 10.0**at) & (values < 10.0 ** (at + 1)))) for at in decades]
         below = float(np.mean(values < 10.0 ** decades[0]))
         lines.append([name, *(f"{100 * share:.1f}" for share in (below, *low))])
-    return _lines(("% of splats", f"< 1e{decades[0]}", *(f"1e{at} …" for at in decades)), lines, markdown=markdown)
-
-
-def _lines(header: Sequence[str], rows: Sequence[Sequence[str]], *, markdown: bool) -> str:
-    if not markdown:
-        return format_table(header, rows)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return laid_out(("% of splats", f"< 1e{decades[0]}", *(f"1e{at} …" for at in decades)), lines, markdown=markdown)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from study_tables import laid_out
+from printing import laid_out
 
 __all__ = ["CLAIMS", "claims", "format_claims"]
 

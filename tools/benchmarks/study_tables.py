@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from csplat_tools.console import format_table
+from printing import laid_out
 
-__all__ = ["MIB", "PUBLISHED", "Published", "laid_out", "tables"]
+__all__ = ["MIB", "PUBLISHED", "Published", "tables"]
 
 Results = dict[str, dict[str, Any]]
 
@@ -71,14 +70,6 @@ def tables(results: Results, *, markdown: bool = False) -> str:
     parts.append(_books(results, markdown=markdown))
     parts.append(_times(results, markdown=markdown))
     return "\n\n".join(part for part in parts if part)
-
-
-def laid_out(header: Sequence[str], rows: Sequence[Sequence[str]], *, markdown: bool) -> str:
-    """A table as text or as Markdown."""
-    if not markdown:
-        return format_table(header, rows)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def _line(key: str, row: dict[str, Any], facts: dict[str, Any], published: Published | None) -> list[str]:

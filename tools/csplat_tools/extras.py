@@ -10,6 +10,12 @@ from csplat_tools.console import note
 
 __all__ = ["need_photographs", "need_pictures", "need_plots", "need_renderer", "need_trainer", "prepare_renderer"]
 
+_PHOTOGRAPHS = (
+    ("numba", None),
+    ("scipy", None),
+    ("PIL", "pillow"),
+)  # what reading and rendering them needs
+
 
 def need_renderer() -> None:
     """Import what rendering needs: better absent now than after the minutes that reading may take.
@@ -49,7 +55,7 @@ def need_trainer(*, plots: bool = False) -> None:
     Raises:
         InputError: a package is not installed.
     """
-    for module, package in (("numba", None), ("scipy", None), ("PIL", "pillow")):
+    for module, package in _PHOTOGRAPHS:
         _need(module, package, "train")
     if plots:
         _need("matplotlib", None, "train")
@@ -79,7 +85,7 @@ def need_photographs() -> None:
     Raises:
         InputError: a package is not installed.
     """
-    for module, package in (("numba", None), ("scipy", None), ("PIL", "pillow")):
+    for module, package in _PHOTOGRAPHS:
         _need(module, package)
 
 

@@ -13,12 +13,10 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.models import without_bands
+from csplat_tools.rate.exchange import BYTES_PER_DB
 from csplat_tools.rate.trials import Choice, Part, Trial, Trials
 
-__all__ = ["BYTES_PER_DB", "Chooser"]
-
-#: Share of the bytes that a decibel costs, about: 0.035 without SH, 0.05 with it.
-BYTES_PER_DB = 0.045
+__all__ = ["Chooser"]
 
 _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _FIRST_SHARE = 1 / 32  # entries of an SH codebook per splat

@@ -22,7 +22,8 @@ from csplat_render import Camera
 from csplat_render.virtual import scene_frame
 from csplat_tools.compare import comparison_cameras
 from csplat_tools.rate.bounds import meet_bounds
-from csplat_tools.rate.choosing import BYTES_PER_DB, Chooser
+from csplat_tools.rate.choosing import Chooser
+from csplat_tools.rate.exchange import BYTES_PER_DB
 from csplat_tools.rate.pruning import Pruner
 from csplat_tools.rate.search import Window, meet
 from csplat_tools.rate.summary import summary
@@ -237,7 +238,7 @@ class _Search:
         found: list[Trial] = []
 
         def measure(place: float) -> float:
-            found.append(self.trials.judged(self._file(part, choice, place)))
+            found.append(self.trials.judged(self.trials.encode(part, choice, place)))
             return found[-1].psnr
 
         window = Window(goal + _PSNR[0], goal + _PSNR[1], goal + _PSNR[2])
@@ -250,19 +251,12 @@ class _Search:
         found: list[Trial] = []
 
         def measure(place: float) -> float:
-            found.append(self._file(part, choice, place))
+            found.append(self.trials.encode(part, choice, place))
             return found[-1].size_bytes / goal
 
         meet(measure, Window(*_SIZE), start=quality, slope=BYTES_PER_DB, bounds=_QUALITIES, tries=_TRIES)
         good = [trial for trial in found if trial.size_bytes <= goal]
         return max(good, key=lambda trial: trial.quality, default=None)
-
-    def _file(self, part: Part, choice: Choice, quality: float) -> Trial:
-        """A file, made before or now."""
-        for trial in self.trials.made:
-            if trial.part is part and trial.choice == choice and trial.quality == quality:
-                return trial
-        return self.trials.encode(part, choice, quality)
 
     def _better(self, best: Trial, other: Trial | None) -> Trial:
         """The one whose renders are nearer to the source's."""

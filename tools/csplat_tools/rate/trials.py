@@ -70,7 +70,7 @@ class Trial:
     """One file.
 
     Attributes:
-        part, choice, quality: what it was made of.
+        part, choice, options, quality: what it was made of; the choice is the first of those with these options.
         result: of the encoder.
         psnr: dB against the source; NaN where nobody looked yet.
         errors: [V] mean squared error by view.
@@ -78,6 +78,7 @@ class Trial:
 
     part: Part
     choice: Choice
+    options: EncodeOptions
     quality: float
     result: EncodeResult = field(repr=False)
     psnr: float = math.nan
@@ -127,7 +128,11 @@ class Trials:
         self._offset = 0.0
 
     def encode(self, part: Part, choice: Choice, quality: float) -> Trial:
-        """Make a file; nobody looks at it."""
+        """Make a file, if there is none of these options yet; nobody looks at it."""
+        options = choice.options(self._encoding, len(part.model), quality)
+        for trial in self.made:
+            if trial.part is part and trial.options == options:
+                return trial
         between, importance = None, self._importance
         if part.rows is not None:
             if isinstance(importance, Importance):
@@ -135,11 +140,10 @@ class Trials:
             elif importance is not None:
                 importance = importance[part.rows]
             between = Between(len(self._source), part.rows, said=part.said, key="pruned", refitted=False)
-        options = choice.options(self._encoding, len(part.model), quality)
         result = encode_with_report(
             part.model, options, importance=importance, between=between, progress=self._progress
         )
-        trial = Trial(part, choice, quality, result)
+        trial = Trial(part, choice, options, quality, result)
         self.made.append(trial)
         return trial
 
