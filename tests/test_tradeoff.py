@@ -18,7 +18,7 @@ pytest.importorskip("matplotlib", reason="plots need matplotlib: pip install 'cs
 # Importing them needs what is looked for above.
 from captures import cameras, photograph, shell
 
-from csplat import EncodeOptions, decode, encode
+from csplat import EncodeOptions, decode, encode, write_ply
 from csplat._spec import CHUNK_CODEBOOK
 from csplat.decoder import read_header
 from csplat.errors import InputError
@@ -384,6 +384,14 @@ def test_an_absent_file_is_one_line(tmp_path):
     result = invoke(tmp_path / "absent.ply")
     assert 1 == result.exit_code
     assert f"error: {tmp_path / 'absent.ply'}: No such file or directory\n" == result.stderr
+
+
+def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
+    write_ply(tmp_path / "empty.ply", make_model(0))
+    result = invoke(tmp_path / "empty.ply", "-o", tmp_path / "report.html")
+    assert 1 == result.exit_code
+    assert "error: a scene without splats has nothing to trade\n" == result.stderr
+    assert not (tmp_path / "report.html").exists()
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def read_setting(inputs: Inputs, *, deciding: bool) -> Setting:
         deciding: the training cameras of a data set are wanted, too.
 
     Raises:
-        CsplatError: a file is not valid.
+        CsplatError: a file is not valid, or no splat is left of it.
         OSError: it cannot be read.
     """
     if inputs.data is not None and inputs.cameras is not None:
@@ -97,6 +97,8 @@ def read_setting(inputs: Inputs, *, deciding: bool) -> Setting:
     with ply_path(inputs.source) as path:
         source = read_ply(path, report=findings)
         source_bytes = path.stat().st_size
+    if not len(source):
+        raise InputError("a scene without splats has nothing to trade")
     name = "standard input" if inputs.source == STANDARD_STREAM else Path(inputs.source).name
     if inputs.data is None:
         cameras = comparison_cameras(source) if given is None else given
