@@ -19,7 +19,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +33,15 @@ from peers import Peer, find_splat_transform, run_timed, transform
 from scenes import DATA, ROOT, Scene, find_scenes
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.extras import need_renderer
+from csplat_tools.importances import measured_importance
 from csplat_tools.simplify import SimplifyOptions
 from csplat_tools.simplify.judge import Judge
 
@@ -47,6 +49,9 @@ __all__ = ["Kept", "main"]
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
+_GRADED = "graded"  # balanced, with what views say of how precise splats have to be
+_VIEWS = (40, 480, 360)  # of those, virtual ones of objects: number, width, height
+_SEED = 7  # others than those that judge
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
 _GRID = (-9.0, -6.0, -3.0, 3.0, 6.0)  # dB beside the PSNR of SPZ at which the curve is drawn, too
@@ -140,6 +145,22 @@ class _Bench:
     judge: Judge
     kept: Kept
 
+    @cached_property
+    def importance(self) -> Importance | None:
+        """What training cameras say, or virtual views of an object; None inside of surroundings without cameras."""
+        beside = self.scene.path.with_suffix(".cameras.json")
+        if beside.exists():
+            cameras = load_cameras(beside)
+        elif scene_frame(self.source).kind == "object":
+            cameras = virtual_cameras(self.source, *_VIEWS, seed=_SEED)
+        else:
+            return None
+        start = time.perf_counter()
+        found = measured_importance(self.source, cameras, (0.0, 0.0, 0.0), threads=None)
+        seconds = time.perf_counter() - start
+        self.kept.values["graded by"] = {"cameras": len(cameras), "given": beside.exists(), "seconds": seconds}
+        return found
+
     @classmethod
     def of(cls, scene: Scene, kept: Kept) -> _Bench:
         source = read_ply(scene.path)
@@ -188,7 +209,11 @@ def _plain(bench: _Bench) -> None:
     """Files of the whole scene around the PSNR of each peer, by preset and coding of SH; then further away."""
     has_sh = bench.source.sh_degree > 0
     # Without SH, presets differ by nothing but the quality.
-    choices = _CHOICES if has_sh else (("balanced", "none"),)
+    choices = list(_CHOICES) if has_sh else [("balanced", "none")]
+    drawn = choices[:2]
+    if bench.importance is not None:
+        graded = [(_GRADED, coding) for coding in dict.fromkeys(coding for _, coding in choices)]
+        choices, drawn = [*choices, *graded], [*drawn, *graded]
     goals = bench.goals()
     for preset, coding in choices:
         for goal in goals.values():
@@ -197,9 +222,9 @@ def _plain(bench: _Bench) -> None:
     if spz is None:
         return
     for offset in _GRID if has_sh else (*_GRID_FAR, *_GRID):
-        for preset, coding in choices[:2]:
+        for preset, coding in drawn:
             series = Measured(bench.kept.values).plain()
-            if not any(abs(one.psnr - spz - offset) < 1.0 for one in series[f"{preset}, {coding}"]):
+            if not any(abs(one.psnr - spz - offset) < 1.0 for one in series.get(f"{preset}, {coding}", ())):
                 _extend(bench, preset, coding, spz + offset, most=1)
 
 
@@ -209,9 +234,11 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
 
     def measure(quality: float) -> Point:
         quality = round(quality, 2)
-        options = EncodeOptions(preset=preset, quality=quality, sh_coding="auto" if coding == "none" else coding)
+        options = EncodeOptions(quality=quality, sh_coding="auto" if coding == "none" else coding)
+        graded = preset == _GRADED
+        options = replace(options, adaptive=1.0) if graded else replace(options, preset=preset)
         start = time.perf_counter()
-        data = encode_with_report(bench.source, options).data
+        data = encode_with_report(bench.source, options, importance=bench.importance if graded else None).data
         seconds = time.perf_counter() - start
         point = Point(bench.judge.psnr(decode(data)), len(data), quality, seconds)
         series.append(point.as_json())

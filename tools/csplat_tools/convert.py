@@ -12,11 +12,12 @@ import numpy as np
 from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.encoder.between import Between
+from csplat.encoder.importance import Importance
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_tools.importances import read_importance
+from csplat_tools.importances import read_importance, weights_of
 from csplat_tools.inout import mapped_csplat, ply_path, write_array, write_bytes, write_model
 from csplat_tools.models import without_bands
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -182,7 +183,7 @@ def _encoded(
     stored = found if isinstance(found, StoredSensitivity) else None
     if prune_unseen and stored is None:
         raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
-    weights = found if not isinstance(found, StoredSensitivity) else found.importance()
+    weights = None if found is None else weights_of(found, model)
     if not prune_unseen or stored is None or stored.seen.all():
         return encode_with_report(model, options, importance=weights, progress=progress)
     rows = np.flatnonzero(stored.seen)
@@ -195,7 +196,7 @@ def _encoded(
         key="pruned",
         refitted=False,
     )
-    chosen = stored.importance().select(rows)
+    chosen = weights.select(rows) if isinstance(weights, Importance) else None
     result = encode_with_report(model.select(rows), options, importance=chosen, between=between, progress=progress)
     if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
         missed = (

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.importance import Importance
+from csplat.encoder.importance import Importance, trusted
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.model import SplatModel
+from csplat_render.virtual import scene_frame
 from csplat_tools.inout import read_array
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, read_sensitivity, write_sensitivity
 
@@ -21,7 +22,15 @@ if TYPE_CHECKING:
     from csplat_render import Camera
     from csplat_trainer.sensitivity import Sensitivity
 
-__all__ = ["Measured", "Wanted", "measure_scene", "measure_views", "read_importance"]
+__all__ = [
+    "Measured",
+    "Wanted",
+    "measure_scene",
+    "measure_views",
+    "measured_importance",
+    "read_importance",
+    "weights_of",
+]
 
 Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
@@ -162,6 +171,27 @@ def measure_views(
     return found
 
 
+def measured_importance(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: Colour,
+    *,
+    threads: int | None,
+    progress: Progress | None = None,
+) -> Importance:
+    """What views say for the encoder: weights of SH, none far below what opacity and size suggest, and curvatures.
+
+    Args:
+        model, cameras, background, threads, progress: as for `measure_views`.
+
+    Raises:
+        InputError: as `measure_views`.
+    """
+    found = measure_views(model, cameras, background, matrices=False, threads=threads, progress=progress)
+    weights = StoredSensitivity.of(model, found).importance()
+    return replace(weights, sh=trusted(weights.sh, model))
+
+
 def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance | StoredSensitivity:
     """Read weights from a .npy file, or sensitivities from a .npz file.
 
@@ -172,3 +202,21 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
     with Path(path).open("rb") as stream:
         begin = stream.read(len(_ZIP))
     return read_sensitivity(path, model) if begin == _ZIP else read_array(path)
+
+
+def weights_of(found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel) -> NDArray[Any] | Importance:
+    """What the encoder wants of what a file says.
+
+    Virtual views do not stand where the cameras inside surroundings do: of what those show, they show too little to
+    say how coarse it may be. So they grade no splats there.
+
+    Args:
+        found: by `read_importance`.
+        model: the scene that it is about.
+    """
+    if not isinstance(found, StoredSensitivity):
+        return found
+    weights = found.importance()
+    if found.source == "virtual" and scene_frame(model).kind == "surrounding":
+        return replace(weights, curvatures=None)
+    return weights

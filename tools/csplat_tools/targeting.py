@@ -14,10 +14,9 @@ from csplat.model import SplatModel
 from csplat_tools.console import format_bytes
 from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.importances import read_importance
+from csplat_tools.importances import read_importance, weights_of
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.targets import RateTarget, parse_max_error, parse_size_bytes
-from csplat_trainer.sensitivity_file import StoredSensitivity
 
 __all__ = ["Targeting", "target_lines"]
 
@@ -72,7 +71,7 @@ class Targeting:
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
             bounds = {} if self.max_error is None else parse_max_error(self.max_error, model.unit_metres)
             found = None if self.importance is None else read_importance(self.importance, model)
-            weights = found.importance() if isinstance(found, StoredSensitivity) else found
+            weights = None if found is None else weights_of(found, model)
             if not rendered:
                 bounded = meet_bounds(model, encoding, bounds, importance=weights, progress=progress).as_result()
                 return Made(bounded.result, "target", bounded.report)
@@ -110,6 +109,8 @@ def target_lines(said: Mapping[str, Any]) -> list[str]:
     cost = f"{said['encodes']} files tried"
     if said["renders"]:
         cost += f", {said['renders']} pictures rendered"
+    if said.get("sensitivity_views"):
+        cost += f", sensitivity measured in {said['sensitivity_views']}"
     if said.get("removal_views"):
         cost += f", removal measured in {said['removal_views']} small ones"
     return [*lines, cost]

@@ -35,6 +35,7 @@ F64 = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _DIAGONAL = [0, 6, 11, 15, 18, 20]  # of a triangle of 6 by 6
+_LARGEST = 1e37  # of a sum; float32 holds six of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,8 @@ class _Derivatives(Rasteriser):
         """Divide by the pixels, and take the largest of each group."""
         pixels = max(1, self._pixel_count)
         self._metric /= np.float32(pixels)
-        net, sizes, squares = self._net / pixels, self._sizes / pixels, self._squares / pixels
+        bends, squares = _finite(self._bends / pixels), _finite(self._squares / pixels)
+        net, sizes = _finite(self._net / pixels), _finite(self._sizes / pixels)
         return Sensitivity(
             colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels,
             opacity=sizes[:, 0],
@@ -179,11 +181,16 @@ class _Derivatives(Rasteriser):
             shape_net=net[:, 1:].max(axis=1),
             colour_squares=squares[:, 0],
             opacity_squares=squares[:, 1],
-            shape_squares=self._bends[:, _DIAGONAL].sum(axis=1) / pixels,
+            shape_squares=bends[:, _DIAGONAL].sum(axis=1),
             means_squares=squares[:, 2],
-            shape_metric=self._bends / pixels,
+            shape_metric=bends,
             metric=self._metric if self._wanted else None,
             views=self._views,
             view_count=self._view_count,
             pixel_count=self._pixel_count,
         )
+
+
+def _finite(sums: F64) -> F64:
+    """Sums that float32 holds; those of splats blown up beyond all measure say nothing, and are 0."""
+    return np.clip(np.nan_to_num(sums, nan=0.0, posinf=0.0, neginf=0.0), -_LARGEST, _LARGEST)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
+from csplat.encoder.curvature import Curvatures
 from csplat.encoder.importance import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -32,6 +33,8 @@ SOURCES = ("training", "cameras", "virtual")
 
 _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_CHANNELS = 3.0
+_SHAPE = 6.0  # entries of a covariance
 _FLOOR = 0.01  # of the median: the weight of what no view saw; other views may see it
 
 
@@ -89,7 +92,16 @@ class StoredSensitivity:
     def importance(self) -> Importance:
         """Return the weights of squared errors that the encoder wants."""
         matrices = self.matrices, self.shape_matrices
-        return Importance(self._floored("colour_squares"), self._floored("shape_squares"), *matrices)
+        return Importance(
+            self._floored("colour_squares"), self._floored("shape_squares"), *matrices, self._curvatures()
+        )
+
+    def _curvatures(self) -> Curvatures:
+        """The same, attribute by attribute and not only in ratios, where nothing stands in for what no view saw."""
+        opacity, shape, means = (self.groups[f"{name}_squares"] / _CHANNELS for name in ("opacity", "shape", "means"))
+        return Curvatures(
+            opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
+        )
 
     def _floored(self, name: str) -> NDArray[np.float32]:
         weights = self.groups[name]

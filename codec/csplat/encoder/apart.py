@@ -1,4 +1,4 @@
-"""Tiles of a whole scene: splats with huge values get tiles of their own, as far outliers do (tiling.py).
+"""Tiles of a whole scene: by grade (grades.py), and splats with huge values apart, as far outliers are (tiling.py).
 
 A tile's lattices grow coarser until the largest value fits 32 bits. One exploded colour would take those of up to
 65,535 neighbours along.
@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.grades import Grades
 from csplat.encoder.plan import Plan
-from csplat.encoder.quantise import largest_exact
-from csplat.encoder.tiling import Tile, cut
+from csplat.encoder.quantise import largest_exact, lattice_step
+from csplat.encoder.tiling import EVEN, Tile, cut
 from csplat.model import SplatModel
 
 __all__ = ["cut_scene"]
@@ -25,17 +26,37 @@ Flags = NDArray[np.uint8]
 _BLOCK = 1 << 14  # splats that are looked at at a time
 
 
-def cut_scene(model: SplatModel, plan: Plan) -> list[Tile]:
+def cut_scene(model: SplatModel, plan: Plan, grades: Grades | None = None) -> list[Tile]:
     """Cut a scene into tiles.
 
     Args:
         model: the scene.
         plan: lattices and tile size.
+        grades: which splats share steps; None: all do.
 
     Returns:
-        As `cut`, and after those the tiles of splats some of whose values their lattices hold with coarser steps
-        only, those alike in which attributes that are together.
+        As `cut`, grade by grade, and after those the tiles of splats some of whose values their lattices hold with
+        coarser steps only, those alike in which attributes that are together.
     """
+    kinds = _huge(model, plan)
+    if kinds is None and grades is None:
+        return cut(model.means, plan.lattice, plan.tile_splats)
+    index = np.zeros(len(model), np.uint8) if grades is None else grades.index
+    coarse = [EVEN] if grades is None else grades.coarse
+    groups = index if kinds is None else index + np.uint8(len(coarse)) * kinds
+    tiles: list[Tile] = []
+    for group in np.unique(groups):
+        rows, shared = np.flatnonzero(groups == group), coarse[int(group) % len(coarse)]
+        lattice = replace(plan.lattice, step=lattice_step(plan.lattice.step, shared.means))
+        tiles += (
+            Tile(rows[tile.rows], tile.exponent + shared.means, shared)
+            for tile in cut(model.means[rows], lattice, plan.tile_splats)
+        )
+    return tiles
+
+
+def _huge(model: SplatModel, plan: Plan) -> Flags | None:
+    """[N], a bit for each attribute with a value that the file's lattice does not hold; None where there is none."""
     kept = (plan.sh_degree + 1) ** 2 - 1
     # Colours go through sums and differences of two channels.
     looked_at = (
@@ -48,15 +69,7 @@ def cut_scene(model: SplatModel, plan: Plan) -> list[Tile]:
         if _may_exceed(values, limit):
             kinds = np.zeros(len(model), np.uint8) if kinds is None else kinds
             kinds |= _exceeds(values, limit).view(np.uint8) << np.uint8(bit)
-    if kinds is None or not kinds.any():
-        return cut(model.means, plan.lattice, plan.tile_splats)
-    tiles: list[Tile] = []
-    for kind in np.unique(kinds):
-        rows = np.flatnonzero(kinds == kind)
-        tiles += (
-            replace(tile, rows=rows[tile.rows]) for tile in cut(model.means[rows], plan.lattice, plan.tile_splats)
-        )
-    return tiles
+    return kinds if kinds is not None and kinds.any() else None
 
 
 def _may_exceed(values: F32, limit: float) -> bool:

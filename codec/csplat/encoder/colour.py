@@ -74,9 +74,9 @@ class CodedSh:
     tables: tuple[int, ...] = ()
 
 
-def quantise_colour(rgb: F32, step: float, shift: int) -> Colour:
-    """Quantise colours [3, ..., n] on the lattice of `step`."""
-    exponent = lattice_exponent(2.0 * float(np.abs(rgb).max(initial=0.0)), step)
+def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> Colour:
+    """Quantise colours [3, ..., n] on the lattice of `step` times 2**coarse, or a coarser one that holds them."""
+    exponent = max(coarse, lattice_exponent(2.0 * float(np.abs(rgb).max(initial=0.0)), step))
     tile_step = lattice_step(step, exponent)
     real = np.float32 if exponent == 0 else np.float64
     columns = colour_integers(rgb * real(1.0 / tile_step), shift)

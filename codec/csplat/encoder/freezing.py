@@ -19,7 +19,6 @@ from csplat.encoder.options import EncodeOptions
 from csplat.encoder.pipeline import Decisions, EncodeResult, decide, write_decided
 from csplat.encoder.plan import Plan, Progress
 from csplat.encoder.tile import coarseness, tile_order
-from csplat.encoder.tiling import Tile
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -40,7 +39,7 @@ def freeze(
     source: SplatModel | None = None,
     progress: Progress | None = None,
 ) -> Frozen:
-    """Decide how a scene is coded, and leave its values open.
+    """Decide how a scene is coded, all of it in one grade, and leave its values open.
 
     Args:
         model: the scene.
@@ -54,6 +53,7 @@ def freeze(
         raise InputError("a scene without splats has nothing to tune")
     if between is not None and source is None:
         raise InputError("the source that the splats come from is wanted, too")
+    options = replace(options or EncodeOptions(), grades=1)  # what tunes it reckons with one step per attribute
     decided = decide(model, options, importance=importance, between=between, progress=progress)
     plan = replace(decided.books.plan, gauged=True)
     rows = [tile_order(decided.model, tile, plan)[0] for tile in decided.tiles]
@@ -102,7 +102,7 @@ def _reordered(decided: Decisions, order: I64, counts: Sequence[int], plan: Plan
     )
     ends = np.cumsum(counts)
     tiles = [
-        Tile(np.arange(end - count, end), tile.exponent)
+        replace(tile, rows=np.arange(end - count, end))
         for tile, count, end in zip(decided.tiles, counts, ends, strict=True)
     ]
     shapes = None if decided.shapes is None else decided.shapes.select(order)

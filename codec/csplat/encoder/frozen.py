@@ -164,14 +164,14 @@ class Frozen:
                 later_sh, later_shapes = pool.submit(self.seen_sh, held.sh), pool.submit(self._seen_shapes, held)
                 means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
                 shN, (quats, scales) = later_sh.result(), later_shapes.result()
-        return Seen(means, quats, scales, seen_opacities(held.opacities, plan), sh0, shN)
+        return Seen(means, quats, scales, seen_opacities(held.opacities, tiles, plan), sh0, shN)
 
     def seen_sh0(self, sh0: F32) -> F32:
         """Degree-0 colours [N, 3] as a decoder will see them."""
         plan, seen = self.plan, np.empty_like(sh0)
         for tile in self.decided.tiles:
             columns = np.ascontiguousarray(sh0[tile.rows].T)
-            seen[tile.rows] = quantise_colour(columns, plan.sh0_step, plan.chroma_shift).decoded.T
+            seen[tile.rows] = quantise_colour(columns, plan.sh0_step, plan.chroma_shift, tile.coarse.sh0).decoded.T
         return seen
 
     def seen_sh(self, sh: F32) -> F32:

@@ -22,7 +22,7 @@ from csplat.encoder.quantise import (
     quat_values,
 )
 from csplat.encoder.shape_tables import ShapePart, ShapeTables
-from csplat.encoder.tiling import Tile
+from csplat.encoder.tiling import EVEN, Coarse, Tile
 from csplat.model import SplatModel
 
 __all__ = ["Shape", "quantise_shape", "quantised_geometry", "seen_means", "seen_opacities", "seen_shapes"]
@@ -42,7 +42,7 @@ class Shape:
     decoded_quats: F32
 
 
-def quantise_shape(quats: F32, scales: F32, plan: Plan, part: ShapePart | None = None) -> Shape:
+def quantise_shape(quats: F32, scales: F32, plan: Plan, part: ShapePart | None = None, coarse: Coarse = EVEN) -> Shape:
     """Quantise rotations [n, 4] and log scales [n, 3] of a tile in their gauge, which they may be in already.
 
     Args:
@@ -50,12 +50,13 @@ def quantise_shape(quats: F32, scales: F32, plan: Plan, part: ShapePart | None =
         scales: logarithms.
         plan: the lattices.
         part: what a codebook says of these splats; those that it serves take its integers.
+        coarse: by how much the tile's steps are coarser, where there is no codebook.
     """
     rotation, sorted_scales = (quats.T, scales.T) if plan.gauged else fix_gauge(quats, scales)
-    exponent = lattice_exponent(float(np.abs(sorted_scales).max()), plan.scale_step)
+    exponent = max(coarse.scales, lattice_exponent(float(np.abs(sorted_scales).max()), plan.scale_step))
     step = lattice_step(plan.scale_step, exponent)
     n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
-    q = quat_levels(rotation, plan.quat_levels)
+    q = quat_levels(rotation, plan.quat_levels, coarse.quats)
     if part is not None:
         n[:, part.served], q[:, part.served] = part.scales, part.quats
     return Shape(n, exponent, q, lattice_values(n, step), quat_values(q, plan.quat_levels))
@@ -76,7 +77,7 @@ def quantised_geometry(
         The scene, in the same order.
     """
     quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, shapes)
-    means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, plan)
+    means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, tiles, plan)
     return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
 
 
@@ -96,12 +97,15 @@ def seen_shapes(
     seen = np.empty_like(quats), np.empty_like(scales)
     for tile in tiles:
         part = None if shapes is None else shapes.part(tile.rows)
-        shape = quantise_shape(quats[tile.rows], scales[tile.rows], plan, part)
+        shape = quantise_shape(quats[tile.rows], scales[tile.rows], plan, part, tile.coarse)
         seen[0][tile.rows], seen[1][tile.rows] = shape.decoded_quats.T, shape.decoded_scales.T
     return seen
 
 
-def seen_opacities(opacities: F32, plan: Plan) -> F32:
+def seen_opacities(opacities: F32, tiles: Sequence[Tile], plan: Plan) -> F32:
     """Alpha [N] as a decoder will see it."""
-    levels = plan.opacity_levels
-    return opacity_values(opacity_levels(opacities, levels, square=True), levels, square=True)
+    seen, levels = np.empty_like(opacities), plan.opacity_levels
+    for tile in tiles:
+        q = opacity_levels(opacities[tile.rows], levels, square=True, multiple=tile.coarse.opacities)
+        seen[tile.rows] = opacity_values(q, levels, square=True)
+    return seen

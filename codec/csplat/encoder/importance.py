@@ -8,17 +8,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.curvature import Curvatures
 from csplat.encoder.metric import Metric
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
-__all__ = ["Importance", "sh_metric", "shape_metric", "shape_weights", "splat_weights"]
+__all__ = [
+    "Importance",
+    "known_curvatures",
+    "sh_metric",
+    "shape_metric",
+    "shape_weights",
+    "splat_weights",
+    "trusted",
+]
 
 F32 = NDArray[np.float32]
 
 _BLOCK = 1 << 16
 _RIDGE = 0.2  # share of the plain norm in the metric: other views than those that were measured see other directions
 _SHAPE = 6  # entries of a covariance
+_GUESSED = 0.2  # share of what opacity and size suggest that a measured weight has at least
+_COMMON = 0.99  # share of the splats whose size is no exception
 _LARGEST_LOG = 80.0  # log sizes beyond ± this are not told apart: float32 holds the weights
 
 
@@ -33,17 +44,36 @@ class Importance:
             upper triangle, row by row, of a matrix that is positive semidefinite, the mean of whose diagonal is 1 for
             what was seen; `None`: all weigh alike, each for itself.
         shape_metric: [N, 21], the same for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
+        curvatures: what pictures lose by errors of opacities, shapes, centres and colours, not only in ratios: with
+            it, splats are graded (grades.py).
     """
 
     sh: NDArray[Any]
     shape: NDArray[Any] | None = None
     sh_metric: NDArray[Any] | None = None
     shape_metric: NDArray[Any] | None = None
+    curvatures: Curvatures | None = None
 
     def select(self, rows: NDArray[Any]) -> Importance:
         """The same for some of the splats."""
-        rest = (None if array is None else array[rows] for array in (self.shape, self.sh_metric, self.shape_metric))
-        return Importance(self.sh[rows], *rest)
+
+        def some(array: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if array is None else array[rows]
+
+        curvatures = None if self.curvatures is None else self.curvatures.select(rows)
+        return Importance(self.sh[rows], some(self.shape), some(self.sh_metric), some(self.shape_metric), curvatures)
+
+
+def known_curvatures(model: SplatModel, importance: NDArray[Any] | Importance | None) -> Curvatures | None:
+    """Return what pictures lose by errors, if that is known.
+
+    Raises:
+        InputError: it is about another number of splats, negative, or not finite.
+    """
+    if not isinstance(importance, Importance) or importance.curvatures is None:
+        return None
+    importance.curvatures.check(len(model))
+    return importance.curvatures
 
 
 def shape_weights(model: SplatModel, importance: NDArray[Any] | Importance | None) -> F32:
@@ -126,3 +156,25 @@ def splat_weights(model: SplatModel, importance: NDArray[Any] | Importance | Non
         raise InputError("importance has negative or non-finite values")
     top = float(values.max(initial=0.0))
     return (values / top if top > 0 else values + 1.0).astype(np.float32)
+
+
+def trusted(measured: NDArray[Any], model: SplatModel) -> NDArray[np.float64]:
+    """Measured weights of which none is far below what the splat's opacity and size suggest.
+
+    Other views see more of what those that measured hardly saw; and where a splat is hidden or small, a large error
+    does more than the slope at its place says.
+
+    Args:
+        measured: [N] or [N, A], >= 0.
+        model: the scene.
+
+    Returns:
+        As `measured`, float64: at least a fifth of the column's mean times the cheap weight over its mean.
+    """
+    suggested = splat_weights(model, None).astype(np.float64)
+    suggested = np.minimum(suggested, np.quantile(suggested, _COMMON)) if len(suggested) else suggested
+    mean = float(suggested.mean()) if len(suggested) else 0.0
+    least = _GUESSED * (suggested / mean if mean > 0.0 else np.ones_like(suggested))
+    floor: NDArray[np.float64] = np.multiply.outer(least, measured.mean(axis=0, dtype=np.float64))
+    result: NDArray[np.float64] = np.maximum(measured, floor)
+    return result

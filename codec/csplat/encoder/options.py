@@ -44,6 +44,8 @@ class EncodeOptions:
             matrices of shapes, and a twentieth where not.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). By default only where an importance is given.
+        grades: into how many grades splats are sorted, at most, 1 to 5: those whose errors show alike share tiles with
+            steps of their own. Only where an importance holds curvatures; by default as many as are worth their bytes.
         tile_splats: splats per tile at most, 1 to 65536.
         effort: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
@@ -73,6 +75,7 @@ class EncodeOptions:
     shape_codebook_size: int | None = None
     shape_escape_fraction: float | None = None
     adaptive: float | None = None
+    grades: int | None = None
     tile_splats: int = _spec.TILE_SPLATS_MAX
     effort: int | None = None
     deflate: str = "auto"
@@ -161,6 +164,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "shape_codebook_size": (int, 0, _spec.CODEBOOK_ENTRIES_MAX),
     "shape_escape_fraction": (float, 0, 1),
     "adaptive": (float, 0, 1),
+    "grades": (int, 1, 5),
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
     "effort": (int, 1, 12),
     "seed": (int, 0, math.inf),

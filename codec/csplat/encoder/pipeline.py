@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -18,7 +19,15 @@ from csplat.encoder.between import Between
 from csplat.encoder.codebook import Books, choose_sh, with_zero_books
 from csplat.encoder.container import write
 from csplat.encoder.geometry import quantised_geometry
-from csplat.encoder.importance import Importance, sh_metric, shape_metric, shape_weights, splat_weights
+from csplat.encoder.grades import Grades, choose_grades
+from csplat.encoder.importance import (
+    Importance,
+    known_curvatures,
+    sh_metric,
+    shape_metric,
+    shape_weights,
+    splat_weights,
+)
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress, make_plan
@@ -120,6 +129,7 @@ class Decisions:
         books: plan, weights and codebooks.
         extras: records of the extra columns that are carried.
         shapes: the codebook of shapes, if there is one.
+        grades: of the splats, if there are several.
     """
 
     model: SplatModel
@@ -128,6 +138,7 @@ class Decisions:
     books: Books
     extras: Sequence[_spec.ExtraRecord]
     shapes: ShapeTables | None = None
+    grades: Grades | None = None
 
 
 def decide(
@@ -142,7 +153,8 @@ def decide(
     options = options or EncodeOptions()
     plan = make_plan(model, options, importance_given=importance is not None)
     extras = extra_columns(model, options)
-    tiles = cut_scene(model, plan)
+    plan, grades = choose_grades(model, known_curvatures(model, importance), plan, options)
+    tiles = cut_scene(model, plan, grades)
     shapes = None
     if options.shape_codebook_size and len(model):
         by_shape = shape_weights(model, importance)
@@ -153,14 +165,14 @@ def decide(
         model = replace(model, sh0=sh0, shN=shN)
     needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
     weights = splat_weights(model, importance) if needs_weights else None
-    sample = tiles[len(tiles) // 2].rows if tiles else np.zeros(0, np.intp)
+    sample = _sample(model, tiles, grades)
     carried = tuple(model.extra) if options.keep_extra else ()
     metric = sh_metric(model, weights, importance)
     books = choose_sh(
         model, weights, carried, sample, plan, options, _threads(options), progress or _silent, metric,
         measured=importance is not None,
     )  # fmt: skip
-    return Decisions(model, options, tiles, books, extras, shapes)
+    return Decisions(model, options, tiles, books, extras, shapes, grades)
 
 
 def write_decided(
@@ -182,7 +194,7 @@ def write_decided(
     plan = books.plan
     encoded = _encode_tiles(decided, _threads(options), progress or _silent)
     errors = measured or ErrorSums.total(part.errors for part in encoded)
-    settings = chosen_settings(plan, books.tables, options, between, decided.shapes)
+    settings = chosen_settings(plan, books.tables, options, between, decided.shapes, decided.grades)
     books = with_zero_books(books, (id for part in encoded for id in part.tile.tables if id != SHAPE_BOOK))
     if decided.shapes is not None:
         record, chunk = shape_book(decided.shapes, plan.coding)
@@ -218,6 +230,15 @@ def _encode_tiles(decided: Decisions, threads: int, report: Progress) -> list[En
         return [one(tile) for tile in tiles]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, tiles))
+
+
+def _sample(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
+    """Rows like those of one tile, on which codings are tried: of all grades, where there are several."""
+    if not tiles:
+        return np.zeros(0, np.intp)
+    if grades is None:
+        return tiles[len(tiles) // 2].rows
+    return np.arange(0, len(model), math.ceil(len(model) / _spec.TILE_SPLATS_MAX))
 
 
 def _notes(encoded: Sequence[EncodedTile], plan: Plan) -> tuple[str, ...]:

@@ -87,19 +87,24 @@ def quantise_means(means: F32, step: float) -> I64:
     return n
 
 
-def opacity_levels(opacities: F32, levels: int, *, square: bool) -> I32:
+def opacity_levels(opacities: F32, levels: int, *, square: bool, multiple: int = 1) -> I32:
     """Round alpha to q / M or q² / M² (spec 7.3).
 
     Args:
         opacities: [n] float32, 0 to 1.
         levels: M.
         square: the square-root domain, whose levels lie closer near 0.
+        multiple: all q but M are multiples of this, >= 1: no other levels, fewer symbols.
 
     Returns:
         [n] int32, 0 to M; 0 and M exactly for alpha 0 and 1.
     """
     root = np.sqrt(opacities) if square else opacities
-    return np.rint(root * np.float32(levels)).astype(np.int32)
+    q: I32 = np.rint(root * np.float32(levels / multiple)).astype(np.int32)
+    if multiple > 1:
+        q *= multiple
+        np.copyto(q, levels, where=(q > levels) | (opacities == 1.0))
+    return q
 
 
 def opacity_values(q: I32, levels: int, *, square: bool) -> F32:
@@ -110,24 +115,26 @@ def opacity_values(q: I32, levels: int, *, square: bool) -> F32:
     return result
 
 
-def quat_levels(rotation: F32, levels: int) -> I32:
+def quat_levels(rotation: F32, levels: int, multiple: int = 1) -> I32:
     """Round x, y, z of a rotation whose w is the largest component (spec 7.5).
 
     Args:
         rotation: [4, n] float32, unit length, w >= |x|, |y|, |z|.
         levels: M >= 3.
+        multiple: q are multiples of this, 1 to M / 3: no other levels, fewer symbols.
 
     Returns:
         [3, n] int32 with |q| <= M and q1² + q2² + q3² <= 2 M². Where rounding to the nearest breaks the second
         bound (about w = 0.5 at small M), all three are rounded towards 0.
     """
-    scaled = rotation[1:] * np.float32(levels * _ROOT2)
+    scaled = rotation[1:] * np.float32(levels * _ROOT2 / multiple)
+    most = levels // multiple
     q: I32 = np.rint(scaled).astype(np.int32)
-    np.clip(q, -levels, levels, out=q)
-    negative = (q * q).sum(axis=0, dtype=np.int64) > 2 * levels * levels
+    np.clip(q, -most, most, out=q)
+    negative = (q * q).sum(axis=0, dtype=np.int64) * multiple**2 > 2 * levels * levels
     if negative.any():
         q[:, negative] = np.trunc(scaled[:, negative]).astype(np.int32)
-    return q
+    return q if multiple == 1 else q * np.int32(multiple)
 
 
 def quat_values(q: I32, levels: int) -> F32:

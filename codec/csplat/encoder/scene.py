@@ -12,6 +12,7 @@ from csplat.encoder.between import Between
 from csplat.encoder.codebook import Books
 from csplat.encoder.colour import ShTables
 from csplat.encoder.container import FileChunk, Scene, json_payload
+from csplat.encoder.grades import Grades
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan
@@ -32,6 +33,7 @@ def chosen_settings(
     options: EncodeOptions,
     between: Between | None = None,
     shapes: ShapeTables | None = None,
+    grades: Grades | None = None,
 ) -> dict[str, Any]:
     """Return what was asked and what followed, JSON-compatible; it becomes the OPTS chunk."""
     said = {} if between is None else {between.key: dict(between.said)}
@@ -53,6 +55,7 @@ def chosen_settings(
         "adaptive": plan.adaptive if plan.sh_coding == "scalar" else 0.0,
         "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
         **_of_shapes(shapes),
+        **({} if grades is None else {"grades": grades.as_json()}),
         "effort": plan.coding.effort,
         "deflate": plan.coding.library,
         "seed": options.seed,

@@ -25,7 +25,7 @@ from csplat.encoder.quantise import (
     quantise_means,
 )
 from csplat.encoder.shape_tables import SHAPE_BOOK, ShapePart, ShapeTables, shape_blocks
-from csplat.encoder.tiling import Tile
+from csplat.encoder.tiling import Coarse, Tile
 from csplat.model import SplatModel
 
 __all__ = ["EncodedTile", "coarseness", "encode_tile", "tile_order"]
@@ -77,11 +77,11 @@ def encode_tile(
     """
     work = _Work(plan, [], {}, {}, set())
     rows, q, corner, codes = tile_order(model, tile, plan)
-    _opacities(work, _take(model.opacities, rows))
+    _opacities(work, _take(model.opacities, rows), tile.coarse)
     part = None if shapes is None else shapes.part(rows)
-    max_scale = _shape(work, _take(model.quats, rows), _take(model.scales, rows), part)
+    max_scale = _shape(work, _take(model.quats, rows), _take(model.scales, rows), part, tile.coarse)
     _means(work, model, rows, q, corner, codes, lattice_step(plan.lattice.step, tile.exponent))
-    _sh0(work, _take(model.sh0, rows))
+    _sh0(work, _take(model.sh0, rows), tile.coarse)
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: work.blocks}
     used: tuple[int, ...] = () if part is None else (SHAPE_BOOK,)
     if model.sh_degree:
@@ -142,18 +142,18 @@ def coarseness(rows: NDArray[np.intp], plan: Plan, tables: ShTables) -> NDArray[
     return np.clip(np.rint(0.5 * plan.adaptive * ratio), 0, _COARSEST).astype(np.int32)
 
 
-def _opacities(work: _Work, opacities: F32) -> None:
+def _opacities(work: _Work, opacities: F32, coarse: Coarse) -> None:
     levels = work.plan.opacity_levels
-    q = opacity_levels(opacities, levels, square=True)
+    q = opacity_levels(opacities, levels, square=True, multiple=coarse.opacities)
     work.blocks.append(blocks.levels_block(q, work.plan.coding))
     work.note("opacities", value_errors(opacities, opacity_values(q, levels, square=True)))
 
 
-def _shape(work: _Work, quats: F32, scales: F32, part: ShapePart | None) -> float:
+def _shape(work: _Work, quats: F32, scales: F32, part: ShapePart | None, coarse: Coarse) -> float:
     """Scales and rotations in their gauge. Returns the largest decoded scale."""
     plan = work.plan
-    shape = quantise_shape(quats, scales, plan, part)
-    if shape.exponent:
+    shape = quantise_shape(quats, scales, plan, part, coarse)
+    if shape.exponent > coarse.scales:
         work.coarsened.add("scales")
     check_finite("scales", shape.decoded_scales)
     work.blocks.extend(shape_blocks(shape.scales, shape.exponent, shape.quats, part, plan.coding))
@@ -181,11 +181,11 @@ def _means(
     work.note("means", distance_errors(np.ascontiguousarray(_take(model.means, rows).T), decoded))
 
 
-def _sh0(work: _Work, sh0: F32) -> None:
+def _sh0(work: _Work, sh0: F32, coarse: Coarse) -> None:
     plan = work.plan
     source = np.ascontiguousarray(sh0.T)
-    colour = quantise_colour(source, plan.sh0_step, plan.chroma_shift)
-    if colour.exponent:
+    colour = quantise_colour(source, plan.sh0_step, plan.chroma_shift, coarse.sh0)
+    if colour.exponent > coarse.sh0:
         work.coarsened.add("sh0")
     work.blocks.append(blocks.offset_block(_spec.ATTRIBUTE_SH0, colour.columns, colour.exponent, plan.coding))
     check_finite("sh0", colour.decoded)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Lattice", "Tile", "cut"]
+__all__ = ["EVEN", "Coarse", "Lattice", "Tile", "cut"]
 
 F32 = NDArray[np.float32]
 Rows = NDArray[np.intp]
@@ -35,16 +35,37 @@ class Lattice:
 
 
 @dataclass(frozen=True)
+class Coarse:
+    """By how much the steps of a tile's attributes are coarser than the file's, by choice (grades.py).
+
+    Attributes:
+        opacities, quats: integers are multiples of this, >= 1.
+        scales, means, sh0: the step is the file's times 2**this, >= 0.
+    """
+
+    opacities: int = 1
+    scales: int = 0
+    quats: int = 1
+    means: int = 0
+    sh0: int = 0
+
+
+EVEN = Coarse()
+
+
+@dataclass(frozen=True)
 class Tile:
     """Splats of one tile, before they are ordered.
 
     Attributes:
         rows: [n] places in the model.
-        exponent: the tile's step is the file's times 2**exponent.
+        exponent: the step of the tile's means is the file's times 2**exponent.
+        coarse: by how much the others' steps are coarser.
     """
 
     rows: Rows
     exponent: int
+    coarse: Coarse = EVEN
 
 
 def cut(means: F32, lattice: Lattice, tile_splats: int) -> list[Tile]:

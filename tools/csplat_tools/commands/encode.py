@@ -161,6 +161,15 @@ def encode(
     means_coding: Annotated[
         str, typer.Option(metavar="auto|morton|axis", rich_help_panel=_CODING, help="How the means are coded.")
     ] = "auto",
+    grades: Annotated[
+        int | None,
+        typer.Option(
+            metavar="1..5",
+            rich_help_panel=_PRECISION,
+            help="Sort splats into so many grades at most, each with steps of its own, by what pictures lose: a target"
+            " measures it, or --importance says it. 1 for one precision throughout.",
+        ),
+    ] = None,
     tile_splats: Annotated[
         int, typer.Option(metavar="1..65536", rich_help_panel=_CODING, help="Splats of a tile at most.")
     ] = TILE_SPLATS_MAX,
@@ -257,6 +266,7 @@ def encode(
             shape_codebook_size=shape_codebook_size,
             shape_escape_fraction=shape_escape_fraction,
             adaptive=adaptive,
+            grades=grades,
             tile_splats=tile_splats,
             effort=effort,
             deflate=deflate,

@@ -1,4 +1,7 @@
-"""What to keep of SH and how to code it: tried at one quality, compared by what each would take to reach the goal."""
+"""What to keep of SH, how to code it, and whether splats are graded.
+
+Tried at one quality, compared by what each would take to reach the goal.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +26,13 @@ _FIRST_SHARE = 1 / 32  # entries of an SH codebook per splat
 _SHARE_STEP = 4.0
 _SHARES = (1 / 512, 1 / 8)
 _FAR = 0.15  # of the bytes; a choice that was so much dearer is not tried again
+_ADAPTIVE = 1.0  # coarseness of unimportant splats that is tried beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
 
 
 @dataclass
 class Chooser:
-    """Compares what may be kept of SH. Owns what it found out of the scene without its upper bands.
+    """Compares choices. Owns what it found out of the scene without its upper bands.
 
     Attributes:
         trials: makes the files.
@@ -64,7 +68,7 @@ class Chooser:
             goal: PSNR that is wanted; `None` where a size is: then what the first one tried reaches.
             start: a file of these splats at this quality, where there is one.
         """
-        if not self._degree() or self.encoding.sh_coding == "none":
+        if not self._choosable() and not self.trials.gradable:
             return self.first()
         before, costs = self._costs, dict[Choice, float]()
         likely = min(before, key=lambda choice: before[choice]) if before else self.first()
@@ -81,13 +85,12 @@ class Chooser:
                 costs[choice] = _cost(trial, reached, wanted, self.floor(trial))
             return costs[choice]
 
-        if start.choice.coding == "codebook" and self.encoding.codebook_size is None:
-            self._descend(start.choice, cost)
-        if self.encoding.sh_coding == "auto":
-            cost(Choice("scalar"))
-        best = min(costs, key=lambda choice: costs[choice])
-        if self.encoding.sh_degree is None:
-            self._try_degrees(best, wanted, cost)
+        if self._choosable():
+            self._try_codings(start.choice, cost)
+            if self.encoding.sh_degree is None:
+                self._try_degrees(min(costs, key=lambda choice: costs[choice]), wanted, cost)
+        if self.trials.gradable:
+            cost(replace(min(costs, key=lambda choice: costs[choice]), graded=False))
         self._costs = costs
         return min(costs, key=lambda choice: costs[choice])
 
@@ -99,6 +102,16 @@ class Chooser:
             return math.inf if trial.choice.degree is None else self._without(trial.choice.degree)
         decoded = decode(trial.result.data)
         return self.trials.glimpsed(replace(trial.part.model.select(_rows(trial)), shN=decoded.shN))
+
+    def _try_codings(self, start: Choice, cost: Callable[[Choice], float]) -> None:
+        """Codebooks around one that was tried, and none."""
+        encoding = self.encoding
+        if start.coding == "codebook" and encoding.codebook_size is None:
+            self._descend(start, cost)
+        if encoding.sh_coding == "auto":
+            cost(Choice("scalar"))
+        if encoding.sh_coding != "codebook" and encoding.adaptive is None and self.trials.gradable:
+            cost(Choice("scalar", adaptive=_ADAPTIVE))
 
     def _descend(self, start: Choice, cost: Callable[[Choice], float]) -> None:
         """Codebooks larger and smaller by steps, as long as it pays."""
@@ -128,6 +141,10 @@ class Chooser:
         if degree not in self._truncated:
             self._truncated[degree] = self.trials.glimpsed(without_bands(self.source, degree))
         return self._truncated[degree]
+
+    def _choosable(self) -> bool:
+        """Whether there is SH to choose about."""
+        return self._degree() > 0 and self.encoding.sh_coding != "none"
 
     def _degree(self) -> int:
         fixed = self.encoding.sh_degree

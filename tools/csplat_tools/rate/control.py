@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,9 @@ from csplat.encoder import EncodeOptions, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.virtual import scene_frame
+from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.compare import comparison_cameras
+from csplat_tools.importances import measured_importance
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.choosing import Chooser
 from csplat_tools.rate.exchange import BYTES_PER_DB
@@ -48,6 +49,8 @@ _SIZE = (0.97, 1.0, 0.987)  # of the target: from, to, aimed at
 _TRIES = 9
 _MOST_CAMERAS = 24  # of the user's own judge
 _ENOUGH_CAMERAS = 40  # of the user's own decide what is left out; fewer would only keep what they show
+_GRADING_VIEWS = (40, 480, 360)  # views that say how precise splats have to be: number, width, height
+_GRADING_SEED = 7  # others than those that judge
 _STARVED = 40.0  # quality to begin with where a size is too small for all splats
 _ROUNDS = 4  # of leaving out splats for a size, each by what the one before taught
 _SAME = 0.03  # of the splats: fewer or more by less are not worth another round
@@ -107,23 +110,50 @@ def encode_to_target(
         encoding, files = bounded.encoding, bounded.encodes
     judging = comparison_cameras(source) if cameras is None else _evenly(cameras, _MOST_CAMERAS)
     judge = Judge.of_source(source, judging, background, encoding.threads)
-    trials = Trials(source, encoding, judge, importance, progress)
     if cameras is not None and all(np.ptp(wanted, axis=(0, 1)).max() == 0.0 for wanted in judge.wanted):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
     deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
-    unsure = prune is None and deciding is None and scene_frame(source).kind == "surrounding"
+    inside = deciding is None and scene_frame(source).kind == "surrounding"
+    unsure = prune is None and inside
+    measured, measured_in = None, 0
+    if encoding.grades != 1 and encoding.preset != "fast" and not inside:
+        seen_from = _evenly(deciding or virtual_cameras(source, *_GRADING_VIEWS, seed=_GRADING_SEED), _GRADING_VIEWS[0])
+        measured = _measured(source, seen_from, background, importance, encoding.threads, progress)
+        measured_in = 0 if measured is importance else len(seen_from)
     pruner = None
     if blocked is None and prune is not False and not unsure:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
         pruner = Pruner(source, deciding, options, progress)
+    trials = Trials(source, encoding, judge, importance, progress, measured)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
     removal_views = 0 if pruner is None else pruner.renders
-    report = summary(target, found, trials, source, removal_views, virtual=cameras is None)
+    report = summary(
+        target, found, trials, source, removal_views=removal_views, sensitivity_views=measured_in,
+        virtual=cameras is None,
+    )  # fmt: skip
     if unsure and blocked is None:
         report["why"].append(_ALL_STAY)
     seconds = round(time.perf_counter() - start, 3)
     return RateResult(found.result, {**report, "encodes": files + len(trials.made), "seconds": seconds})
+
+
+def _measured(
+    source: SplatModel,
+    cameras: Sequence[Camera],
+    background: Colour,
+    importance: NDArray[Any] | Importance | None,
+    threads: int | None,
+    progress: Progress | None,
+) -> Importance | None:
+    """What grades the splats: what the caller knows, or what views say; None where they see nothing."""
+    if isinstance(importance, Importance):
+        return importance
+    try:
+        found = measured_importance(source, cameras, background, threads=threads, progress=progress)
+    except InputError:
+        return None  # nothing shows
+    return found if importance is None else replace(found, sh=importance)
 
 
 def _blocked(target: RateTarget, encoding: EncodeOptions) -> str | None:

@@ -16,7 +16,14 @@ _FAR = 0.3  # dB above a target
 
 
 def summary(
-    target: RateTarget, found: Trial, trials: Trials, source: SplatModel, removal_views: int, *, virtual: bool
+    target: RateTarget,
+    found: Trial,
+    trials: Trials,
+    source: SplatModel,
+    *,
+    removal_views: int,
+    sensitivity_views: int,
+    virtual: bool,
 ) -> dict[str, Any]:
     """Report a search, JSON-compatible.
 
@@ -26,6 +33,7 @@ def summary(
         trials: all that were tried.
         source: the scene.
         removal_views: small views in which the removal of splats was measured, counted pass by pass.
+        sensitivity_views: views in which it was measured how precise splats have to be.
         virtual: the views are the virtual ones of `psnr`.
     """
     goal: dict[str, Any] = {"size_bytes": target.size_bytes, "psnr": target.psnr, "max_error": dict(target.max_error)}
@@ -51,6 +59,7 @@ def summary(
         "views": len(errors),
         "renders": trials.renders,
         "removal_views": removal_views,
+        "sensitivity_views": sensitivity_views,
         "tried": [trial.as_json() for trial in trials.made],
     }
 
@@ -59,6 +68,8 @@ def _why(target: RateTarget, found: Trial, trials: Trials, source: SplatModel) -
     """Sentences: how SH is coded and among what that was chosen, and how many splats went."""
     codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
     lines = [f"{_coding(found)}, quality {found.quality:.1f}: all steps follow from it"]
+    if found.grades > 1:
+        lines.append(f"splats are sorted into {found.grades} grades by what pictures lose, each with steps of its own")
     others = [coding for coding in codings if coding != _coding(found)]
     if others:
         expected = "take more" if target.psnr is not None else "look worse"
@@ -79,4 +90,5 @@ def _coding(trial: Trial) -> str:
     bands = f"SH degree {options['sh_degree']}"
     if options["sh_coding"] == "codebook":
         return f"{bands} by a codebook of {'+'.join(map(str, options['codebook_sizes']))}"
-    return f"{bands} value by value"
+    adaptive = " by importance" if options["adaptive"] == 1.0 else ""
+    return f"{bands} value by value{adaptive}"

@@ -35,11 +35,16 @@ class Choice:
         coding: "codebook", "scalar" or "none".
         share: entries of a codebook per splat; `None`: what the options say.
         degree: bands up to this one are kept; `None`: what the options say.
+        adaptive: how much coarser unimportant splats are; `None`: what the options say.
+        graded: splats are sorted into grades by what was measured, if anything was; else nothing that was measured is
+            heeded.
     """
 
     coding: str
     share: float | None = None
     degree: int | None = None
+    adaptive: float | None = None
+    graded: bool = True
 
     def options(self, encoding: EncodeOptions, splats: int, quality: float) -> EncodeOptions:
         """Options of the encoder with this choice, at a quality."""
@@ -47,7 +52,16 @@ class Choice:
         if self.coding == "codebook" and self.share is not None and size is None:
             size = 1 << round(math.log2(min(max(self.share * splats, _ENTRIES[0]), _ENTRIES[1])))
         degree = encoding.sh_degree if self.degree is None else self.degree
-        return replace(encoding, sh_coding=self.coding, codebook_size=size, sh_degree=degree, quality=quality)
+        adaptive = encoding.adaptive if self.adaptive is None else self.adaptive
+        return replace(
+            encoding,
+            sh_coding=self.coding,
+            codebook_size=size,
+            sh_degree=degree,
+            adaptive=adaptive,
+            grades=encoding.grades if self.graded else 1,
+            quality=quality,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +103,11 @@ class Trial:
         """Size of the file."""
         return len(self.result.data)
 
+    @property
+    def grades(self) -> int:
+        """How many grades its splats are sorted into."""
+        return len(self.result.report.options.get("grades", {}).get("splats", [0]))
+
     def as_json(self) -> dict[str, Any]:
         """Say what was tried and what came of it."""
         options = self.result.report.options
@@ -98,6 +117,7 @@ class Trial:
             "sh_coding": options["sh_coding"],
             "sh_degree": options["sh_degree"],
             "codebook_sizes": options["codebook_sizes"],
+            "grades": self.grades,
             "size_bytes": self.size_bytes,
             "psnr": None if math.isnan(self.psnr) else round(self.psnr, 3),
         }
@@ -108,6 +128,7 @@ class Trials:
 
     Attributes:
         judge: what the source looks like.
+        gradable: whether something was measured that sorts splats into grades.
         made: every file, in order.
         renders: how many pictures were rendered, the source's among them.
     """
@@ -119,8 +140,11 @@ class Trials:
         judge: Judge,
         importance: NDArray[Any] | Importance | None,
         progress: Progress | None,
+        measured: Importance | None = None,
     ) -> None:
         self._source, self._encoding, self._importance, self._progress = source, encoding, importance, progress
+        self._measured = measured
+        self.gradable = measured is not None
         self.judge = judge
         self.made: list[Trial] = []
         self.renders = count = len(judge.cameras)
@@ -133,7 +157,7 @@ class Trials:
         for trial in self.made:
             if trial.part is part and trial.options == options:
                 return trial
-        between, importance = None, self._importance
+        between, importance = None, self._measured if self.gradable and choice.graded else self._importance
         if part.rows is not None:
             if isinstance(importance, Importance):
                 importance = importance.select(part.rows)

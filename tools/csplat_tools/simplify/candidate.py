@@ -94,19 +94,25 @@ class Candidate:
         result = encode_with_report(
             self.fitted,
             replace(encoding, quality=quality),
-            importance=self._by_shape() if encoding.shape_codebook_size else self._weights,
+            importance=self._measured() if encoding.shape_codebook_size or self._grades(encoding) else self._weights,
             between=between,
             progress=self._progress,
         )
         return SimplifiedFile(result, report)
 
-    def _by_shape(self) -> Importance:
-        """How much pictures depend on shapes, too."""
+    def _grades(self, encoding: EncodeOptions) -> bool:
+        """Whether splats are to be sorted into grades."""
+        return not self._session.inside and encoding.grades != 1 and encoding.preset != "fast"
+
+    def _measured(self) -> Importance:
+        """How much pictures depend on shapes, and on all else, too."""
         if self._importance is None:
             session, options = self._session, self._session.options
             found = measure_sensitivity(
                 self.fitted, session.views.used, background=options.background, threads=options.threads,
                 progress=self._progress,
             )  # fmt: skip
-            self._importance = replace(StoredSensitivity.of(self.fitted, found).importance(), sh=self._weights)
+            measured = StoredSensitivity.of(self.fitted, found).importance()
+            curvatures = None if session.inside else measured.curvatures
+            self._importance = replace(measured, sh=self._weights, curvatures=curvatures)
         return self._importance

@@ -16,7 +16,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.simplify.colours import Fitted, fit
 from csplat_tools.simplify.judge import Judge, loss_as_psnr, render_pictures
 from csplat_tools.simplify.options import SimplifyOptions, Target
@@ -65,6 +65,8 @@ class Session:
         order: of removal.
         checked: judges by views that were not used.
         seconds: by stage.
+        inside: virtual views of surroundings decide, which do not stand where cameras do: they may say what is left
+            out, but not how precise the rest has to be.
     """
 
     source: SplatModel
@@ -74,6 +76,7 @@ class Session:
     order: Order
     checked: Judge
     seconds: dict[str, float]
+    inside: bool
 
     def pruned(self, gone: int) -> I64:
         """Source splats that are left when the first `gone` of the order are removed."""
@@ -116,7 +119,8 @@ def prepare(
     start = time.perf_counter()
     order = removal_order(source, views, options, left, progress)
     seconds["rounds"] = time.perf_counter() - start
-    return Session(source, options, views, wanted, order, checked, seconds)
+    inside = cameras is None and scene_frame(source).kind == "surrounding"
+    return Session(source, options, views, wanted, order, checked, seconds, inside)
 
 
 def simplify(

@@ -1,0 +1,180 @@
+"""Grades: splats whose errors show alike share tiles, and each grade has steps of its own.
+
+Where a step is twice as coarse, the squared error of pictures grows fourfold and an integer takes a bit less; so bits
+are spent best where every integer adds as much error as any other. Splats differ in that by orders of magnitude. The
+format knows no steps by splat, but each tile may coarsen the file's lattices by powers of two, and nothing keeps tiles
+from overlapping: as many as there are grades fill the same space. What it costs to say which splat is of which grade
+(centres lie less densely in a tile of fewer) comes back where sizes, opacities and colours of a grade are alike.
+
+Splats are assigned as in k-means, by the bytes that they would cost at equal error (the divergence is that of Itakura
+and Saito); the steps of a grade follow from the mean errors of its splats.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.curvature import GRADED, Curvatures, step_errors
+from csplat.encoder.importance import trusted
+from csplat.encoder.options import EncodeOptions
+from csplat.encoder.plan import Plan
+from csplat.encoder.tiling import Coarse
+from csplat.model import SplatModel
+
+__all__ = ["Grades", "choose_grades"]
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_SPLATS = 5000  # of a grade, about: each tile has Huffman codes of its own
+_MOST = 5
+_FEWEST = 500  # splats; a smaller grade joins others
+_SAMPLE = 1 << 15  # splats that the steps of grades are found from
+_BLOCK = 1 << 16
+_ROUNDS = 30
+_FINER, _COARSER = 4.0, 6.0  # octaves from the plan's steps, at most
+_LARGEST_STEP = 1.0  # of a log scale
+_MOST_LEVELS = 255  # of them, where no knob says more
+_FEWEST_LEVELS = 4  # of opacities and of rotations
+_ONE_BYTE = {"opacities": 255, "quats": 127}  # levels whose integers fit a byte plane
+_KNOBS = {
+    "opacities": ("opacity_levels",),
+    "scales": ("scale_step",),
+    "quats": ("quat_levels",),
+    "means": ("position_bits", "position_step", "position_error"),
+    "sh0": ("sh0_step",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Grades:
+    """Which grade each splat is of, and by how much its steps are coarser than the file's.
+
+    Attributes:
+        index: [N] uint8.
+        coarse: by grade.
+    """
+
+    index: U8
+    coarse: Sequence[Coarse]
+
+    def as_json(self) -> dict[str, list[int]]:
+        """Say how many splats there are by grade, and by how much their steps are coarser."""
+        counts = np.bincount(self.index, minlength=len(self.coarse))
+        columns = {name: [getattr(one, name) for one in self.coarse] for name in GRADED}
+        return {"splats": [int(count) for count in counts], **columns}
+
+
+def choose_grades(
+    model: SplatModel, curvatures: Curvatures | None, plan: Plan, options: EncodeOptions
+) -> tuple[Plan, Grades | None]:
+    """Sort the splats into grades, at the picture error that the plan has in linear approximation.
+
+    Args:
+        model: the scene.
+        curvatures: what pictures lose by its splats' errors, if that is known; without it, there is one grade.
+        plan: the lattices.
+        options: `grades`, at most; and the knobs: what is set holds for all splats.
+
+    Returns:
+        The plan with the finest steps that a grade has, and the grades; or the plan as it was, and None.
+    """
+    count = min(options.grades or _MOST, round(len(model) / _SPLATS))
+    free = [name for name in GRADED if all(getattr(options, knob) is None for knob in _KNOBS[name])]
+    if curvatures is None or count < 2 or not free or options.shape_codebook_size:
+        return plan, None
+    integers = np.array([GRADED[name] for name in free], np.float64)
+    errors = step_errors(model, curvatures, plan)[:, [list(GRADED).index(name) for name in free]]
+    # Levels that the plan would have finer, if they were not bounded, say nothing of how much error is wanted.
+    bounded = {"opacities": plan.opacity_levels >= _MOST_LEVELS, "quats": plan.quat_levels >= _MOST_LEVELS}
+    says = np.array([not bounded.get(name, False) for name in free])
+    allowed = errors[:, says].mean(axis=0).sum() / max(1.0, integers[says].sum())
+    if not allowed > 0.0:
+        return plan, None
+    relative: F64 = trusted(errors, model) / allowed
+    octaves = _clustered(relative, integers, count)
+    return _as_steps(plan, _assigned(relative, integers, octaves), octaves, free)
+
+
+def _clustered(errors: F64, integers: F64, count: int) -> F64:
+    """Octaves [K, A] by which the steps of at most `count` grades differ from the plan's.
+
+    Args:
+        errors: [N, A], of splats and attributes at the plan's steps; 1 is what an integer is to add.
+        integers: [A], that an attribute has.
+        count: K at most.
+    """
+    sample = errors[:: max(1, len(errors) // _SAMPLE)]
+    energy = (integers * np.log(np.maximum(sample, np.finfo(np.float64).tiny))).sum(axis=1)
+    places = np.empty(len(sample), np.uint8)
+    places[np.argsort(energy, kind="stable")] = np.arange(len(sample)) * count // len(sample)
+    octaves = _octaves(sample, places, integers)
+    for _ in range(_ROUNDS):
+        before, places = places, _assigned(sample, integers, octaves)
+        if (places == before).all():
+            break
+        octaves = _octaves(sample, places, integers)
+    splats = np.bincount(places)[np.unique(places)] * (len(errors) / len(sample))
+    large: F64 = octaves[splats >= min(_FEWEST, splats.max())]
+    return large
+
+
+def _octaves(errors: F64, places: U8, integers: F64) -> F64:
+    """The best steps of the grades that have splats: those at which integers add 1 each, on average."""
+    means = np.array([errors[places == grade].mean(axis=0) for grade in np.unique(places)])
+    best: F64 = 0.5 * np.log2(integers / np.maximum(means, np.finfo(np.float64).tiny))
+    return np.clip(best, -_FINER, _COARSER)
+
+
+def _assigned(errors: F64, integers: F64, octaves: F64) -> U8:
+    """The grade of each splat, [N]: where its bits and its error, worth as many, are fewest."""
+    grown, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
+    index = np.empty(len(errors), np.uint8)
+    for at in range(0, len(errors), _BLOCK):
+        part = errors[at : at + _BLOCK]
+        costs = [(part * grown[grade]).sum(axis=1) - saved[grade] for grade in range(len(octaves))]
+        index[at : at + _BLOCK] = np.argmin(np.stack(costs), axis=0)
+    return index
+
+
+def _as_steps(plan: Plan, index: U8, octaves: F64, free: Sequence[str]) -> tuple[Plan, Grades | None]:
+    """Steps of the file that are those of the finest grade, and whole multiples of them for the others."""
+    used = np.unique(index)
+    if len(used) < 2:
+        return plan, None
+    levels = {"opacities": plan.opacity_levels, "quats": plan.quat_levels}
+    steps = {"scales": plan.scale_step, "means": plan.lattice.step, "sh0": plan.sh0_step}
+    coarse: dict[str, list[int]] = {}
+    for column, name in enumerate(free):
+        wanted = octaves[used, column]
+        if name in levels:
+            levels[name], coarse[name] = _coarser_levels(levels[name], wanted, _ONE_BYTE[name])
+            continue
+        if name == "scales":
+            wanted = np.minimum(wanted, math.log2(_LARGEST_STEP / steps[name]))
+        steps[name] *= 2.0 ** float(wanted.min())
+        coarse[name] = [round(octave) for octave in wanted - wanted.min()]
+    plan = replace(
+        plan,
+        lattice=replace(plan.lattice, step=steps["means"]),
+        scale_step=steps["scales"],
+        sh0_step=steps["sh0"],
+        opacity_levels=levels["opacities"],
+        quat_levels=levels["quats"],
+    )
+    by_grade = [Coarse(**{name: coarse[name][grade] for name in free}) for grade in range(len(used))]
+    return plan, Grades(np.searchsorted(used, index).astype(np.uint8), by_grade)
+
+
+def _coarser_levels(levels: int, octaves: F64, one_byte: int) -> tuple[int, list[int]]:
+    """As many levels as the finest grade wants and a byte holds, and multiples of their step for the others."""
+    finest = min(
+        round(levels * 2.0 ** -float(octaves.min())), one_byte if levels <= one_byte else max(levels, _MOST_LEVELS)
+    )
+    most = max(1, finest // _FEWEST_LEVELS)
+    return finest, [min(max(1, round(finest / levels * 2.0 ** float(octave))), most) for octave in octaves]

@@ -1,0 +1,336 @@
+"""Grades: splats sorted by what pictures lose, tiles with steps of their own; files that both decoders read."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.encoder.apart import cut_scene
+from csplat.encoder.curvature import GRADED, Curvatures, step_errors
+from csplat.encoder.freezing import freeze
+from csplat.encoder.grades import choose_grades
+from csplat.encoder.importance import trusted
+from csplat.encoder.measure import covariance_entries, measure_errors
+from csplat.encoder.plan import make_plan
+from csplat.encoder.quantise import opacity_levels, quat_levels
+from csplat.errors import InputError
+from csplat.model import normalise_quats
+from csplat_conformance.validator import validate
+
+ROOT = Path(__file__).resolve().parent.parent
+COUNT = 12_000  # splats, enough for two grades
+
+
+def unequal(model, seed=0, spread=3.0):
+    """Curvatures that differ from splat to splat by orders of magnitude."""
+    rng = np.random.default_rng(seed)
+    size = rng.lognormal(0.0, spread, len(model))
+    roots = rng.normal(size=(len(model), 6, 3))
+    rows, columns = np.triu_indices(6)
+    matrices = (roots @ roots.transpose(0, 2, 1))[:, rows, columns]
+    return Curvatures(size, matrices * size[:, None], size, size)
+
+
+def important(model, **changes):
+    return Importance(np.ones(len(model)), curvatures=replace(unequal(model), **changes))
+
+
+def encoded(model, importance=None, **options):
+    """Encode, and check what must hold of any file."""
+    result = encode_with_report(model, EncodeOptions(**options), importance=importance)
+    assert () == tuple(validate(result.data).violations)
+    decoded = csplat.decode(result.data)
+    for name, (largest, rms) in measure_errors(model, decoded, result.source_index).items():
+        assert largest <= result.report.errors[name][0], name
+        assert rms <= result.report.errors[name][1], name
+    return result, decoded
+
+
+@pytest.fixture
+def model(make_model):
+    return make_model(COUNT, 0)
+
+
+# what errors do
+
+
+def test_shape_curvatures_are_those_of_the_covariance(make_model):
+    model = make_model(50, 0)
+    plan = make_plan(model, EncodeOptions(scale_step=1.0, quat_levels=100), importance_given=True)
+    curvatures = unequal(model)
+    found = step_errors(model, curvatures, plan)
+    rows, columns = np.triu_indices(6)
+    matrices = np.zeros((50, 6, 6))
+    matrices[:, rows, columns] = matrices[:, columns, rows] = curvatures.shapes
+
+    def lost(quats, scales):
+        """What a small change of shape loses, by the covariance over the trace that it had."""
+        variances = np.exp(2.0 * model.scales.T.astype(np.float64))
+        before = covariance_entries(model.quats.T, variances) / variances.sum(axis=0)
+        after = covariance_entries(quats.T, np.exp(2.0 * scales.T.astype(np.float64))) / variances.sum(axis=0)
+        vectors = (after - before).T * np.sqrt([1, 1, 1, 2, 2, 2])
+        return np.einsum("ni,nij,nj->n", vectors, matrices, vectors)
+
+    small = 1e-4
+    sizes = sum(lost(model.quats, model.scales + small * np.eye(3)[axis]) for axis in range(3)) / small**2
+    np.testing.assert_allclose(found[:, 1], sizes / 12.0, rtol=2e-3)
+    turns = np.zeros(50)
+    for axis in range(3):
+        turn = np.r_[1.0, small / 2.0 * np.eye(3)[axis]]
+        turns += lost(_multiplied(model.quats.astype(np.float64), turn), model.scales) / small**2
+    angle = 2.0 / (plan.quat_levels * np.sqrt(2.0))
+    np.testing.assert_allclose(found[:, 2], turns * angle**2 / 12.0, rtol=2e-3)
+
+
+def _multiplied(q, turn):
+    """q · turn: a rotation in the splat's own axes."""
+    w, v = q[:, :1], q[:, 1:]
+    a, b = turn[0], turn[1:]
+    return np.concatenate([w * a - (v @ b)[:, None], w * b + a * v + np.cross(v, b)], axis=1)
+
+
+def test_twice_the_step_is_four_times_the_error(model):
+    curvatures = unequal(model)
+    fine, coarse = (
+        step_errors(model, curvatures, make_plan(model, EncodeOptions(**options), importance_given=True))
+        for options in (
+            {"position_step": 0.01, "scale_step": 0.01, "sh0_step": 0.01, "quat_levels": 200, "opacity_levels": 200},
+            {"position_step": 0.02, "scale_step": 0.02, "sh0_step": 0.02, "quat_levels": 100, "opacity_levels": 100},
+        )
+    )
+    bright = model.opacities > 0.01
+    np.testing.assert_allclose(coarse[bright], 4.0 * fine[bright], rtol=1e-5)
+
+
+def test_what_rounding_loses_is_foretold():
+    pytest.importorskip("numba", reason="pictures want the extra [render]")
+    from captures import cameras, shell
+
+    from csplat_render import render
+    from csplat_tools.importances import measured_importance
+
+    scene, views = shell(0), cameras(12)
+    options = EncodeOptions(quality=58)
+    importance = measured_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
+    plan = make_plan(scene, options, importance_given=True)
+    foretold = step_errors(scene, importance.curvatures, plan).sum()
+    decoded = csplat.decode(encode_with_report(scene, options).data)
+    lost = np.mean([np.mean(np.square(render(decoded, view).rgb - render(scene, view).rgb)) for view in views])
+    assert foretold / 1.6 < lost < 1.6 * foretold
+
+
+# the file
+
+
+def test_grades_have_steps_of_their_own(model):
+    plain, _ = encoded(model)
+    graded, _ = encoded(model, important(model))
+    said = graded.report.options["grades"]
+    assert sum(said["splats"]) == COUNT
+    assert len(said["splats"]) == graded.report.tile_count == 2 > plain.report.tile_count
+    for name in GRADED:
+        assert min(said[name]) == (1 if name in ("opacities", "quats") else 0)
+    assert any(max(said[name]) > 1 for name in GRADED)
+    assert graded.report.notes == ()
+
+
+@pytest.mark.parametrize("name", ["means", "opacities", "scales", "sh0"])
+def test_what_matters_more_is_kept_better(model, name):
+    importance = important(model)
+    result, decoded = encoded(model, importance, quality=45)
+    source = model if name != "scales" else replace(model, scales=np.sort(model.scales, axis=1))
+    if name == "scales":
+        decoded = replace(decoded, scales=np.sort(decoded.scales, axis=1))
+    errors = np.abs(getattr(decoded, name) - getattr(source, name)[result.source_index]).reshape(COUNT, -1).mean(axis=1)
+    order = np.argsort(importance.curvatures.means[result.source_index])
+    assert errors[order[-COUNT // 10 :]].mean() < 0.75 * errors[order[: COUNT // 10]].mean()
+
+
+def test_knobs_that_are_set_hold_for_all_splats(model):
+    result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
+    said = result.report.options
+    assert (said["scale_step"], said["opacity_levels"]) == (0.01, 100)
+    assert set(said["grades"]["scales"]) == set(said["grades"]["means"]) == {0}
+    assert set(said["grades"]["opacities"]) == {1}
+    assert max(said["grades"]["sh0"]) > 0
+
+
+@pytest.mark.parametrize("options", [{"grades": 1}, {"shape_codebook_size": 16}])
+def test_one_grade_is_as_without_curvatures(model, options):
+    with_them, without = important(model), Importance(np.ones(COUNT))
+    assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
+
+
+def test_few_splats_are_of_one_grade(make_model):
+    few = make_model(200, 1)
+    assert "grades" not in encoded(few, important(few))[0].report.options
+
+
+def test_where_nothing_is_lost_all_is_one_grade(model):
+    nothing = Curvatures(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
+    result, _ = encoded(model, Importance(np.ones(COUNT), curvatures=nothing))
+    assert "grades" not in result.report.options
+
+
+def test_a_frozen_scene_has_one_grade(model):
+    assert freeze(model, importance=important(model)).decided.grades is None
+
+
+def test_huge_values_stay_apart_from_their_grade(model):
+    sh0 = model.sh0.copy()
+    sh0[5] = 3e12
+    exploded = replace(model, sh0=sh0)
+    result, decoded = encoded(exploded, important(exploded))
+    place = np.argsort(result.source_index)
+    errors = np.abs(decoded.sh0[place] - sh0).max(axis=1)
+    assert np.delete(errors, 5).max() < 5.0  # the coarsest grade's step, not that of 3e12
+
+
+def test_colours_are_chosen_for_what_a_decoder_sees(model):
+    from csplat.encoder.between import Between
+
+    shown = []
+
+    def colours(seen):
+        shown.append(seen)
+        return seen.sh0, seen.shN
+
+    between = Between(COUNT, np.arange(COUNT), colours)
+    result = encode_with_report(model, EncodeOptions(), importance=important(model), between=between)
+    decoded = csplat.decode(result.data)
+    for name in ("means", "quats", "scales", "opacities"):
+        np.testing.assert_array_equal(getattr(shown[0], name)[result.source_index], getattr(decoded, name))
+
+
+def test_sh_is_tried_on_all_grades(make_model):
+    model = make_model(COUNT, 1)
+    result, _ = encoded(model, important(model), preset="balanced")
+    assert "grades" in result.report.options
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("means", np.ones(3)),
+        ("means", np.full(COUNT, -1.0)),
+        ("opacities", np.full(COUNT, np.nan)),
+        ("colours", np.ones(COUNT, np.int64)),
+        ("shapes", np.ones((COUNT, 6))),
+    ],
+)
+def test_other_curvatures_are_refused(model, field, value):
+    with pytest.raises(InputError, match=f"curvatures of {field}"):
+        encode_with_report(model, importance=important(model, **{field: value}))
+
+
+def test_the_bytes_do_not_depend_on_threads():
+    script = f"""
+import sys
+sys.path[:0] = [{str(ROOT / "tests")!r}]
+import hashlib
+import numpy as np
+from csplat import SplatModel
+from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.model import normalise_quats
+from test_grades import COUNT, important
+rng = np.random.default_rng(0)
+model = SplatModel(
+    means=rng.normal(size=(COUNT, 3)).astype(np.float32),
+    quats=normalise_quats(rng.normal(size=(COUNT, 4)).astype(np.float32)),
+    scales=rng.normal(-4, 1, (COUNT, 3)).astype(np.float32),
+    opacities=rng.uniform(0, 1, COUNT).astype(np.float32),
+    sh0=rng.normal(size=(COUNT, 3)).astype(np.float32),
+    shN=np.zeros((COUNT, 0, 3), np.float32),
+)
+data = encode_with_report(model, EncodeOptions(threads=int(sys.argv[1])), importance=important(model)).data
+print(hashlib.sha256(data).hexdigest())
+"""
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", script, threads],
+            env={**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads},
+            capture_output=True, text=True, check=True,
+        ).stdout.strip()
+        for threads in ("1", "2")
+    }  # fmt: skip
+    assert len(found) == 1
+
+
+def test_javascript_reads_the_same(model, tmp_path):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    result, decoded = encoded(model, important(model))
+    path = tmp_path / "graded.csplat"
+    path.write_bytes(result.data)
+    script = f"""
+import {{ readFileSync }} from 'node:fs';
+import {{ createHash }} from 'node:crypto';
+import {{ decode }} from {str((ROOT / "codec/js/decoder.mjs").as_uri())!r};
+const scene = await decode(new Uint8Array(readFileSync({str(path)!r})));
+const hash = createHash('sha256');
+for (const name of ['means', 'quats', 'scales', 'opacities', 'sh0'])
+  hash.update(new Uint8Array(scene[name].buffer, scene[name].byteOffset, scene[name].byteLength));
+console.log(hash.digest('hex'));
+"""
+    seen = subprocess.run([node, "--input-type=module", "-e", script], capture_output=True, text=True, check=True)
+    digest = hashlib.sha256()
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        digest.update(np.ascontiguousarray(getattr(decoded, name)).tobytes())
+    assert seen.stdout.strip() == digest.hexdigest()
+
+
+# its parts
+
+
+def test_tiles_of_a_grade_are_as_coarse_as_it_is(model):
+    plan = make_plan(model, EncodeOptions(), importance_given=True)
+    finer, grades = choose_grades(model, unequal(model), plan, EncodeOptions())
+    tiles = cut_scene(model, finer, grades)
+    assert sorted(np.concatenate([tile.rows for tile in tiles])) == list(range(COUNT))
+    for tile in tiles:
+        assert len(set(grades.index[tile.rows])) == 1
+        assert tile.coarse == grades.coarse[grades.index[tile.rows[0]]]
+        assert tile.exponent >= tile.coarse.means
+    assert min(one.means for one in grades.coarse) == min(one.sh0 for one in grades.coarse) == 0
+
+
+@pytest.mark.parametrize("multiple", [2, 3, 7])
+def test_coarse_opacities_are_multiples_and_the_ends(multiple):
+    alpha = np.linspace(0, 1, 999, dtype=np.float32)
+    q = opacity_levels(alpha, 50, square=True, multiple=multiple)
+    assert (q[0], q[-1]) == (0, 50)
+    assert set(q) <= {*range(0, 51, multiple), 50}
+    assert np.abs(q - 50 * np.sqrt(alpha)).max() <= multiple
+    assert (np.diff(q) >= 0).all()
+
+
+@pytest.mark.parametrize(("levels", "multiple"), [(12, 4), (50, 7), (255, 30)])
+def test_coarse_rotations_are_multiples_within_bounds(levels, multiple):
+    rng = np.random.default_rng(0)
+    rotation = np.abs(normalise_quats(rng.normal(size=(20_000, 4)).astype(np.float32)))
+    rotation = np.sort(rotation, axis=1)[:, ::-1].T.copy()
+    rotation[:, 0] = 0.5
+    q = quat_levels(rotation, levels, multiple)
+    assert not (q % multiple).any()
+    assert np.abs(q).max() <= levels
+    assert ((q.astype(np.int64) ** 2).sum(axis=0) <= 2 * levels**2).all()
+    assert np.abs(q - rotation[1:] * levels * 2**0.5).max() <= multiple
+
+
+def test_measured_weights_are_trusted_down_to_a_fifth_of_what_is_suggested(model):
+    measured = np.zeros((COUNT, 2))
+    measured[:10] = 1.0
+    floored = trusted(measured, model)
+    assert (floored >= measured).all()
+    assert floored[10:].min() > 0.0
+    np.testing.assert_allclose(floored[10:, 0], trusted(measured[:, 0], model)[10:])
+    assert floored[10:].mean() < 0.25 * measured.mean()
