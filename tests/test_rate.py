@@ -113,6 +113,14 @@ def test_meet_stops_at_a_bound():
     assert [place for place, _ in points] == [50.0, 100.0]
 
 
+def test_a_plateau_is_crossed():
+    def value(place):
+        return 34.0 if place < 55.0 else place - 21.0
+
+    points = meet(value, Window(38.0, 38.25, 38.1), start=42.0, slope=1.0, bounds=(24, 110), tries=9)
+    assert 38.0 <= points[-1][1] <= 38.25
+
+
 def test_meet_gives_up_where_values_grow_no_more():
     points = meet(lambda q: min(q, 40.0), Window(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 100), tries=9)
     assert len(points) < 6
@@ -271,7 +279,7 @@ def test_of_surroundings_all_splats_stay_unless_asked(crowded):
     )
     assert scene_frame(surroundings).kind == "surrounding"
     report = encode_to_target(surroundings, RateTarget(psnr=30.0), views=24).report
-    assert (report["splats"], report["removal_views"]) == (900, 0)
+    assert (report["splats"], report["removal_views"], report["sensitivity_views"]) == (900, 0, 0)
     assert "all splats stay" in report["why"][-1]
     assert encode_to_target(surroundings, RateTarget(psnr=30.0), views=24, prune=True).report["removal_views"] > 0
 
@@ -368,3 +376,44 @@ def test_the_command_refuses_what_says_nothing(tmp_path, ply, arguments, status,
     assert done.exit_code == status
     assert message in " ".join(done.stderr.replace("│", " ").split())
     assert not out.exists()
+
+
+# grades
+
+
+@pytest.fixture(scope="module")
+def unequal():
+    """An object of 9,000 splats, most of them small."""
+    rng = np.random.default_rng(3)
+    means = rng.standard_normal((9000, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    return SplatModel(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (9000, 1)),
+        scales=np.repeat(rng.normal(-4.0, 0.8, (9000, 1)), 3, axis=1).astype(np.float32),
+        opacities=rng.uniform(0.05, 0.95, 9000).astype(np.float32),
+        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
+        shN=np.zeros((9000, 0, 3), np.float32),
+    )
+
+
+def test_splats_are_graded_where_that_makes_files_smaller(unequal):
+    def reached(**knobs):
+        target, views = RateTarget(psnr=38.0), cameras(41)
+        return encode_to_target(unequal, target, EncodeOptions(**knobs), cameras=views, prune=False).report
+
+    graded, even, fast = reached(), reached(grades=1), reached(preset="fast")
+    assert graded["chosen"]["grades"] == 2
+    assert graded["sensitivity_views"] == 40
+    assert any("graded" in line or "grades" in line for line in graded["why"])
+    assert graded["size_bytes"] < 0.97 * even["size_bytes"]
+    for report in (even, fast):
+        assert (report["chosen"]["grades"], report["sensitivity_views"]) == (1, 0)
+
+
+def test_an_importance_that_is_given_stays(unequal):
+    weights = np.linspace(1.0, 2.0, len(unequal))
+    found = encode_to_target(
+        unequal, RateTarget(psnr=34.0), cameras=cameras(41), prune=False, importance=weights
+    ).report
+    assert (found["chosen"]["grades"], found["sensitivity_views"]) == (2, 40)

@@ -16,6 +16,8 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.twin import Decisions, render_exact
+from csplat_render.virtual import scene_frame
+from csplat_tools.importances import weights_of
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
@@ -236,6 +238,28 @@ def test_a_file_gives_back_what_was_written(stored):
     assert (30, 21) == importance.shape_metric.shape
     rows, columns = np.triu_indices(8)
     np.testing.assert_allclose(1.0, importance.sh_metric[:, rows == columns].mean(axis=1), rtol=1e-3)
+
+
+def test_views_say_how_precise_splats_have_to_be(stored):
+    path, model, found = stored
+    curvatures = read_sensitivity(path, model).importance().curvatures
+    np.testing.assert_allclose(curvatures.means, found.means_squares / 3.0, rtol=1e-5)
+    np.testing.assert_allclose(curvatures.shapes, found.shape_metric / 3.0, rtol=1e-4, atol=1e-9)
+
+
+def test_virtual_views_do_not_say_it_inside_of_surroundings(stored):
+    path, model, _ = stored
+    read = read_sensitivity(path, model)
+    far = np.linspace(0.0, 20.0 * np.pi, len(model), dtype=np.float32)[:, None]
+    ring = 500.0 * np.concatenate([np.cos(far), np.sin(far), 0.0 * far], axis=1)
+    scales = np.where(np.arange(len(model))[:, None] % 2, np.float32(-5.0), np.float32(3.0))
+    means = np.where(np.arange(len(model))[:, None] % 2, model.means, ring).astype(np.float32)
+    inside = replace(model, means=means, scales=np.broadcast_to(scales, (len(model), 3)).astype(np.float32))
+    assert scene_frame(inside).kind == "surrounding"
+    virtual = replace(read, source="virtual")
+    assert weights_of(virtual, inside).curvatures is None
+    assert weights_of(read, inside).curvatures is not None
+    assert weights_of(virtual, model).curvatures is not None
 
 
 def test_a_file_is_refused_for_another_scene(stored):

@@ -27,7 +27,7 @@ from typing import Any
 from distortion_curves import Point, bracket, rate_at
 from distortion_plot import plot
 from distortion_simplified import Shrinker
-from distortion_tables import Measured, tables
+from distortion_tables import GRADED, Measured, tables
 from machine import describe_machine
 from peers import Peer, find_splat_transform, run_timed, transform
 from scenes import DATA, ROOT, Scene, find_scenes
@@ -49,8 +49,7 @@ __all__ = ["Kept", "main"]
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
-_GRADED = "graded"  # balanced, with what views say of how precise splats have to be
-_VIEWS = (40, 480, 360)  # of those, virtual ones of objects: number, width, height
+_VIEWS = (40, 480, 360)  # that grade objects, virtual ones: number, width, height
 _SEED = 7  # others than those that judge
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
@@ -212,7 +211,7 @@ def _plain(bench: _Bench) -> None:
     choices = list(_CHOICES) if has_sh else [("balanced", "none")]
     drawn = choices[:2]
     if bench.importance is not None:
-        graded = [(_GRADED, coding) for coding in dict.fromkeys(coding for _, coding in choices)]
+        graded = [(GRADED, coding) for coding in dict.fromkeys(coding for _, coding in choices)]
         choices, drawn = [*choices, *graded], [*drawn, *graded]
     goals = bench.goals()
     for preset, coding in choices:
@@ -235,7 +234,7 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
     def measure(quality: float) -> Point:
         quality = round(quality, 2)
         options = EncodeOptions(quality=quality, sh_coding="auto" if coding == "none" else coding)
-        graded = preset == _GRADED
+        graded = preset == GRADED
         options = replace(options, adaptive=1.0) if graded else replace(options, preset=preset)
         start = time.perf_counter()
         data = encode_with_report(bench.source, options, importance=bench.importance if graded else None).data

@@ -60,6 +60,7 @@ def plot(results: Mapping[str, Measured], path: Path) -> None:
 
 _LEGEND = {
     "front": "csplat, whole scene (front)",
+    "blind": "csplat, without a look at pictures",
     "other": "csplat, other presets and codings",
     "simplified": "csplat, simplified",
     "SPZ": "SPZ, written in the same run",
@@ -73,14 +74,16 @@ def _panel(axis: Axes, name: str, one: Measured) -> None:
 
     plain = one.plain()
     best = front(plain)
+    blind = front(one.unmeasured())
     simplified = front(one.simplified())
     peers = one.peers()
     highest = max((point.psnr for point in peers.values()), default=99.0) + _ABOVE
     every = [point for points in plain.values() for point in points if point.psnr <= highest]
     others = [point for point in every if point not in best]
-    shown = [point for point in (*best, *simplified, *peers.values()) if point.psnr <= highest]
+    shown = [point for point in (*best, *blind, *simplified, *peers.values()) if point.psnr <= highest]
     axis.set_xscale("log")
     axis.plot(*_xy(one, others), ".", color=_OURS, alpha=0.35, markersize=4, label="other")
+    axis.plot(*_xy(one, blind), "-", color=_OURS, alpha=0.45, linewidth=1.0, label="blind")
     axis.plot(*_xy(one, best), "o-", color=_OURS, markersize=3.5, linewidth=1.4, label="front")
     if simplified:
         axis.plot(*_xy(one, simplified), "^--", color=_SIMPLIFIED, markersize=5, linewidth=1.2, label="simplified")

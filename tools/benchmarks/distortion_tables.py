@@ -9,7 +9,10 @@ from typing import Any
 from distortion_curves import Point, Rate, Series, front, psnr_at, rate_at
 from printing import laid_out
 
-__all__ = ["FIGURES", "Figure", "Measured", "aims", "tables"]
+__all__ = ["FIGURES", "GRADED", "Figure", "Measured", "aims", "tables"]
+
+#: What names of series begin with whose splats are graded by what views say.
+GRADED = "graded"
 
 #: Share of SPZ's bytes at equal PSNR that is aimed at, without and with simplification.
 _AIMS = (0.7, 0.4)
@@ -70,6 +73,10 @@ class Measured:
         """Files of the whole scene, by preset and coding of SH."""
         return {how: [Point(**one) for one in points] for how, points in self.values.get("plain", {}).items()}
 
+    def unmeasured(self) -> Series:
+        """Those of them that the encoder made without having seen a picture."""
+        return {how: points for how, points in self.plain().items() if not how.startswith(GRADED)}
+
     def simplified(self) -> Series:
         """Files of simplified scenes, by number of splats, coding of SH, and PSNR that was looked for.
 
@@ -129,6 +136,8 @@ def _peer_table(results: Mapping[str, Measured], name: str, *, markdown: bool) -
             continue
         row = [scene, f"{one.splats:,}, {one.values['sh_degree']}"]
         row.append(f"{one.per_splat(peer.size_bytes):.2f} at {peer.psnr:.1f}")
+        blind = rate_at(one.unmeasured(), peer.psnr)
+        row += ["-" if blind is None else f"{one.per_splat(blind.size_bytes):.2f}", _ratio(blind, peer.size_bytes)]
         rates = rate_at(one.plain(), peer.psnr), one.simplified_rate(peer.psnr)
         for rate, aim in zip(rates, aims(scene), strict=True):
             row += [_bytes(one, rate), _ratio(rate, peer.size_bytes)]
@@ -136,7 +145,8 @@ def _peer_table(results: Mapping[str, Measured], name: str, *, markdown: bool) -
         rows.append(row)
     aim = ["aim"] if judged else []
     beside = f"of {name}'s bytes"
-    header = ["B/splat at dB", "splats, SH", name, "csplat", beside, *aim, "simplified", beside, *aim]
+    blind = ["without a look", beside]
+    header = ["B/splat at dB", "splats, SH", name, *blind, "csplat", beside, *aim, "simplified", beside, *aim]
     return laid_out(header, rows, markdown=markdown)
 
 

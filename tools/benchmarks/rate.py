@@ -140,7 +140,7 @@ def _cells(splats: int, found: dict[str, Any]) -> tuple[str, ...]:
         "" if found["spread"] is None else f"{found['spread']:.1f}",
         f"{100.0 * found['splats'] / splats:.0f} %",
         str(found["encodes"]),
-        f"{found['renders']} + {found['removal_views']}",
+        f"{found['renders']} + {found['removal_views'] + found['sensitivity_views']}",
         f"{found['seconds']:.0f}",
     )
 

@@ -96,11 +96,12 @@ def _variants(measured: Measured, args: argparse.Namespace) -> Iterator[tuple[st
     path = args.cache / "sensitivity.npz"
     measured.write(str(path))
     full = read_sensitivity(path, measured.model).importance()
-    plain = EncodeOptions(preset=args.preset, threads=args.threads)
+    plain = EncodeOptions(preset=args.preset, grades=1, threads=args.threads)
     weights = Importance(full.sh, full.shape)
     yield "nothing", plain, None
     yield "weights", plain, weights
     yield "matrices", plain, full
+    yield "matrices, grades", replace(plain, grades=None), full
     sizes = [int(size) for size in args.sizes.split(",")]
     for size in sizes:
         yield f"matrices, {size:,} shapes", replace(plain, shape_codebook_size=size), full

@@ -173,8 +173,7 @@ def _as_steps(plan: Plan, index: U8, octaves: F64, free: Sequence[str]) -> tuple
 
 def _coarser_levels(levels: int, octaves: F64, one_byte: int) -> tuple[int, list[int]]:
     """As many levels as the finest grade wants and a byte holds, and multiples of their step for the others."""
-    finest = min(
-        round(levels * 2.0 ** -float(octaves.min())), one_byte if levels <= one_byte else max(levels, _MOST_LEVELS)
-    )
-    most = max(1, finest // _FEWEST_LEVELS)
-    return finest, [min(max(1, round(finest / levels * 2.0 ** float(octave))), most) for octave in octaves]
+    most = one_byte if levels <= one_byte else max(levels, _MOST_LEVELS)
+    finest = min(max(_FEWEST_LEVELS, round(levels * 2.0 ** -float(octaves.min()))), most)
+    coarsest = max(1, finest // _FEWEST_LEVELS)
+    return finest, [min(max(1, round(finest / levels * 2.0 ** float(octave))), coarsest) for octave in octaves]

@@ -72,9 +72,17 @@ def _next(points: list[tuple[float, float]], window: Window, slope: float, bound
     place, value = points[-1]
     if len(points) > 1 and points[-2][0] != place:
         seen = (value - points[-2][1]) / (place - points[-2][0])
-        far = place - points[-2][0] >= _STALLED * (bounds[1] - bounds[0])
-        if far and seen < _FLATTEST * slope and value < window.low:
+        if value < window.low and all(_stalled(points[: len(points) - back], slope, bounds) for back in (0, 1)):
             return None  # it grows no more
         slope = min(max(seen, _FLATTEST * slope), _STEEPEST * slope)
     wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])
     return None if any(wanted == tried for tried, _ in points) else wanted
+
+
+def _stalled(points: list[tuple[float, float]], slope: float, bounds: tuple[float, float]) -> bool:
+    """Whether the last step went far and gained next to nothing; one that did may have crossed a plateau."""
+    if len(points) < 2:
+        return False
+    (before, low), (place, high) = points[-2:]
+    far = place - before >= _STALLED * (bounds[1] - bounds[0])
+    return far and high - low < _FLATTEST * slope * (place - before)
