@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import typer
 
+from csplat.encoder import EncodeOptions
 from csplat_tools.convert import Encoder
 from csplat_tools.reducing import Reducing
 from csplat_tools.simplifying import Simplifying
@@ -19,17 +20,21 @@ class Ways:
     """What a command line says of all of them.
 
     Attributes:
+        encoding: options of the encoder.
         simplify: whether to simplify. simplifying: how.
         targeting: the targets.
         reducing: the simple strategies.
         prune_unseen: whether what `importance` did not see goes.
+        views_given: whether a number of virtual views was given.
     """
 
+    encoding: EncodeOptions
     simplify: bool
     simplifying: Simplifying
     targeting: Targeting
     reducing: Reducing
     prune_unseen: bool
+    views_given: bool
 
     def encoder(self, *, quiet: bool) -> Encoder | None:
         """Return what makes a file of a scene; None for the plain encoder.
@@ -49,6 +54,10 @@ class Ways:
         simplifying, target, reducing = self.simplifying, self.targeting, self.reducing
         importance = target.importance is not None
         looks = target.cameras is not None or target.data is not None
+        looks_for = target.size is not None or target.psnr is not None
+        chooses = looks_for or (self.simplify and simplifying.max_loss is not None)
+        renders = self.simplify or looks_for or reducing.distil_sh
+        several = self.encoding.grades is not None and self.encoding.grades > 1
         both = (self.simplify or target.asked) and reducing.asked
         refused = (
             (self.simplify and target.max_error is not None,
@@ -65,6 +74,12 @@ class Ways:
             (self.prune_unseen and not importance, "--prune-unseen wants --importance, which says what was seen"),
             (self.prune_unseen and target.asked,
              "--prune-unseen and a target: a target chooses itself what is left out"),
+            (chooses and self.encoding.quality is not None,
+             "--quality is what a target chooses: give one of them"),
+            (self.views_given and not renders,
+             "--views says nothing without a target size or PSNR, --simplify or --distil-sh"),
+            (several and not (self.simplify or looks_for or importance),
+             "--grades says nothing without a target size or PSNR, --simplify or --importance: views sort the splats"),
             (reducing.residual_stages is not None and reducing.kmeans is None,
              "--residual-stages says nothing without --kmeans"),
         )  # fmt: skip

@@ -218,8 +218,11 @@ def encode(
         str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set with its photographs.")
     ] = None,
     views: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
-    ] = DEFAULT_VIEWS,
+        int | None,
+        typer.Option(
+            metavar="N", min=1, rich_help_panel=_VIEWS, help=f"Virtual views at most, {DEFAULT_VIEWS} by default."
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report on standard output, for programs.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
@@ -276,12 +279,15 @@ def encode(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
+    given, views = views is not None, views or DEFAULT_VIEWS
     ways = Ways(
+        options,
         simplify,
         Simplifying(keep, max_loss, target_psnr, target_size, cameras, data, views, threads),
         Targeting(target_size, target_psnr, max_error, prune, importance, cameras, data, views, threads),
         Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, views, sh_degree, seed, threads),
         prune_unseen,
+        views_given=given,
     )
     encoder = ways.encoder(quiet=quiet)
     if as_json and target == STANDARD_STREAM:
