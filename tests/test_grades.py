@@ -301,6 +301,8 @@ def test_tiles_of_a_grade_are_as_coarse_as_it_is(model):
         assert tile.coarse == grades.coarse[grades.index[tile.rows[0]]]
         assert tile.exponent >= tile.coarse.means
     assert min(one.means for one in grades.coarse) == min(one.sh0 for one in grades.coarse) == 0
+    weights = unequal(model).means
+    assert weights[grades.index == 0].mean() > weights[grades.index == 1].mean()  # what matters most comes first
 
 
 @pytest.mark.parametrize("multiple", [2, 3, 7])
@@ -326,11 +328,11 @@ def test_coarse_rotations_are_multiples_within_bounds(levels, multiple):
     assert np.abs(q - rotation[1:] * levels * 2**0.5).max() <= multiple
 
 
-def test_measured_weights_are_trusted_down_to_a_fifth_of_what_is_suggested(model):
+def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
     measured = np.zeros((COUNT, 2))
     measured[:10] = 1.0
     floored = trusted(measured, model)
     assert (floored >= measured).all()
     assert floored[10:].min() > 0.0
     np.testing.assert_allclose(floored[10:, 0], trusted(measured[:, 0], model)[10:])
-    assert floored[10:].mean() < 0.25 * measured.mean()
+    assert floored[10:].mean() < 0.6 * measured.mean()

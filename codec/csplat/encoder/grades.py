@@ -56,7 +56,7 @@ class Grades:
     """Which grade each splat is of, and by how much its steps are coarser than the file's.
 
     Attributes:
-        index: [N] uint8.
+        index: [N] uint8; the finest grade, whose tiles come first in a file, is 0.
         coarse: by grade.
     """
 
@@ -102,7 +102,7 @@ def choose_grades(
 
 
 def _clustered(errors: F64, integers: F64, count: int) -> F64:
-    """Octaves [K, A] by which the steps of at most `count` grades differ from the plan's.
+    """Octaves [K, A] by which the steps of at most `count` grades differ from the plan's, the finest grade first.
 
     Args:
         errors: [N, A], of splats and attributes at the plan's steps; 1 is what an integer is to add.
@@ -121,7 +121,7 @@ def _clustered(errors: F64, integers: F64, count: int) -> F64:
         octaves = _octaves(sample, places, integers)
     splats = np.bincount(places)[np.unique(places)] * (len(errors) / len(sample))
     large: F64 = octaves[splats >= min(_FEWEST, splats.max())]
-    return large
+    return large[np.argsort((integers * large).sum(axis=1), kind="stable")]
 
 
 def _octaves(errors: F64, places: U8, integers: F64) -> F64:

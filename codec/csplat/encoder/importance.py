@@ -28,7 +28,7 @@ F32 = NDArray[np.float32]
 _BLOCK = 1 << 16
 _RIDGE = 0.2  # share of the plain norm in the metric: other views than those that were measured see other directions
 _SHAPE = 6  # entries of a covariance
-_GUESSED = 0.2  # share of what opacity and size suggest that a measured weight has at least
+_GUESSED = 0.5  # share of what opacity and size suggest that a measured weight has at least
 _COMMON = 0.99  # share of the splats whose size is no exception
 _LARGEST_LOG = 80.0  # log sizes beyond ± this are not told apart: float32 holds the weights
 
@@ -169,7 +169,7 @@ def trusted(measured: NDArray[Any], model: SplatModel) -> NDArray[np.float64]:
         model: the scene.
 
     Returns:
-        As `measured`, float64: at least a fifth of the column's mean times the cheap weight over its mean.
+        As `measured`, float64: at least half of the column's mean times the cheap weight over its mean.
     """
     suggested = splat_weights(model, None).astype(np.float64)
     suggested = np.minimum(suggested, np.quantile(suggested, _COMMON)) if len(suggested) else suggested
