@@ -19,6 +19,7 @@ from csplat.encoder.freezing import freeze
 from csplat.encoder.grades import choose_grades
 from csplat.encoder.importance import trusted
 from csplat.encoder.measure import covariance_entries, measure_errors
+from csplat.encoder.pipeline import sample_rows
 from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
@@ -181,7 +182,9 @@ def test_where_nothing_is_lost_all_is_one_grade(model):
 
 
 def test_a_frozen_scene_has_one_grade(model):
-    assert freeze(model, importance=important(model)).decided.grades is None
+    frozen = freeze(model, importance=important(model))
+    assert frozen.decided.grades is None
+    assert frozen.decided.options.grades is None
 
 
 def test_huge_values_stay_apart_from_their_grade(model):
@@ -210,10 +213,40 @@ def test_colours_are_chosen_for_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(shown[0], name)[result.source_index], getattr(decoded, name))
 
 
-def test_sh_is_tried_on_all_grades(make_model):
-    model = make_model(COUNT, 1)
-    result, _ = encoded(model, important(model), preset="balanced")
-    assert "grades" in result.report.options
+def test_codings_are_tried_on_splats_of_all_grades(model):
+    plan, grades = choose_grades(
+        model, unequal(model), make_plan(model, EncodeOptions(), importance_given=True), EncodeOptions()
+    )
+    tiles = cut_scene(model, plan, grades)
+    found = grades.index[sample_rows(model, tiles, grades)]
+    assert set(found) == set(grades.index)
+    np.testing.assert_allclose(np.bincount(found) / len(found), np.bincount(grades.index) / COUNT, atol=0.05)
+    assert set(sample_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
+
+
+def test_one_splat_does_not_say_how_precise_the_others_have_to_be(model):
+    one = unequal(model).means.copy()
+    one[7] *= 1e20
+    alone, together = important(model, means=one), important(model)
+    without, with_it = encoded(model, together)[0].report.options, encoded(model, alone)[0].report.options
+    for name in ("scale_step", "sh0_step", "position_step"):
+        assert 0.5 < with_it[name] / without[name] < 2.0, name
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e22, 1e37])
+def test_scenes_of_any_extent_are_encoded(model, factor):
+    scaled = replace(model, means=(model.means * np.float32(factor)).astype(np.float32))
+    encoded(scaled, important(scaled))
+
+
+def test_any_step_may_be_given(model):
+    result, _ = encoded(model, important(model), position_step=1e200)
+    assert result.report.options["position_step"] == 1e200
+
+
+def test_the_preset_fast_has_one_grade_unless_asked(model):
+    assert "grades" not in encoded(model, important(model), preset="fast")[0].report.options
+    assert "grades" in encoded(model, important(model), preset="fast", grades=2)[0].report.options
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,8 @@ class Ways:
              "--quality is what a target chooses: give one of them"),
             (self.views_given and not renders,
              "--views says nothing without a target size or PSNR, --simplify or --distil-sh"),
+            (several and self.encoding.shape_codebook_size,
+             "--grades and --shape-codebook-size: entries of a codebook have one precision"),
             (several and not (self.simplify or looks_for or importance),
              "--grades says nothing without a target size or PSNR, --simplify or --importance: views sort the splats"),
             (reducing.residual_stages is not None and reducing.kmeans is None,

@@ -192,5 +192,6 @@ class _Derivatives(Rasteriser):
 
 
 def _finite(sums: F64) -> F64:
-    """Sums that float32 holds; those of splats blown up beyond all measure say nothing, and are 0."""
-    return np.clip(np.nan_to_num(sums, nan=0.0, posinf=0.0, neginf=0.0), -_LARGEST, _LARGEST)
+    """The array, made to fit float32; sums that have left float64 say nothing, and become 0."""
+    np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.clip(sums, -_LARGEST, _LARGEST, out=sums)

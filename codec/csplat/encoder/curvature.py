@@ -71,22 +71,25 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
 
     Returns:
         [N, 5] float64, >= 0, by splat and attribute, in the order of `GRADED`; four times as much for twice the step.
+        Not finite where a scene is so large that squares leave float64.
     """
     errors = np.empty((len(model), len(GRADED)))
     squared_levels = float(plan.opacity_levels) ** 2
     # Of what rounds in Y, Co and Cg the channels see this much, in squared steps.
-    colour = (_SH0 * plan.sh0_step) ** 2 * (1.0 + 4.0**plan.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
-    alpha = np.maximum(model.opacities.astype(np.float64), 0.25 / squared_levels)
-    errors[:, 0] = curvatures.opacities * alpha * (4.0 / squared_levels)  # alpha = q² / M²
-    errors[:, 3] = curvatures.means * plan.lattice.step**2
-    errors[:, 4] = curvatures.colours * colour
+    seen = _SH0**2 * (1.0 + 4.0**plan.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
     # A component of a quaternion errs by half the angle.
     angle = 2.0 / (plan.quat_levels * np.sqrt(2.0))
-    for at in range(0, len(model), _BLOCK):
-        part = slice(at, at + _BLOCK)
-        sizes, turns = _shape_curvatures(model, curvatures, part)
-        errors[part, 1], errors[part, 2] = sizes * plan.scale_step**2, turns * angle**2
-    errors *= _UNIFORM
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.square(np.array([plan.scale_step, angle, plan.lattice.step, plan.sh0_step], np.float64))
+        alpha = np.maximum(model.opacities.astype(np.float64), 0.25 / squared_levels)
+        errors[:, 0] = curvatures.opacities * alpha * (4.0 / squared_levels)  # alpha = q² / M²
+        errors[:, 3] = curvatures.means.astype(np.float64) * steps[2]
+        errors[:, 4] = curvatures.colours * (seen * steps[3])
+        for at in range(0, len(model), _BLOCK):
+            part = slice(at, at + _BLOCK)
+            sizes, turns = _shape_curvatures(model, curvatures, part)
+            errors[part, 1], errors[part, 2] = sizes * steps[0], turns * steps[1]
+        errors *= _UNIFORM
     return np.maximum(errors, 0.0, out=errors)
 
 

@@ -53,8 +53,8 @@ def freeze(
         raise InputError("a scene without splats has nothing to tune")
     if between is not None and source is None:
         raise InputError("the source that the splats come from is wanted, too")
-    options = replace(options or EncodeOptions(), grades=1)  # what tunes it reckons with one step per attribute
-    decided = decide(model, options, importance=importance, between=between, progress=progress)
+    # What tunes it reckons with one step per attribute.
+    decided = decide(model, options, importance=importance, between=between, graded=False, progress=progress)
     plan = replace(decided.books.plan, gauged=True)
     rows = [tile_order(decided.model, tile, plan)[0] for tile in decided.tiles]
     order = np.concatenate(rows).astype(np.int64)

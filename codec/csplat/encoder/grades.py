@@ -26,7 +26,7 @@ from csplat.encoder.plan import Plan
 from csplat.encoder.tiling import Coarse
 from csplat.model import SplatModel
 
-__all__ = ["Grades", "choose_grades"]
+__all__ = ["Grades", "choose_grades", "most_grades"]
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -36,6 +36,7 @@ _MOST = 5
 _FEWEST = 500  # splats; a smaller grade joins others
 _SAMPLE = 1 << 15  # splats that the steps of grades are found from
 _BLOCK = 1 << 16
+_COMMON = 0.999  # share of the splats whose errors are no exception
 _ROUNDS = 30
 _FINER, _COARSER = 4.0, 6.0  # octaves from the plan's steps, at most
 _LARGEST_STEP = 1.0  # of a log scale
@@ -73,7 +74,7 @@ class Grades:
 def choose_grades(
     model: SplatModel, curvatures: Curvatures | None, plan: Plan, options: EncodeOptions
 ) -> tuple[Plan, Grades | None]:
-    """Sort the splats into grades, at the picture error that the plan has in linear approximation.
+    """Sort the splats into grades, at about the picture error that the plan has in linear approximation, or less.
 
     Args:
         model: the scene.
@@ -84,12 +85,15 @@ def choose_grades(
     Returns:
         The plan with the finest steps that a grade has, and the grades; or the plan as it was, and None.
     """
-    count = min(options.grades or _MOST, round(len(model) / _SPLATS))
-    free = [name for name in GRADED if all(getattr(options, knob) is None for knob in _KNOBS[name])]
-    if curvatures is None or count < 2 or not free or options.shape_codebook_size:
+    count, free = most_grades(len(model), options), _free(options)
+    if curvatures is None or count < 2:
         return plan, None
     integers = np.array([GRADED[name] for name in free], np.float64)
     errors = step_errors(model, curvatures, plan)[:, [list(GRADED).index(name) for name in free]]
+    if not np.isfinite(errors).all():
+        return plan, None  # a scene so large or small that float64 does not hold its squares
+    # One splat in front of a camera must not say how precise all others have to be.
+    errors = np.minimum(errors, np.quantile(errors, _COMMON, axis=0))
     # Levels that the plan would have finer, if they were not bounded, say nothing of how much error is wanted.
     bounded = {"opacities": plan.opacity_levels >= _MOST_LEVELS, "quats": plan.quat_levels >= _MOST_LEVELS}
     says = np.array([not bounded.get(name, False) for name in free])
@@ -99,6 +103,19 @@ def choose_grades(
     relative: F64 = trusted(errors, model) / allowed
     octaves = _clustered(relative, integers, count)
     return _as_steps(plan, _assigned(relative, integers, octaves), octaves, free)
+
+
+def most_grades(count: int, options: EncodeOptions) -> int:
+    """Into how many grades so many splats are sorted at most, where curvatures are known; 1 where into none."""
+    if options.shape_codebook_size or not _free(options):
+        return 1
+    asked = options.grades or (1 if options.preset == "fast" else _MOST)
+    return max(1, min(asked, round(count / _SPLATS)))
+
+
+def _free(options: EncodeOptions) -> list[str]:
+    """Attributes whose steps no knob sets."""
+    return [name for name in GRADED if all(getattr(options, knob) is None for knob in _KNOBS[name])]
 
 
 def _clustered(errors: F64, integers: F64, count: int) -> F64:

@@ -38,7 +38,16 @@ from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
 
-__all__ = ["Decisions", "EncodeReport", "EncodeResult", "decide", "encode", "encode_with_report", "write_decided"]
+__all__ = [
+    "Decisions",
+    "EncodeReport",
+    "EncodeResult",
+    "decide",
+    "encode",
+    "encode_with_report",
+    "sample_rows",
+    "write_decided",
+]
 
 _FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of one, that nobody has to be told of
 
@@ -147,13 +156,18 @@ def decide(
     *,
     importance: NDArray[Any] | Importance | None = None,
     between: Between | None = None,
+    graded: bool = True,
     progress: Progress | None = None,
 ) -> Decisions:
-    """The first half of `encode_with_report`, with the same arguments: everything but the coding of tiles."""
+    """The first half of `encode_with_report`, with the same arguments: everything but the coding of tiles.
+
+    With `graded` false, all splats are of one grade, whatever is known of them.
+    """
     options = options or EncodeOptions()
     plan = make_plan(model, options, importance_given=importance is not None)
     extras = extra_columns(model, options)
-    plan, grades = choose_grades(model, known_curvatures(model, importance), plan, options)
+    curvatures = known_curvatures(model, importance) if graded else None
+    plan, grades = choose_grades(model, curvatures, plan, options)
     tiles = cut_scene(model, plan, grades)
     shapes = None
     if options.shape_codebook_size and len(model):
@@ -165,7 +179,7 @@ def decide(
         model = replace(model, sh0=sh0, shN=shN)
     needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
     weights = splat_weights(model, importance) if needs_weights else None
-    sample = _sample(model, tiles, grades)
+    sample = sample_rows(model, tiles, grades)
     carried = tuple(model.extra) if options.keep_extra else ()
     metric = sh_metric(model, weights, importance)
     books = choose_sh(
@@ -232,7 +246,7 @@ def _encode_tiles(decided: Decisions, threads: int, report: Progress) -> list[En
         return list(pool.map(one, tiles))
 
 
-def _sample(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
+def sample_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
     """Rows like those of one tile, on which codings are tried: of all grades, where there are several."""
     if not tiles:
         return np.zeros(0, np.intp)

@@ -90,7 +90,7 @@ class Chooser:
             if self.encoding.sh_degree is None:
                 self._try_degrees(min(costs, key=lambda choice: costs[choice]), wanted, cost)
         if self.trials.gradable:
-            cost(replace(min(costs, key=lambda choice: costs[choice]), graded=False))
+            cost(replace(min(costs, key=lambda choice: costs[choice]), graded=False, adaptive=None))
         self._costs = costs
         return min(costs, key=lambda choice: costs[choice])
 

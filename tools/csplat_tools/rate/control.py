@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,12 @@ from csplat.encoder import EncodeOptions, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.virtual import scene_frame, virtual_cameras
+from csplat_render.virtual import scene_frame
 from csplat_tools.compare import comparison_cameras
-from csplat_tools.importances import measured_importance
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.choosing import Chooser
 from csplat_tools.rate.exchange import BYTES_PER_DB
+from csplat_tools.rate.grading import MEASURING_VIEWS, graded_by
 from csplat_tools.rate.pruning import Pruner
 from csplat_tools.rate.search import Window, meet
 from csplat_tools.rate.summary import summary
@@ -42,6 +42,10 @@ _ALL_STAY = (
     "all splats stay: in surroundings virtual views do not show what cameras inside show; 40 cameras or more would say"
     " which may go"
 )
+_ONE_GRADE = (
+    "all splats are of one grade: in surroundings virtual views do not say how precise splats have to be; 40 cameras or"
+    " more, or --importance from cameras, would"
+)
 _QUALITIES = (24.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (4.0, 9.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH
 _PSNR = (0.0, 0.25, 0.1)  # dB above the target: from, to, aimed at
@@ -49,8 +53,6 @@ _SIZE = (0.97, 1.0, 0.987)  # of the target: from, to, aimed at
 _TRIES = 9
 _MOST_CAMERAS = 24  # of the user's own judge
 _ENOUGH_CAMERAS = 40  # of the user's own decide what is left out; fewer would only keep what they show
-_GRADING_VIEWS = (40, 480, 360)  # views that say how precise splats have to be: number, width, height
-_GRADING_SEED = 7  # others than those that judge
 _STARVED = 40.0  # quality to begin with where a size is too small for all splats
 _ROUNDS = 4  # of leaving out splats for a size, each by what the one before taught
 _SAME = 0.03  # of the splats: fewer or more by less are not worth another round
@@ -115,45 +117,26 @@ def encode_to_target(
     deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
     inside = deciding is None and scene_frame(source).kind == "surrounding"
     unsure = prune is None and inside
-    measured, measured_in = None, 0
-    if encoding.grades != 1 and encoding.preset != "fast" and not inside:
-        seen_from = _evenly(deciding or virtual_cameras(source, *_GRADING_VIEWS, seed=_GRADING_SEED), _GRADING_VIEWS[0])
-        measured = _measured(source, seen_from, background, importance, encoding.threads, progress)
-        measured_in = 0 if measured is importance else len(seen_from)
+    measuring = None if deciding is None else _evenly(deciding, MEASURING_VIEWS[0])
+    graded = graded_by(source, measuring, background, encoding, importance, inside=inside, progress=progress)
     pruner = None
     if blocked is None and prune is not False and not unsure:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
         pruner = Pruner(source, deciding, options, progress)
-    trials = Trials(source, encoding, judge, importance, progress, measured)
+    trials = Trials(source, encoding, judge, importance, progress, graded.importance)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)
     removal_views = 0 if pruner is None else pruner.renders
     report = summary(
-        target, found, trials, source, removal_views=removal_views, sensitivity_views=measured_in,
+        target, found, trials, source, removal_views=removal_views, sensitivity_views=graded.views,
         virtual=cameras is None,
     )  # fmt: skip
+    if inside and graded.importance is None and (encoding.grades or 0) > 1:
+        report["why"].append(_ONE_GRADE)
     if unsure and blocked is None:
         report["why"].append(_ALL_STAY)
     seconds = round(time.perf_counter() - start, 3)
     return RateResult(found.result, {**report, "encodes": files + len(trials.made), "seconds": seconds})
-
-
-def _measured(
-    source: SplatModel,
-    cameras: Sequence[Camera],
-    background: Colour,
-    importance: NDArray[Any] | Importance | None,
-    threads: int | None,
-    progress: Progress | None,
-) -> Importance | None:
-    """What grades the splats: what the caller knows, or what views say; None where they see nothing."""
-    if isinstance(importance, Importance):
-        return importance
-    try:
-        found = measured_importance(source, cameras, background, threads=threads, progress=progress)
-    except InputError:
-        return None  # nothing shows
-    return found if importance is None else replace(found, sh=importance)
 
 
 def _blocked(target: RateTarget, encoding: EncodeOptions) -> str | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
 from csplat.encoder.between import Between
+from csplat.encoder.grades import most_grades
 from csplat.model import SplatModel
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.colours import fit
@@ -102,7 +103,7 @@ class Candidate:
 
     def _grades(self, encoding: EncodeOptions) -> bool:
         """Whether splats are to be sorted into grades."""
-        return not self._session.inside and encoding.grades != 1 and encoding.preset != "fast"
+        return not self._session.inside and most_grades(len(self._rows), encoding) > 1
 
     def _measured(self) -> Importance:
         """How much pictures depend on shapes, and on all else, too."""
