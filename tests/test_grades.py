@@ -369,3 +369,17 @@ def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
     assert floored[10:].min() > 0.0
     np.testing.assert_allclose(floored[10:, 0], trusted(measured[:, 0], model)[10:])
     assert floored[10:].mean() < 0.6 * measured.mean()
+
+
+@pytest.mark.parametrize("grades", [None, 2])
+def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, grades):
+    from typer.testing import CliRunner
+
+    from csplat_tools.app import app
+
+    csplat.write_ply(tmp_path / "scene.ply", model)
+    np.save(tmp_path / "weights.npy", np.ones(COUNT, np.float32))
+    words = ["encode", tmp_path / "scene.ply", tmp_path / "scene.csplat", "--importance", tmp_path / "weights.npy"]
+    done = CliRunner().invoke(app, [str(word) for word in [*words, *(["--grades", grades] if grades else [])]])
+    assert done.exit_code == 0
+    assert ("of one grade" in done.stderr) == (grades is not None)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
@@ -35,6 +36,11 @@ __all__ = [
 
 #: What is told how far a stage has come: its name, and 0 to 1.
 Report = Callable[[str, float], None]
+
+_ONE_GRADE = (
+    "all splats are of one grade: weights alone do not say how precise they have to be, nor do virtual views inside of"
+    " surroundings; `csplat sensitivity` from cameras does"
+)
 
 
 @dataclass(frozen=True)
@@ -184,8 +190,9 @@ def _encoded(
     if prune_unseen and stored is None:
         raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
     weights = None if found is None else weights_of(found, model)
+    notes = _unheeded(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
-        return encode_with_report(model, options, importance=weights, progress=progress)
+        return _noted(encode_with_report(model, options, importance=weights, progress=progress), *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{importance}: no view saw any splat; nothing would be left")
@@ -203,8 +210,20 @@ def _encoded(
             f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
             " them: `csplat sensitivity` with more views misses fewer"
         )
-        result = replace(result, report=replace(result.report, notes=(*result.report.notes, missed)))
-    return result
+        notes = (*notes, missed)
+    return _noted(result, *notes)
+
+
+def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance | None) -> tuple[str, ...]:
+    """What an importance does not say, though it is asked for."""
+    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.curvatures is not None):
+        return ()
+    return (_ONE_GRADE,)
+
+
+def _noted(result: EncodeResult, *notes: str) -> EncodeResult:
+    """The same, with sentences for the user."""
+    return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))
 
 
 def decode_file(

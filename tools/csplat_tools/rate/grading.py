@@ -66,7 +66,8 @@ def graded_by(
     if isinstance(importance, Importance) and importance.curvatures is not None:
         return Graded(importance if several else None)
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
-    if inside or encoding.preset == "fast" or not (several or has_sh):
+    quick = encoding.preset == "fast" and encoding.grades is None
+    if inside or quick or not (several or has_sh):
         return Graded()
     views = list(cameras or virtual_cameras(source, *MEASURING_VIEWS, seed=_SEED))
     try:
