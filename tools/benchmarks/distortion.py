@@ -42,6 +42,7 @@ from csplat_render.cameras import load_cameras
 from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.extras import need_renderer
 from csplat_tools.importances import measured_importance
+from csplat_tools.rate.grading import measuring_views
 from csplat_tools.simplify import SimplifyOptions
 from csplat_tools.simplify.judge import Judge
 
@@ -49,8 +50,6 @@ __all__ = ["Kept", "main"]
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
-_VIEWS = (40, 480, 360)  # that grade objects, virtual ones: number, width, height
-_SEED = 7  # others than those that judge
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
 _GRID = (-9.0, -6.0, -3.0, 3.0, 6.0)  # dB beside the PSNR of SPZ at which the curve is drawn, too
@@ -149,12 +148,13 @@ class _Bench:
         """What training cameras say, or virtual views of an object; None inside of surroundings without cameras."""
         beside = self.scene.path.with_suffix(".cameras.json")
         if beside.exists():
-            cameras = load_cameras(beside)
+            given = load_cameras(beside)
         elif scene_frame(self.source).kind == "object":
-            cameras = virtual_cameras(self.source, *_VIEWS, seed=_SEED)
+            given = None
         else:
             return None
         start = time.perf_counter()
+        cameras = measuring_views(self.source, given)
         found = measured_importance(self.source, cameras, (0.0, 0.0, 0.0), threads=None)
         seconds = time.perf_counter() - start
         self.kept.values["graded by"] = {"cameras": len(cameras), "given": beside.exists(), "seconds": seconds}

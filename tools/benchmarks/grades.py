@@ -3,9 +3,9 @@
     python tools/benchmarks/grades.py                       # six scenes; ten minutes on two cores
     python tools/benchmarks/grades.py --scenes fox60k_noreg --markdown
 
-Who measures: 40 virtual views; or every other camera that a scene was trained with. Who judges: the cameras of the data
-folder; or the other half of the training cameras. Nobody judges what the same cameras measured. SH is left out of
-scenes that have it: its coding is another matter.
+Who measures: virtual views, as for a target; or every other camera that a scene was trained with. Who judges: the
+cameras of the data folder; or the other half of the training cameras. Nobody judges what the same cameras measured. SH
+is left out of scenes that have it: its coding is another matter.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.compare import BLACK
 from csplat_tools.importances import measured_importance
 from csplat_tools.models import without_bands
+from csplat_tools.rate.grading import measuring_views
 from csplat_tools.simplify.judge import Judge
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
 _EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files without grades
 _GRADED = (46.0, 54.0, 62.0)
-_VIEWS = (40, 480, 360)
-_SEED = 7
 _JUDGES = 20  # cameras at most
 _HEAD = ("scene", "kind", "measured by", "s", "judged by", *["of the bytes at dB"] * len(_GRADED))
 
@@ -61,7 +60,7 @@ def main() -> None:
 def _rows(scene: Scene) -> list[tuple[str, ...]]:
     source = without_bands(read_ply(scene.path), 0)
     given, own = _cameras(scene.path.with_suffix(".cameras.json")), _cameras(_of_psnr(scene.name))
-    measures = {"virtual views": virtual_cameras(source, *_VIEWS, seed=_SEED), "half of its cameras": given[::2]}
+    measures = {"virtual views": measuring_views(source, None), "half of its cameras": given[::2]}
     judges = {"cameras of `psnr`": own or virtual_cameras(source), "the other half": given[1::2][:_JUDGES]}
     kind, found = scene_frame(source).kind, dict[str, tuple[Importance, float]]()
     for name, cameras in measures.items():

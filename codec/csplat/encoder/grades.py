@@ -31,7 +31,7 @@ __all__ = ["Grades", "choose_grades", "most_grades"]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-_SPLATS = 5000  # of a grade, about: each tile has Huffman codes of its own
+_SPLATS = 2500  # of a grade, about: each tile has Huffman codes of its own
 _MOST = 5
 _FEWEST = 500  # splats; a smaller grade joins others
 _SAMPLE = 1 << 15  # splats that the steps of grades are found from

@@ -45,7 +45,7 @@ class EncodeOptions:
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). By default only where an importance is given.
         grades: into how many grades splats are sorted, at most, 1 to 5: those whose errors show alike share tiles with
-            steps of their own. Only where an importance holds curvatures; by default one per 5,000 splats, one in
+            steps of their own. Only where an importance holds curvatures; by default one per 2,500 splats, one in
             all with the preset "fast".
         tile_splats: splats per tile at most, 1 to 65536.
         effort: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.

@@ -16,18 +16,48 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.models import without_bands
-from csplat_tools.rate.exchange import BYTES_PER_DB
+from csplat_tools.rate.exchange import BYTES_PER_DB, error_at_size, error_of_psnr
 from csplat_tools.rate.trials import Choice, Part, Trial, Trials
 
-__all__ = ["Chooser"]
+__all__ = ["Chooser", "Goal"]
 
 _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _FIRST_SHARE = 1 / 32  # entries of an SH codebook per splat
 _SHARE_STEP = 4.0
 _SHARES = (1 / 512, 1 / 8)
+_ELSEWHERE = 6.0  # dB of quality beyond which what was dearer there says nothing
 _FAR = 0.15  # of the bytes; a choice that was so much dearer is not tried again
 _ADAPTIVE = 1.0  # coarseness of unimportant splats that is tried beside the preset's, where importance was measured
+_LEAST_LEFT = 1e-3  # of an error: what quantisation has of it, at least; below, a difference is noise
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A PSNR in dB, or a size; what files of other sizes and qualities say of the file that meets it."""
+
+    psnr: float | None = None
+    size_bytes: int | None = None
+
+    def cost(self, trial: Trial, reached: float, floor: float) -> float:
+        """What a file like this one would cost at the goal, in logarithms of bytes but for a constant.
+
+        At a PSNR that is its size. At a size it is what the error is worth.
+
+        Args:
+            trial: the file.
+            reached: its PSNR.
+            floor: PSNR with nothing wrong but what is left out; the finest steps do not get beyond it.
+        """
+        dropped, error = error_of_psnr(floor), error_of_psnr(reached)
+        left = max(error - dropped, _LEAST_LEFT * error)
+        if self.size_bytes is not None:
+            share = np.array(trial.size_bytes / self.size_bytes)
+            return BYTES_PER_DB * 10.0 * math.log10(float(error_at_size(share, np.array(dropped), left, BYTES_PER_DB)))
+        allowed = error_of_psnr(self.psnr or 0.0) - dropped
+        if allowed <= 0.0:
+            return math.inf
+        return math.log(trial.size_bytes) + BYTES_PER_DB * 10.0 * math.log10(max(left, _LEAST_LEFT * allowed) / allowed)
 
 
 @dataclass
@@ -47,6 +77,7 @@ class Chooser:
     def __post_init__(self) -> None:
         self._truncated: dict[int, float] = {}
         self._costs: dict[Choice, float] = {}
+        self._quality = 0.0
 
     def first(self) -> Choice:
         """The choice that comparisons begin with, and the only one where nothing is left to choose."""
@@ -59,22 +90,24 @@ class Chooser:
             coding = "scalar" if huge else PRESETS[encoding.preset].sh_coding
         return Choice("scalar") if coding == "scalar" else Choice("codebook", _FIRST_SHARE)
 
-    def best(self, part: Part, quality: float, goal: float | None, start: Trial | None = None) -> Choice:
+    def best(self, part: Part, quality: float, goal: Goal, start: Trial | None = None) -> Choice:
         """Compare.
 
         Args:
             part: the splats that are coded.
             quality: of the encoder, at which all are tried.
-            goal: PSNR that is wanted; `None` where a size is: then what the first one tried reaches.
+            goal: what is looked for.
             start: a file of these splats at this quality, where there is one.
         """
         if not self._choosable() and not self.trials.gradable:
             return self.first()
         before, costs = self._costs, dict[Choice, float]()
+        if abs(quality - self._quality) > _ELSEWHERE:
+            before = {}
         likely = min(before, key=lambda choice: before[choice]) if before else self.first()
         start = self.trials.judged(start or self.trials.encode(part, likely, quality))
-        wanted = start.psnr if goal is None else goal
-        costs[start.choice] = _cost(start, start.psnr, wanted, self.floor(start))
+        wanted = start.psnr if goal.psnr is None else goal.psnr
+        costs[start.choice] = goal.cost(start, start.psnr, self.floor(start))
 
         def cost(choice: Choice) -> float:
             if before.get(choice, -math.inf) > _FAR + min(before.values(), default=0.0):
@@ -82,7 +115,7 @@ class Chooser:
             if choice not in costs:
                 trial = self.trials.encode(part, choice, quality)
                 reached = self.trials.glimpsed(decode(trial.result.data))
-                costs[choice] = _cost(trial, reached, wanted, self.floor(trial))
+                costs[choice] = goal.cost(trial, reached, self.floor(trial))
             return costs[choice]
 
         if self._choosable():
@@ -91,7 +124,7 @@ class Chooser:
                 self._try_degrees(min(costs, key=lambda choice: costs[choice]), wanted, cost)
         if self.trials.gradable:
             cost(replace(min(costs, key=lambda choice: costs[choice]), graded=False, adaptive=None))
-        self._costs = costs
+        self._costs, self._quality = costs, quality
         return min(costs, key=lambda choice: costs[choice])
 
     def floor(self, trial: Trial) -> float:
@@ -155,19 +188,3 @@ def _rows(trial: Trial) -> NDArray[np.int64]:
     """Which splat of its part each splat of a file is."""
     index = trial.result.source_index
     return index if trial.part.rows is None else np.searchsorted(trial.part.rows, index)
-
-
-def _cost(trial: Trial, reached: float, wanted: float, floor: float = math.inf) -> float:
-    """The logarithm of the bytes that a file would take at the PSNR that is wanted.
-
-    Args:
-        trial: the file.
-        reached: its PSNR.
-        wanted: PSNR that is wanted.
-        floor: PSNR with nothing wrong but what is left out; the finest steps do not get beyond it.
-    """
-    dropped = 10.0 ** (-floor / 10.0)
-    left, allowed = 10.0 ** (-reached / 10.0) - dropped, 10.0 ** (-wanted / 10.0) - dropped
-    if allowed <= 0.0:
-        return math.inf
-    return math.log(trial.size_bytes) + BYTES_PER_DB * 10.0 * math.log10(max(left, 1e-3 * allowed) / allowed)

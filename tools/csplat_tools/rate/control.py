@@ -22,9 +22,9 @@ from csplat_render import Camera
 from csplat_render.virtual import scene_frame
 from csplat_tools.compare import comparison_cameras
 from csplat_tools.rate.bounds import meet_bounds
-from csplat_tools.rate.choosing import Chooser
+from csplat_tools.rate.choosing import Chooser, Goal
 from csplat_tools.rate.exchange import BYTES_PER_DB
-from csplat_tools.rate.grading import MEASURING_VIEWS, graded_by
+from csplat_tools.rate.grading import graded_by
 from csplat_tools.rate.pruning import Pruner
 from csplat_tools.rate.search import Window, meet
 from csplat_tools.rate.summary import summary
@@ -88,7 +88,7 @@ def encode_to_target(
         prune: splats may be left out that are not worth their bits; not where largest errors are bounded. None: where
             40 cameras or more are given, or virtual views show all that there is to see, as of an object. In
             surroundings cameras stand where virtual ones do not, and show what those hardly do.
-        views: virtual views at most that decide which.
+        views: virtual views at most that decide which, and how precise splats have to be.
         importance: how much splats matter, as for the encoder.
         progress: is told the stages.
 
@@ -117,8 +117,9 @@ def encode_to_target(
     deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
     inside = deciding is None and scene_frame(source).kind == "surrounding"
     unsure = prune is None and inside
-    measuring = None if deciding is None else _evenly(deciding, MEASURING_VIEWS[0])
-    graded = graded_by(source, measuring, background, encoding, importance, inside=inside, progress=progress)
+    graded = graded_by(
+        source, deciding, background, encoding, importance, views=views, inside=inside, progress=progress
+    )
     pruner = None
     if blocked is None and prune is not False and not unsure:
         options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
@@ -167,7 +168,7 @@ class _Search:
         """The smallest file that reaches a PSNR."""
         whole = Part(self.source)
         quality = self._bounded(goal + _LOSS[self.source.sh_degree > 0])
-        choice = self.chooser.best(whole, quality, goal)
+        choice = self.chooser.best(whole, quality, Goal(psnr=goal))
         best = self._with_psnr(whole, choice, goal, quality)
         if best is None and choice != self.chooser.first():
             best = self._with_psnr(whole, self.chooser.first(), goal, quality)
@@ -182,7 +183,7 @@ class _Search:
             part = self.pruner.at_psnr(goal, floor, slope, self.trials.seen, most)
             if part is None:
                 break
-            choice = self.chooser.best(part, best.quality, goal)
+            choice = self.chooser.best(part, best.quality, Goal(psnr=goal))
             pruned = self._with_psnr(part, choice, goal, best.quality - 10.0 * math.log10(1.0 - most))
             if pruned is not None:
                 return min(best, pruned, key=lambda trial: trial.size_bytes)
@@ -195,7 +196,7 @@ class _Search:
         if best is None and self.source.sh_degree and self.encoding.sh_coding == "auto":
             best = self._with_size(whole, Choice("none", degree=0), goal, _QUALITIES[0])
         if best is not None:
-            choice = self.chooser.best(whole, best.quality, None, best)
+            choice = self.chooser.best(whole, best.quality, Goal(size_bytes=goal), best)
             best = self._better(self.trials.judged(best), self._with_size(whole, choice, goal, best.quality))
         if self.pruner is None:
             return self._found(best, goal)
@@ -207,7 +208,7 @@ class _Search:
             if part is None or abs(len(part.model) - count) < _SAME * len(self.source):
                 break
             finer = self._bounded(trial.quality + math.log(count / len(part.model)) / BYTES_PER_DB)
-            after = self._with_size(part, self.chooser.best(part, finer, None), goal, finer)
+            after = self._with_size(part, self.chooser.best(part, finer, Goal(size_bytes=goal)), goal, finer)
             if after is None:
                 break
             trial = self.trials.judged(after)

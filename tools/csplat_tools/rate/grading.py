@@ -14,18 +14,19 @@ from csplat.encoder.grades import most_grades
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.virtual import virtual_cameras
 from csplat_tools.importances import measured_importance
+from csplat_tools.simplify.views import VIEW_SIZE, camera_sequence
+from csplat_tools.simplifying import DEFAULT_VIEWS
 
-__all__ = ["MEASURING_VIEWS", "Graded", "graded_by"]
+__all__ = ["Graded", "graded_by", "measuring_views"]
 
 Weights = NDArray[Any] | Importance
 Progress = Callable[[str, float], None]
 Colour = tuple[float, float, float]
 
-#: Views that are enough; of virtual ones, width and height, too.
-MEASURING_VIEWS = (40, 480, 360)
-_SEED = 7  # others than those that judge
+_GIVEN = 40  # cameras that are enough, of those given
+_VIRTUAL = 120  # and of small ones
+_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,24 @@ class Graded:
     views: int = 0
 
 
+def measuring_views(source: SplatModel, cameras: Sequence[Camera] | None, most: int = DEFAULT_VIEWS) -> list[Camera]:
+    """Cameras that say how precise splats have to be: those given, evenly chosen; or small virtual ones.
+
+    Virtual ones are those that decide who may go: they look from nearer and farther, from below and beside, too.
+    Cameras like those that judge would say less of what others see: plane3 graded by 40 of them has 42 dB by them and
+    39 by others; by these, 41 and 40.
+
+    Args:
+        source: the scene.
+        cameras: from which to choose.
+        most: virtual ones at most.
+    """
+    if cameras is None:
+        return camera_sequence(source, min(most, _VIRTUAL), VIEW_SIZE, seed=_SEED)
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(_GIVEN, len(cameras))).round().astype(int))
+    return [cameras[i] for i in chosen]
+
+
 def graded_by(
     source: SplatModel,
     cameras: Sequence[Camera] | None,
@@ -48,8 +67,9 @@ def graded_by(
     encoding: EncodeOptions,
     importance: Weights | None,
     *,
+    views: int = DEFAULT_VIEWS,
     inside: bool,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Graded:
     """Take what the caller knows, or measure the rest.
 
@@ -59,6 +79,7 @@ def graded_by(
         background: behind everything.
         encoding: knobs that are set; some leave nothing to grade.
         importance: what the caller knows. Where it holds curvatures, nothing is measured; else it stays for SH.
+        views: virtual ones at most.
         inside: there are no cameras, and the scene is surroundings, where virtual views do not say it.
         progress: is told the stages.
     """
@@ -69,13 +90,13 @@ def graded_by(
     quick = encoding.preset == "fast" and encoding.grades is None
     if inside or quick or not (several or has_sh):
         return Graded()
-    views = list(cameras or virtual_cameras(source, *MEASURING_VIEWS, seed=_SEED))
     try:
-        found = measured_importance(source, views, background, threads=encoding.threads, progress=progress)
+        seen_from = measuring_views(source, cameras, views)
+        found = measured_importance(source, seen_from, background, threads=encoding.threads, progress=progress)
     except InputError:
         return Graded()  # nothing shows
     if isinstance(importance, Importance):
         found = replace(importance, curvatures=found.curvatures)
     elif importance is not None:
         found = replace(found, sh=np.asarray(importance))
-    return Graded(found, len(views))
+    return Graded(found, len(seen_from))
