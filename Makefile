@@ -55,6 +55,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/sensitivity.py
 	$(BIN)/python tools/benchmarks/compression.py
 	$(BIN)/python tools/benchmarks/rate.py
+	$(BIN)/python tools/benchmarks/grades.py
 	$(BIN)/python tools/benchmarks/distortion.py plain
 	$(BIN)/python tools/benchmarks/operating.py
 	$(BIN)/python tools/benchmarks/study.py
