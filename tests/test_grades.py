@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import encoded
 
 import csplat
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
@@ -18,13 +19,12 @@ from csplat.encoder.curvature import GRADED, Curvatures, step_errors
 from csplat.encoder.freezing import freeze
 from csplat.encoder.grades import choose_grades
 from csplat.encoder.importance import trusted
-from csplat.encoder.measure import covariance_entries, measure_errors
+from csplat.encoder.measure import covariance_entries
 from csplat.encoder.pipeline import sample_rows
 from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
 from csplat.model import normalise_quats
-from csplat_conformance.validator import validate
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 12_000  # splats, enough for several grades
@@ -42,17 +42,6 @@ def unequal(model, seed=0, spread=3.0):
 
 def important(model, **changes):
     return Importance(np.ones(len(model)), curvatures=replace(unequal(model), **changes))
-
-
-def encoded(model, importance=None, **options):
-    """Encode, and check what must hold of any file."""
-    result = encode_with_report(model, EncodeOptions(**options), importance=importance)
-    assert () == tuple(validate(result.data).violations)
-    decoded = csplat.decode(result.data)
-    for name, (largest, rms) in measure_errors(model, decoded, result.source_index).items():
-        assert largest <= result.report.errors[name][0], name
-        assert rms <= result.report.errors[name][1], name
-    return result, decoded
 
 
 @pytest.fixture

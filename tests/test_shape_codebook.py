@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import encoded
 from chromium import absent
 
 import csplat
@@ -18,11 +19,10 @@ from csplat.decoder import decode_scene
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.encoder.between import Between
 from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.measure import covariance_entries, measure_errors
+from csplat.encoder.measure import covariance_entries
 from csplat.encoder.shape_covariances import mean_axes, unit_covariances
 from csplat.errors import InputError
 from csplat.model import normalise_quats
-from csplat_conformance.validator import validate
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -46,17 +46,6 @@ def seen_more(model, seed=1):
     weights = rng.lognormal(0, 2, len(model))
     rows, columns = np.triu_indices(6)
     return Importance(weights, weights, None, matrices[:, rows, columns])
-
-
-def encoded(model, importance=None, **options):
-    """Encode, and check what must hold of any file."""
-    result = encode_with_report(model, EncodeOptions(**options), importance=importance)
-    assert () == tuple(validate(result.data).violations)
-    decoded = csplat.decode(result.data)
-    for name, (largest, rms) in measure_errors(model, decoded, result.source_index).items():
-        assert largest <= result.report.errors[name][0], name
-        assert rms <= result.report.errors[name][1], name
-    return result, decoded
 
 
 def books(data):

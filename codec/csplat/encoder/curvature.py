@@ -7,7 +7,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.measure import rotation_rows
 from csplat.encoder.plan import Plan
+from csplat.encoder.statistics import COLOUR_PER_SH0
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -23,7 +25,6 @@ _BLOCK = 1 << 14  # splats at a time
 _TRIANGLE = 21  # entries of a symmetric matrix of 6 by 6
 _UNIFORM = 1.0 / 12.0  # squared error of rounding, in squared steps
 _ROOT2 = 2.0**0.5
-_SH0 = 0.28209479177387814  # a channel's colour per coefficient of degree 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
     errors = np.empty((len(model), len(GRADED)))
     squared_levels = float(plan.opacity_levels) ** 2
     # Of what rounds in Y, Co and Cg the channels see this much, in squared steps.
-    seen = _SH0**2 * (1.0 + 4.0**plan.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
+    seen = COLOUR_PER_SH0**2 * (1.0 + 4.0**plan.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
     # A component of a quaternion errs by half the angle.
     angle = 2.0 / (plan.quat_levels * np.sqrt(2.0))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -95,7 +96,7 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
 
 def _shape_curvatures(model: SplatModel, curvatures: Curvatures, part: slice) -> tuple[F64, F64]:
     """What errors of the three log scales, and of the three angles, add: sums of each three curvatures, [n]."""
-    axes = _axes(model.quats[part].T)
+    axes = [np.stack(axis) for axis in zip(*rotation_rows(model.quats[part].T), strict=True)]
     scales = model.scales[part].T.astype(np.float64)
     variances = np.exp(2.0 * (scales - scales.max(axis=0)))
     variances /= variances.sum(axis=0)
@@ -106,18 +107,6 @@ def _shape_curvatures(model: SplatModel, curvatures: Curvatures, part: slice) ->
         sizes += _form(triangles, variances[first] * _product(axes[first], axes[first]))
         turns += _form(triangles, (variances[first] - variances[second]) * _product(axes[first], axes[second]))
     return sizes, turns
-
-
-def _axes(quats: Floats) -> tuple[F64, F64, F64]:
-    """A splat's axes, each [3, n], from rotations [4, n]; those of a zero quaternion are the world's."""
-    w, x, y, z = quats.astype(np.float64)
-    squared = w * w + x * x + y * y + z * z
-    two = 2.0 / np.where(squared > 0.0, squared, 1.0)
-    return (
-        np.stack([1.0 - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)]),
-        np.stack([two * (x * y - w * z), 1.0 - two * (x * x + z * z), two * (y * z + w * x)]),
-        np.stack([two * (x * z + w * y), two * (y * z - w * x), 1.0 - two * (x * x + y * y)]),
-    )
 
 
 def _product(a: F64, b: F64) -> F64:

@@ -185,17 +185,22 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
     )
 
 
-def covariance_entries(quats: Floats, variances: F64) -> F64:
-    """Return Σ's entries xx, yy, zz, xy, xz, yz, [6, n]."""
+def rotation_rows(quats: Floats) -> tuple[tuple[F64, F64, F64], ...]:
+    """Return the rows of rotation matrices, entries [n], of quaternions [4, n] of any length but 0."""
     w, x, y, z = quats.astype(np.float64)
     two = 2.0 / (w * w + x * x + y * y + z * z)
-    rows = (
+    return (
         (1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
         (two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)),
         (two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)),
     )
+
+
+def covariance_entries(quats: Floats, variances: F64) -> F64:
+    """Return Σ's entries xx, yy, zz, xy, xz, yz, [6, n]."""
+    rows = rotation_rows(quats)
     scaled = [tuple(entry * variance for entry, variance in zip(row, variances, strict=True)) for row in rows]
-    result = np.empty((6, len(w)))
+    result = np.empty((6, quats.shape[1]))
     for place, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
         a, b = scaled[i], rows[j]
         result[place] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

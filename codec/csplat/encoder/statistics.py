@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from csplat.encoder.morton import morton_codes
 from csplat.model import SplatModel
 
-__all__ = ["Statistics", "scene_statistics"]
+__all__ = ["COLOUR_PER_SH0", "Statistics", "scene_statistics"]
+
+#: A channel's colour per coefficient of degree 0.
+COLOUR_PER_SH0 = 0.28209479177387814
 
 _SAMPLE = 1 << 16  # splats that are looked at
 _RUNS = 16  # of neighbours among them
@@ -24,7 +27,6 @@ _APART = 8  # places in Morton order
 _CORE = 0.8  # share of the splats within the scene's reach
 _BITS = 16
 _LARGEST = 1e38  # of float32
-_COLOUR_PER_SH0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> f
         colour = np.clip(model.sh0[near].astype(np.float64) - model.sh0[far], -10, 10)
         squares += float((np.square(colour).mean(axis=1) * weight).sum())
         weights += float(weight.sum())
-    return _COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
+    return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
 
 
 def _neighbours(means: NDArray[np.float32], centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:

@@ -24,7 +24,7 @@ from csplat_tools.compare import comparison_cameras
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.choosing import Chooser, Goal
 from csplat_tools.rate.exchange import BYTES_PER_DB
-from csplat_tools.rate.grading import graded_by
+from csplat_tools.rate.grading import evenly, graded_by
 from csplat_tools.rate.pruning import Pruner
 from csplat_tools.rate.search import Window, meet
 from csplat_tools.rate.summary import summary
@@ -110,7 +110,7 @@ def encode_to_target(
         if target.size_bytes is None and target.psnr is None:
             return bounded.as_result()
         encoding, files = bounded.encoding, bounded.encodes
-    judging = comparison_cameras(source) if cameras is None else _evenly(cameras, _MOST_CAMERAS)
+    judging = comparison_cameras(source) if cameras is None else evenly(cameras, _MOST_CAMERAS)
     judge = Judge.of_source(source, judging, background, encoding.threads)
     if cameras is not None and all(np.ptp(wanted, axis=(0, 1)).max() == 0.0 for wanted in judge.wanted):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
@@ -147,11 +147,6 @@ def _blocked(target: RateTarget, encoding: EncodeOptions) -> str | None:
     if encoding.preset == "fast":
         return "by the preset fast"
     return "where extra columns are carried" if encoding.keep_extra else None
-
-
-def _evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    places = np.unique(np.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().astype(int))
-    return [cameras[i] for i in places]
 
 
 @dataclass(frozen=True, eq=False)

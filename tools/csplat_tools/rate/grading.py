@@ -18,7 +18,7 @@ from csplat_tools.importances import measured_importance
 from csplat_tools.simplify.views import VIEW_SIZE, camera_sequence
 from csplat_tools.simplifying import DEFAULT_VIEWS
 
-__all__ = ["Graded", "graded_by", "measuring_views"]
+__all__ = ["Graded", "evenly", "graded_by", "measuring_views"]
 
 Weights = NDArray[Any] | Importance
 Progress = Callable[[str, float], None]
@@ -56,8 +56,13 @@ def measuring_views(source: SplatModel, cameras: Sequence[Camera] | None, most: 
     """
     if cameras is None:
         return camera_sequence(source, min(most, _VIRTUAL), VIEW_SIZE, seed=_SEED)
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(_GIVEN, len(cameras))).round().astype(int))
-    return [cameras[i] for i in chosen]
+    return evenly(cameras, _GIVEN)
+
+
+def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
+    """So many of some cameras at most, spread over their order."""
+    places = np.unique(np.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().astype(int))
+    return [cameras[i] for i in places]
 
 
 def graded_by(

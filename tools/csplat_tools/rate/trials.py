@@ -128,7 +128,6 @@ class Trials:
 
     Attributes:
         judge: what the source looks like.
-        gradable: whether something was measured that sorts splats into grades.
         made: every file, in order.
         renders: how many pictures were rendered, the source's among them.
     """
@@ -144,12 +143,16 @@ class Trials:
     ) -> None:
         self._source, self._encoding, self._importance, self._progress = source, encoding, importance, progress
         self._measured = measured
-        self.gradable = measured is not None
         self.judge = judge
         self.made: list[Trial] = []
         self.renders = count = len(judge.cameras)
         self._few = sorted({round(i * (count - 1) / (_FEW_VIEWS - 1)) for i in range(_FEW_VIEWS)})
         self._offset = 0.0
+
+    @property
+    def gradable(self) -> bool:
+        """Whether something was measured that may sort splats into grades."""
+        return self._measured is not None
 
     def encode(self, part: Part, choice: Choice, quality: float) -> Trial:
         """Make a file, if there is none of these options yet; nobody looks at it."""
