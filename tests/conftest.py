@@ -3,12 +3,17 @@
 import os
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 
 from csplat.model import SplatModel, normalise_quats
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# The machine may be busy, and a failure has to come again.
+hypothesis.settings.register_profile("csplat", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("csplat")
 
 pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
 

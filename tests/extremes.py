@@ -220,7 +220,7 @@ def scene(name: str) -> tuple[SplatModel, tuple[Finding, ...]]:
 @cache
 def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResult:
     """A file of a condition."""
-    return encode_with_report(scene(name)[0], EncodeOptions(preset=preset, quality=quality))
+    return encode_with_report(scene(name)[0], EncodeOptions(preset=preset, attribute_psnr=quality))
 
 
 @cache

@@ -30,7 +30,7 @@ QUICK = TrainOptions(
     max_splats=COUNT, sh_degree=1, iterations=120, refine_start=20, refine_every=20, log_every=40, background="black"
 )
 SHORT = FinetuneOptions(iterations=250, warm_up=10, validate_every=50, log_every=50)
-COARSE = EncodeOptions(preset="small", quality=36.0)
+COARSE = EncodeOptions(preset="small", attribute_psnr=36.0)
 BLACK = np.zeros(3, np.float32)
 
 

@@ -12,6 +12,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from interrupts import heed_interrupts
 from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
@@ -587,7 +588,10 @@ def test_bars_are_for_terminals(tmp_path, ply):
 def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
     target = tmp_path / "out.csplat"
     with subprocess.Popen(
-        [*PROGRAM, "encode", "-", str(target)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        [*PROGRAM, "encode", "-", str(target)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
     ) as running:
         assert running.stdin is not None
         running.stdin.write(bytes(1 << 20))  # more than a pipe holds: it has begun to read

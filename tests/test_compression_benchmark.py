@@ -40,7 +40,7 @@ from csplat_trainer.finetune import FinetuneOptions, finetune, renders_of, split
 from csplat_trainer.sensitivity import measure_sensitivity  # noqa: E402
 
 BLACK = np.zeros(3, np.float32)
-BOOKS = EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
+BOOKS = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_integers_take_whole_bytes_by_the_range_of_their_column():
 
 
 @pytest.mark.parametrize(
-    "options", [BOOKS, replace(BOOKS, codebook_stages=2), EncodeOptions(quality=28.0, sh_coding="scalar")]
+    "options", [BOOKS, replace(BOOKS, codebook_stages=2), EncodeOptions(attribute_psnr=28.0, sh_coding="scalar")]
 )
 def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, options):
     frozen = freeze(source, options)
@@ -91,7 +91,7 @@ def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, option
 
 
 def test_a_file_is_smaller_than_its_integers(source):
-    frozen = freeze(source, EncodeOptions(quality=45.0, sh_coding="scalar"))
+    frozen = freeze(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar"))
     assert len(encode_frozen(frozen, frozen.start()).data) < integer_bytes(integer_columns(frozen, frozen.start()))
 
 
@@ -99,7 +99,7 @@ def test_a_file_is_smaller_than_its_integers(source):
 
 
 def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(source):
-    plain = freeze(source, EncodeOptions(preset="fast", quality=30.0, sh_coding="scalar"))
+    plain = freeze(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar"))
     frozen = Unquantised.of(plain)
     start = frozen.start()
     for name in ("means", "scales", "opacities", "sh0"):

@@ -241,7 +241,7 @@ def wild_models(draw):
 
 
 @given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+@settings(max_examples=150, suppress_health_check=list(HealthCheck))
 def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
     # CNF-6
     with suppress(InputError):

@@ -70,7 +70,7 @@ def test_geometry_is_shown_as_it_is_decoded(source):
 def test_colours_that_were_fitted_are_those_of_the_file(source):
     rows = np.arange(400)
     result = encode_with_report(
-        source, EncodeOptions(quality=80.0), between=between(source, rows, lambda m: (m.sh0 + 1, m.shN * 0))
+        source, EncodeOptions(attribute_psnr=80.0), between=between(source, rows, lambda m: (m.sh0 + 1, m.shN * 0))
     )
     decoded = decode(result.data)
     np.testing.assert_allclose(source.sh0[result.source_index] + 1, decoded.sh0, atol=0.01)

@@ -116,7 +116,7 @@ def test_a_pile_of_identical_splats_wants_a_finer_quality():
     source, judged = learnt_from("a million identical"), small_judge("a million identical")
     told = ("small", None, 22.3), ("balanced", None, 30.0), ("fast", None, 35.1), ("balanced", 70.0, 37.9)
     for preset, quality, psnr in told:
-        found = judged.psnr(decode(encode(source, EncodeOptions(preset=preset, quality=quality))))
+        found = judged.psnr(decode(encode(source, EncodeOptions(preset=preset, attribute_psnr=quality))))
         assert found == pytest.approx(psnr, abs=0.5)
 
 

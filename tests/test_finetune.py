@@ -33,7 +33,7 @@ from csplat_trainer.loss import PhotometricLoss
 
 BLACK = np.zeros(3, np.float32)
 QUICK = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, log_every=10)
-COARSE = EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16)
+COARSE = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +58,11 @@ def psnr(model, views):
     "encoding",
     [
         COARSE,
-        EncodeOptions(quality=28.0, sh_coding="scalar"),
-        EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, codebook_stages=2, shape_codebook_size=32),
-        EncodeOptions(quality=28.0, sh_coding="none", tile_splats=80),
+        EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
+        EncodeOptions(
+            attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, codebook_stages=2, shape_codebook_size=32
+        ),
+        EncodeOptions(attribute_psnr=28.0, sh_coding="none", tile_splats=80),
     ],
     ids=["codebook", "scalar", "shapes and stages", "no SH"],
 )
@@ -100,7 +102,7 @@ def test_costly_bytes_make_small_files(source, views):
 
 
 def test_what_does_not_get_better_stays_as_it_was(source, views):
-    frozen = freeze(source, EncodeOptions(preset="fast", quality=90.0, sh_coding="scalar"))
+    frozen = freeze(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"))
     tuned = finetune(frozen, views, replace(QUICK.scaled(5.0), byte_cost=0.0))
     assert 0 == tuned.log["best_iteration"]
     start = frozen.start()
@@ -108,7 +110,7 @@ def test_what_does_not_get_better_stays_as_it_was(source, views):
 
 
 def test_a_run_that_gains_nothing_ends_early(source, views):
-    frozen = freeze(source, EncodeOptions(preset="fast", quality=90.0, sh_coding="scalar"))
+    frozen = freeze(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"))
     options = replace(QUICK, iterations=300, patience=2, byte_cost=0.0).scaled(5.0)
     log = finetune(frozen, views, options).log
     assert log["settled"]
@@ -121,7 +123,7 @@ def test_a_run_that_gains_nothing_ends_early(source, views):
 
 def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     """A sum over users, against finite differences of the loss by an entry's values."""
-    frozen = freeze(source, EncodeOptions(quality=60.0, sh_coding="codebook", codebook_size=16))
+    frozen = freeze(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
     scene, view = TunedScene(frozen), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
     seen, _ = scene.seen()
@@ -203,7 +205,7 @@ def test_costs_take_the_integers_that_are_coded(source):
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
 def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
     """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
-    frozen = freeze(source, EncodeOptions(sh_coding="scalar", quality=60.0))
+    frozen = freeze(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0))
     scene = TunedScene(frozen)
     seen, _ = scene.seen()
     stored = scene.stored(seen)
@@ -263,7 +265,9 @@ def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, vie
 
 
 def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
-    frozen = freeze(source, EncodeOptions(quality=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32))
+    frozen = freeze(
+        source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
+    )
     file = tmp_path / "c.npz"
     middle = []
 
@@ -293,7 +297,7 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_pa
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
     file = tmp_path / "c.npz"
     finetune(freeze(source, COARSE), views, replace(QUICK, iterations=5), checkpoint=file)
-    other = freeze(source, replace(COARSE, quality=29.0))
+    other = freeze(source, replace(COARSE, attribute_psnr=29.0))
     with pytest.raises(InputError, match="another scene"):
         finetune(other, views, QUICK, resume=file)
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
@@ -619,7 +623,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
     white = np.ones(3, np.float32)
     views = split_views([View(picture.camera, picture) for picture in data.train], white)
-    frozen = freeze(model, EncodeOptions(preset="small", quality=34.0))
+    frozen = freeze(model, EncodeOptions(preset="small", attribute_psnr=34.0))
     tuned = finetune(frozen, views, FinetuneOptions(iterations=400))
     judges = [View(one.camera, one) for one in data.test[::10]]
 
@@ -631,6 +635,6 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
             error.append(np.square(picture - wanted).mean())
         return -10.0 * math.log10(float(np.mean(error)))
 
-    plain = decode(encode(model, EncodeOptions(preset="small", quality=34.0)))
+    plain = decode(encode(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     best, lost = score(model), score(plain)
     assert score(decode(encode_frozen(frozen, tuned.held).data)) > lost + 0.6 * (best - lost)

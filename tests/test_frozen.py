@@ -21,7 +21,7 @@ WAYS = {
     "no SH": {"sh_coding": "none"},
     "fewer bands": {"sh_degree": 1},
     "tiles, axis": {"tile_splats": 50, "means_coding": "axis"},
-    "coarse": {"quality": 30.0},
+    "coarse": {"attribute_psnr": 30.0},
     "position bits": {"position_bits": 8},
     "shapes": {"shape_codebook_size": 32},
     "shapes and all": {"shape_codebook_size": 32, "sh_coding": "codebook", "codebook_size": 16, "tile_splats": 90},
@@ -166,7 +166,7 @@ def test_the_sample_is_decoded_as_it_was_seen(sample_path):
     ("name", "options"),
     [
         ("lego60k", {"preset": "small"}),
-        ("fox60k_noreg", {"sh_coding": "scalar", "quality": 40.0}),
+        ("fox60k_noreg", {"sh_coding": "scalar", "attribute_psnr": 40.0}),
         ("plane3", {"shape_codebook_size": 512}),
         ("train1000", {}),
         ("donut", {"tile_splats": 10_000}),

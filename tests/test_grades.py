@@ -108,7 +108,7 @@ def test_what_rounding_loses_is_foretold():
     from csplat_tools.importances import measured_importance
 
     scene, views = shell(0), cameras(12)
-    options = EncodeOptions(quality=58)
+    options = EncodeOptions(attribute_psnr=58)
     importance = measured_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
     plan = make_plan(scene, options, importance_given=True)
     foretold = step_errors(scene, importance.curvatures, plan).sum()
@@ -135,7 +135,7 @@ def test_grades_have_steps_of_their_own(model):
 @pytest.mark.parametrize("name", ["means", "opacities", "scales", "sh0"])
 def test_what_matters_more_is_kept_better(model, name):
     importance = important(model)
-    result, decoded = encoded(model, importance, quality=45)
+    result, decoded = encoded(model, importance, attribute_psnr=45)
     source = model if name != "scales" else replace(model, scales=np.sort(model.scales, axis=1))
     if name == "scales":
         decoded = replace(decoded, scales=np.sort(decoded.scales, axis=1))

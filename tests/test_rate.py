@@ -358,7 +358,7 @@ def test_the_command_keeps_to_largest_errors(tmp_path, ply):
         (["--target-size", "many"], 2, "a size is"),
         (["--target-psnr", "120"], 2, "at most 99"),
         (["--max-error", "means=1mm"], 1, "--unit-metres"),
-        (["--target-size", "5kB", "--quality", "40"], 2, "--quality is what a target chooses"),
+        (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr is what a target chooses"),
         (["--views", "9"], 2, "--views says nothing"),
         (["--grades", "3"], 2, "--grades says nothing"),
         (["--grades", "9", "--target-size", "5kB"], 2, "grades is 9"),

@@ -252,7 +252,7 @@ def test_the_encoders_degree_is_the_reductions(source):
 def test_a_clustered_file_states_its_errors_against_the_source(source, text):
     kmeans = parse_kmeans(text, stages=2)
     reduction = Reduction(prune_opacity=0.2, sh_degree=1, kmeans=kmeans)
-    result = encode_reduced(source, reduction, EncodeOptions(quality=60.0))
+    result = encode_reduced(source, reduction, EncodeOptions(attribute_psnr=60.0))
     scene = stored(source, result)
     assert 6 == len(scene.stated_errors.records)
     clustered = reduce_model(source, reduction).model
@@ -272,8 +272,8 @@ def test_a_file_is_the_same_each_time(source):
 
 
 def test_a_distilled_degree_looks_more_like_the_source(shell):
-    truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(quality=60.0))
-    distilled = encode_reduced(shell, Reduction(sh_degree=0, distil=True), EncodeOptions(quality=60.0))
+    truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(attribute_psnr=60.0))
+    distilled = encode_reduced(shell, Reduction(sh_degree=0, distil=True), EncodeOptions(attribute_psnr=60.0))
     scene = stored(shell, distilled)
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
     assert scene.stated_errors.refitted

@@ -60,8 +60,8 @@ def swept(capture, tmp_path_factory):
     """A sweep over every group, judged by photographs; one point cannot be made: no splat is so opaque."""
     folder = tmp_path_factory.mktemp("swept")
     result = invoke(
-        capture / "scene.ply", "--data", capture, "--what", "presets,quality,strategies,targets,simplify",
-        "--with-finetune", "--quality", "40", "--psnr", "30", "--sizes", "9kB", "--keep", "0.5", "--opacities",
+        capture / "scene.ply", "--data", capture, "--what", "presets,precision,strategies,targets,simplify",
+        "--with-finetune", "--attribute-psnr", "40", "--psnr", "30", "--sizes", "9kB", "--keep", "0.5", "--opacities",
         "0.3,0.97", "--kmeans", "16", "--iterations", "20", "-o", folder / "report.html", "--json",
         folder / "report.json", "--plots", folder / "plots",
     )  # fmt: skip
@@ -76,7 +76,7 @@ def setting(capture):
 
 @pytest.fixture(scope="module")
 def measured(setting):
-    return measure_tradeoff(setting, Wanted(what=("presets", "quality"), quality=(36.0,)))
+    return measure_tradeoff(setting, Wanted(what=("presets", "precision"), attribute_psnr=(36.0,)))
 
 
 # what is measured
@@ -86,8 +86,8 @@ def test_every_group_has_its_points(swept):
     _, _, report = swept
     names = {one["name"]: one["family"] for one in report["points"]}
     assert {
-        "fast": "presets", "balanced": "presets", "small": "presets", "quality 40": "quality", "SH 1": "strategies",
-        "SH 0": "strategies", "opacity > 0.3": "strategies", "opacity > 0.97": "strategies",
+        "fast": "presets", "balanced": "presets", "small": "presets", "attributes 40 dB": "precision",
+        "SH 1": "strategies", "SH 0": "strategies", "opacity > 0.3": "strategies", "opacity > 0.97": "strategies",
         "SH 0, opacity > 0.97": "strategies", "k-means 16": "strategies", "SH 1, distilled": "strategies",
         "SH 0, distilled": "strategies", "target 30 dB": "targets", "target 9.0 kB": "targets", "keep 0.5": "simplify",
         "tuned": "finetune", "tuned, keep 0.5": "finetune",
@@ -317,7 +317,7 @@ def test_without_one_point_that_can_be_measured_it_fails(setting):
 
 def test_a_scene_without_splats_is_swept(setting, make_model):
     empty = replace(setting, source=make_model(0, 1), source_bytes=1000)
-    found = measure_tradeoff(empty, Wanted(what=("presets", "quality"), quality=(40.0,)))
+    found = measure_tradeoff(empty, Wanted(what=("presets", "precision"), attribute_psnr=(40.0,)))
     assert [None] * 4 == [one.bytes_per_source_splat for one in found.measured]
     assert {99.0} == {one.psnr for one in found.measured}
     assert "0 splats" in format_tradeoff(found)
@@ -400,8 +400,8 @@ def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
         ["--what", "presets,everything"],
         ["--what", ""],
         ["--what", "strategies", "--preset", "huge"],
-        ["--quality", "forty"],
-        ["--quality", "500"],
+        ["--attribute-psnr", "forty"],
+        ["--attribute-psnr", "500"],
         ["--psnr", "100"],
         ["--sizes", "5 parsecs"],
         ["--keep", "0"],

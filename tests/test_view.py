@@ -14,6 +14,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+from interrupts import heed_interrupts
 
 from csplat import EncodeOptions, decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
@@ -306,6 +307,7 @@ def command(*words):
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
     )
     with process:
         try:

@@ -44,7 +44,7 @@ _PARTS = ("main", "control", "others", "sizes", "escapes", "positions", "sh0", "
 _MEMORY = "peak-memory.json"
 _MEMORY_STEPS = 30  # memory does not grow with them
 
-_OWN = ("quality", "codebook_size", "shape_codebook_size", "threads")  # of the encoder's options
+_OWN = ("attribute_psnr", "codebook_size", "shape_codebook_size", "threads")  # of the encoder's options
 
 _LISTS: tuple[tuple[str, type[int | float] | None, str, str], ...] = (
     ("sizes", int, "1024,2048,4096,8192,16384", "of codebooks"),
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         "--train-iterations", type=int, metavar="N", help="of scenes that are trained; default: each its own"
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="small", help="default: %(default)s")
-    parser.add_argument("--quality", type=float, metavar="DB", help="of the encoder; default: the preset's")
+    parser.add_argument("--attribute-psnr", type=float, metavar="DB", help="of the encoder; default: the preset's")
     parser.add_argument("--codebook-size", type=int, metavar="N", help="of SH; default: what the encoder chooses")
     parser.add_argument(
         "--knob", action="append", default=[], metavar="NAME=NUMBER", help="any other option of the encoder"
@@ -138,7 +138,7 @@ def _options(args: argparse.Namespace) -> tuple[EncodeOptions, FinetuneOptions]:
         if not 0.0 < share <= 1.0:
             raise InputError(f"a share of splats is {share:g}, wanted more than 0, at most 1")
     encoding = EncodeOptions(
-        preset=args.preset, quality=args.quality, codebook_size=args.codebook_size,
+        preset=args.preset, attribute_psnr=args.attribute_psnr, codebook_size=args.codebook_size,
         shape_codebook_size=args.shapes or None, threads=args.threads, **_knobs(args.knob),
     )  # fmt: skip
     return encoding, FinetuneOptions(iterations=args.iterations, byte_cost=args.byte_cost).scaled(args.lr_factor)

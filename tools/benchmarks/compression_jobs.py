@@ -41,7 +41,7 @@ def find_ways(args: argparse.Namespace, encoding: EncodeOptions) -> Ways:
         },
         "positions": {f"{bits} bits": replace(encoding, position_bits=bits) for bits in args.bits},
         "curve": {
-            f"quality {decibels:g}": replace(encoding, quality=decibels)
+            f"quality {decibels:g}": replace(encoding, attribute_psnr=decibels)
             for decibels in (*args.qualities, *(decibels for _, decibels in args.both))
         },
         "others": {
@@ -66,7 +66,7 @@ def find_jobs(bench: Bench, kept: Kept, ways: Ways, args: argparse.Namespace) ->
     for keep in args.keep:
         yield "curve", f"keep {keep:g}", partial(_row, bench, bench.encoding, keep)
     for keep, decibels in args.both:
-        encoding = replace(bench.encoding, quality=decibels)
+        encoding = replace(bench.encoding, attribute_psnr=decibels)
         yield "curve", f"keep {keep:g}, quality {decibels:g}", partial(_row, bench, encoding, keep)
 
 

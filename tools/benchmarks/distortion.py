@@ -233,7 +233,7 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
 
     def measure(quality: float) -> Point:
         quality = round(quality, 2)
-        options = EncodeOptions(quality=quality, sh_coding="auto" if coding == "none" else coding)
+        options = EncodeOptions(attribute_psnr=quality, sh_coding="auto" if coding == "none" else coding)
         graded = preset == GRADED
         options = replace(options, adaptive=1.0) if graded else replace(options, preset=preset)
         start = time.perf_counter()

@@ -92,7 +92,7 @@ def _of_psnr(name: str) -> Path:
 
 def _file(source: SplatModel, quality: float, importance: Importance | None) -> bytes:
     """A file; graded where an importance says how."""
-    return encode_with_report(source, EncodeOptions(quality=quality), importance=importance).data
+    return encode_with_report(source, EncodeOptions(attribute_psnr=quality), importance=importance).data
 
 
 def _share(curve: dict[str, list[Point]], psnr: float, size_bytes: int) -> str:

@@ -93,8 +93,8 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
     coding = preset.sh_coding if options.sh_coding == "auto" else options.sh_coding
     quality = preset.quality[0 if degree else 1]
     sh_quality = preset.sh_quality
-    if options.quality is not None:
-        quality, sh_quality = options.quality, options.quality + preset.sh_quality - preset.quality[0]
+    if options.attribute_psnr is not None:
+        quality, sh_quality = options.attribute_psnr, options.attribute_psnr + preset.sh_quality - preset.quality[0]
     statistics = scene_statistics(model)
     steps = _steps(statistics, quality, sh_quality, has_sh=degree > 0)
     return Plan(

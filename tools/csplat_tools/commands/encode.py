@@ -95,8 +95,13 @@ def encode(
             help="Leave out splats not worth their bits, or never. By default of objects, or with 40 cameras or more.",
         ),
     ] = None,
-    quality: Annotated[
-        float | None, typer.Option(metavar="DB", rich_help_panel=_PRECISION, help="PSNR that each attribute keeps.")
+    attribute_psnr: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DB",
+            rich_help_panel=_PRECISION,
+            help="PSNR that each attribute keeps by itself; the file's is 5 to 12 dB lower.",
+        ),
     ] = None,
     position_bits: Annotated[
         int | None, typer.Option(metavar="2..16", rich_help_panel=_PRECISION, help="Bits per axis of a tile.")
@@ -249,7 +254,7 @@ def encode(
     try:
         options = EncodeOptions(
             preset=preset,
-            quality=quality,
+            attribute_psnr=attribute_psnr,
             profile=profile,
             position_bits=position_bits,
             position_step=position_step,

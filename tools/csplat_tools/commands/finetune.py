@@ -147,7 +147,7 @@ def finetune(
 
     Examples:
       csplat finetune scene.ply --data capture -o scene.csplat --preset small
-      csplat finetune scene.ply --data capture -o scene.csplat --quality 40 --report scene.json
+      csplat finetune scene.ply --data capture -o scene.csplat --attribute-psnr 40 --report scene.json
       csplat finetune scene.ply --data capture -o scene.csplat --keep 0.5
       csplat finetune scene.ply --self -o scene.csplat
       csplat finetune scene.ply --data capture -o scene.csplat --checkpoint run.npz --resume run.npz

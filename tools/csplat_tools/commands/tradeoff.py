@@ -44,8 +44,8 @@ def tradeoff(
     preset: Annotated[
         str, typer.Option(metavar="|".join(PRESETS), rich_help_panel=_WHAT, help="Of all that is not a preset.")
     ] = Wanted.preset,
-    quality: Annotated[
-        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Values of `encode --quality`.")
+    attribute_psnr: Annotated[
+        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Values of `encode --attribute-psnr`.")
     ] = None,
     psnr: Annotated[
         str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Targets: PSNR against the source.")
@@ -99,7 +99,7 @@ def tradeoff(
 
     Encodes the scene in many ways, measures bytes, pictures and seconds of
     each, and marks those that no other one beats: presets, values of
-    --quality, targets, simplification, fewer SH bands, fewer splats. A small
+    --attribute-psnr, targets, simplification, fewer SH bands, fewer splats. A small
     scene takes a few minutes. `psnr` is against the source's own renders, as
     of `csplat compare`; photographs judge beside it. Needs the packages of
     the render extra.
@@ -107,11 +107,14 @@ def tradeoff(
     Examples:
       csplat tradeoff scene.ply
       csplat tradeoff scene.ply -o report.html --json report.json --plots plots
-      csplat tradeoff scene.ply --what presets,quality --quality 36,44,52
+      csplat tradeoff scene.ply --what presets,precision --attribute-psnr 36,44,52
       csplat tradeoff scene.ply --what targets --psnr 38,42 --sizes 1MB,500kB
       csplat tradeoff scene.ply --data photographs --size 480x270 --with-finetune -o report.html
     """
-    lists = {"quality": quality, "psnr": psnr, "sizes": sizes, "keep": keep, "opacities": opacities, "kmeans": kmeans}
+    lists = {
+        "attribute_psnr": attribute_psnr, "psnr": psnr, "sizes": sizes, "keep": keep, "opacities": opacities,
+        "kmeans": kmeans,
+    }  # fmt: skip
     wanted = _wanted(what, with_finetune, preset, lists, iterations, modes, threads)
     if cameras is not None and data is not None:
         raise typer.BadParameter("wanted one of --cameras and --data")

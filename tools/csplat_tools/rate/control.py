@@ -99,7 +99,7 @@ def encode_to_target(
     encoding = encoding or EncodeOptions()
     if not len(source):
         raise InputError("a scene without splats has no size or quality to choose")
-    if encoding.quality is not None:
+    if encoding.attribute_psnr is not None:
         raise InputError("quality is what a target chooses: give one of them")
     blocked = _blocked(target, encoding)
     if prune and blocked is not None:

@@ -60,7 +60,7 @@ class Choice:
             sh_degree=degree,
             adaptive=adaptive,
             grades=encoding.grades if self.graded else 1,
-            quality=quality,
+            attribute_psnr=quality,
         )
 
 

@@ -95,7 +95,7 @@ class Candidate:
         between = Between(len(session.source), self._rows, colours, said, adjusted=adjusted, figures=figures)
         result = encode_with_report(
             self.fitted,
-            replace(encoding, quality=quality),
+            replace(encoding, attribute_psnr=quality),
             importance=self._measured() if encoding.shape_codebook_size or self._grades(encoding) else self._weights,
             between=between,
             progress=self._progress,

@@ -63,8 +63,8 @@ def encode_simplified(
         source: the scene.
         cameras: as for `simplify`.
         target: `keep`: the encoder's own options decide the rest. `psnr` and `max_loss`: of the file against the
-            source or the photographs; number of splats and precision are chosen together, `encoding.quality` is not
-            looked at, and the smallest of several files is returned, that of the whole scene among them. `size_bytes`:
+            source or the photographs; number of splats and precision are chosen together, and `attribute_psnr` is not
+            looked at; the smallest of several files is returned, that of the whole scene among them. `size_bytes`:
             the best of several files within it.
         encoding: of the encoder.
         options: of the simplification.
@@ -85,7 +85,7 @@ def encode_simplified(
         judge = Judge.of_source(source, judged_by, options.background, options.threads)
     if left is not None:
         gone = min(len(source) - left, len(session.order.rows))
-        return Candidate(session, gone, judge, progress).encoded(encoding, encoding.quality)
+        return Candidate(session, gone, judge, progress).encoded(encoding, encoding.attribute_psnr)
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0
     if target.size_bytes is not None:
         return _within(session, judge, target.size_bytes, encoding, has_sh=has_sh, progress=progress)
@@ -159,7 +159,7 @@ def _plain(
     source: SplatModel, judge: Judge, progress: Progress | None, encoding: EncodeOptions, quality: float
 ) -> SimplifiedFile:
     """The file without simplification."""
-    result = encode_with_report(source, replace(encoding, quality=quality), progress=progress)
+    result = encode_with_report(source, replace(encoding, attribute_psnr=quality), progress=progress)
     report = {"splats": len(source), "splats_before": len(source), "quality": quality}
     return SimplifiedFile(result, {**report, "psnr": judge.psnr(decode(result.data))})
 

@@ -11,7 +11,7 @@ from csplat.errors import InputError
 __all__ = ["FAMILIES", "USUAL", "Wanted", "parse_numbers", "parse_sizes", "parse_words"]
 
 #: Groups of points, in the order in which they are measured: what is quick comes first.
-FAMILIES = ("presets", "quality", "strategies", "targets", "simplify", "finetune")
+FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")
 #: Those that are measured unless others are asked for: fine-tuning takes minutes for each point.
 USUAL = FAMILIES[:-1]
 
@@ -23,7 +23,7 @@ class Wanted:
     Attributes:
         what: some of `FAMILIES`.
         preset: of what is coded once splats, bands or colours have been left out, and of the targets.
-        quality: of `EncodeOptions`, dB.
+        attribute_psnr: of `EncodeOptions`, dB.
         psnr: targets, dB.
         sizes: targets, bytes.
         keep: shares of the splats that simplification leaves.
@@ -39,7 +39,7 @@ class Wanted:
 
     what: tuple[str, ...] = USUAL
     preset: str = "balanced"
-    quality: tuple[float, ...] = (32.0, 36.0, 40.0, 44.0, 48.0, 56.0)
+    attribute_psnr: tuple[float, ...] = (32.0, 36.0, 40.0, 44.0, 48.0, 56.0)
     psnr: tuple[float, ...] = (36.0, 40.0, 44.0)
     sizes: tuple[int, ...] = ()
     keep: tuple[float, ...] = (0.7, 0.5, 0.3)
@@ -57,7 +57,7 @@ class Wanted:
             raise InputError(f"nothing is to be swept, wanted some of {', '.join(FAMILIES)}")
         if self.preset not in PRESETS:
             raise InputError(f"the preset is {self.preset!r}, wanted one of {', '.join(PRESETS)}")
-        _check("a quality", self.quality, 10.0, 120.0, "dB")
+        _check("the PSNR of an attribute", self.attribute_psnr, 10.0, 120.0, "dB")
         _check("a target PSNR", self.psnr, 1.0, 99.0, "dB")
         _check("a target size", self.sizes, 1, math.inf, "bytes")
         _check("an opacity", self.opacities, 0.0, 1.0, "")

@@ -20,7 +20,7 @@ _WIDE, _HIGH = 7.0, 4.4  # inches of 100 pixels
 # Colours that people tell apart whatever colours they see, on white and on black; markers say the same again.
 _STYLES = {
     "presets": ("#d55e00", "s"),
-    "quality": ("#2f83c9", "o"),
+    "precision": ("#2f83c9", "o"),
     "strategies": ("#cc79a7", "^"),
     "targets": ("#e69f00", "D"),
     "simplify": ("#009e73", "v"),
@@ -28,7 +28,7 @@ _STYLES = {
 }
 _NAMES = {
     "presets": "presets",
-    "quality": "--quality",
+    "precision": "--attribute-psnr",
     "strategies": "simple strategies",
     "targets": "targets",
     "simplify": "simplified",

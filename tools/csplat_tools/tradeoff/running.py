@@ -22,7 +22,7 @@ __all__ = ["Tradeoff", "estimated_seconds", "measure_tradeoff"]
 # pictures of the source take; for an estimate that a person decides by, no more.
 _COSTS = {
     "presets": (12.0, 15.0),
-    "quality": (12.0, 6.0),
+    "precision": (12.0, 6.0),
     "strategies": (12.0, 6.0),
     "k-means": (250.0, 6.0),
     "distilled": (40.0, 110.0),

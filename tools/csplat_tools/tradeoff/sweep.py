@@ -45,7 +45,7 @@ def candidates(setting: Setting, wanted: Wanted) -> list[Candidate]:
     """List what is to be tried, what is quick first."""
     makers = {
         "presets": _presets,
-        "quality": _qualities,
+        "precision": _precisions,
         "strategies": _strategies,
         "targets": _targets,
         "simplify": _simplified,
@@ -61,10 +61,10 @@ def _presets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
         yield Candidate(preset, "presets", partial(_encode, setting.source, options), is_partial=has_bands)
 
 
-def _qualities(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
-    for quality in wanted.quality:
-        options = EncodeOptions(preset=wanted.preset, quality=quality, threads=wanted.threads)
-        yield Candidate(f"quality {quality:g}", "quality", partial(_encode, setting.source, options))
+def _precisions(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
+    for decibels in wanted.attribute_psnr:
+        options = EncodeOptions(preset=wanted.preset, attribute_psnr=decibels, threads=wanted.threads)
+        yield Candidate(f"attributes {decibels:g} dB", "precision", partial(_encode, setting.source, options))
 
 
 def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:

@@ -1,0 +1,10 @@
+"""Programs that tests interrupt."""
+
+import signal
+
+__all__ = ["heed_interrupts"]
+
+
+def heed_interrupts():
+    """Make a child process heed SIGINT, also where the tests run in the background of a shell, which ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
