@@ -82,9 +82,16 @@ class Coded:
 
     @classmethod
     def of(
-        cls, draft: Draft, books: Books, errors: ErrorSums | None = None, progress: Progress | None = None
-    ) -> Coded:  # fmt: skip
-        """Code the tiles of a draft whose plan is complete; `errors`, unless given, are those that this makes."""
+        cls, draft: Draft, books: Books, *, errors: ErrorSums | None = None, progress: Progress | None = None
+    ) -> Coded:
+        """Code the tiles of a draft whose plan is complete.
+
+        Args:
+            draft: everything but SH, whose coding its plan names.
+            books: of SH.
+            errors: to state; `None`: those of the coding.
+            progress: as of `Draft.of`.
+        """
         tiles = _coded_tiles(draft, books, progress)
         errors = errors or ErrorSums.total(part.errors for part in tiles)
         books = with_zero_books(

@@ -26,7 +26,7 @@ from csplat.encoder.codebook import Books, choose_sh
 from csplat.encoder.coded import Coded
 from csplat.encoder.frozen import Frozen
 from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.geometry import quantised_geometry
+from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
 from csplat.encoder.grades import Grades, choose_grades
 from csplat.encoder.importance import (
     Importance,
@@ -132,15 +132,16 @@ class Draft:
         if options.shape_codebook_size and len(model):
             weights = shape_weights(model, importance)
             metric = shape_metric(weights, importance)
-            shapes = choose_shapes(
-                model, weights, metric, tiles, plan, options, progress or _silent
-            )  # fmt: skip
+            shapes = choose_shapes(model, weights, metric, tiles, plan, options, progress or _silent)
         return cls(model, options, origin, importance, plan, tiles, extras, shapes, grades)
 
     @cached_property
     def scene(self) -> SplatModel:
         """The scene as a decoder will see it, in its order of splats, but for the colours, which are as they are."""
-        return quantised_geometry(self.model, self.tiles, self.plan, self.shapes)
+        model, tiles, plan = self.model, self.tiles, self.plan
+        quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, self.shapes)
+        means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, tiles, plan)
+        return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
 
     def with_colours(self, sh0: F32, shN: F32) -> Draft:
         """The same geometry with colours that were fitted anew.
@@ -152,9 +153,8 @@ class Draft:
         Raises:
             InputError: they are of another shape or type, or not finite.
         """
-        return replace(
-            self, model=replace(self.model, sh0=sh0, shN=shN), origin=replace(self.origin, refitted=True)
-        )  # fmt: skip
+        model = replace(self.model, sh0=sh0, shN=shN)
+        return replace(self, model=model, origin=replace(self.origin, refitted=True))
 
     def coded(self, progress: Progress | None = None) -> Coded:
         """Decide how SH is coded, and code the tiles: most of the work.
@@ -179,7 +179,7 @@ class Draft:
             raise InputError("a scene without splats has nothing to tune")
         if self.grades is not None:  # what tunes it reckons with one step per attribute
             raise InputError("the splats are of several grades, wanted one: draft them with graded=False")
-        source = source or self.model
+        source = self.model if source is None else source
         if len(source) != self.origin.source_count:
             raise InputError(f"a source of {len(source)} splats, wanted {self.origin.source_count}: that of the origin")
         plan, books = self._sh(progress)

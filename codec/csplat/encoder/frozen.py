@@ -192,7 +192,7 @@ class Frozen:
             model, means=held.means, quats=quats, scales=scales, opacities=held.opacities, sh0=held.sh0, shN=shN
         )
         errors = measured_sums(self.source, decoded, self.source_index)
-        return Coded.of(replace(self.draft, model=model, shapes=shapes), books, errors, progress)
+        return Coded.of(replace(self.draft, model=model, shapes=shapes), books, errors=errors, progress=progress)
 
     def seen(self, held: Held) -> Seen:
         """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""

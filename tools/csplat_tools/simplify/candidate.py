@@ -65,7 +65,6 @@ class Candidate:
         """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
         session = self._session
         report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
-
         draft = Draft.of(
             self.fitted, replace(encoding, attribute_psnr=quality),
             importance=self._measured() if encoding.shape_codebook_size or self._grades(encoding) else self._weights,
