@@ -200,7 +200,7 @@ def test_scenes_are_chosen_by_name(tmp_path):
 
 def run(capture, out, *words):
     extra = ("--scenes", "", "--extra", "shell", capture / "scene.ply", capture, "-", "black")
-    small = ("--iterations", 40, "--quality", 30, "--shapes", 32, "--codebook-size", 16, "--threads", 1)
+    small = ("--iterations", 40, "--attribute-psnr", 30, "--shapes", 32, "--codebook-size", 16, "--threads", 1)
     return main([str(word) for word in (*words, *extra, *small, "--out", out)])
 
 

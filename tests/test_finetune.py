@@ -389,7 +389,7 @@ def capture(source, tmp_path_factory):
 def test_the_command_tunes_prunes_and_reports(capture, tmp_path):
     out, report, log = tmp_path / "s.csplat", tmp_path / "report.json", tmp_path / "log.json"
     said = call(
-        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--quality", 28, "--iterations", 200,
+        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--attribute-psnr", 28, "--iterations", 200,
         "--report", report, "--json", log, "--deflate", "zlib",
     )  # fmt: skip
     facts = json.loads(report.read_text())
@@ -439,7 +439,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
 def test_a_scene_can_be_tuned_to_its_own_renders(capture, tmp_path):
     out, report = tmp_path / "s.csplat", tmp_path / "report.json"
     call(
-        "finetune", capture / "scene.ply", "--self", "-o", out, "--quality", 28, "--iterations", 150, "--views", 24,
+        "finetune", capture / "scene.ply", "--self", "-o", out, "--attribute-psnr", 28, "--iterations", 150, "--views", 24,
         "--lr-factor", 0.3, "--view-size", "64x48", "--report", report, "-q",
     )  # fmt: skip
     facts = json.loads(report.read_text())
@@ -536,7 +536,7 @@ def test_every_knob_of_the_encoder_is_there():
 
 
 def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--quality", 28, "-q")
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, "-q")
     call(*words, "-o", tmp_path / "whole.csplat", "--iterations", 50)
     short = tmp_path / "run.npz"
     call(*words, "-o", tmp_path / "a.csplat", "--iterations", 50, "--checkpoint", short, "--checkpoint-every", 20)
@@ -550,7 +550,7 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
         ((), "one of --data and --self"),
         (("--self", "--data", "x"), "one of --data and --self"),
         (("--data", "x", "--cameras", "y"), "--cameras goes with --self"),
-        (("--self", "--quality", "5"), "quality is 5"),
+        (("--self", "--attribute-psnr", "5"), "attribute_psnr is 5"),
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
         (("--self", "--lr-factor", "1e9"), "lr_"),
         (("--self", "--near", "0.1"), "for the photographs of --data"),
