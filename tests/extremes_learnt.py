@@ -11,7 +11,7 @@ import numpy as np
 from extremes import COUNT, DRAWN, NAMES, judge, scene
 
 from csplat import EncodeOptions, SplatModel, decode
-from csplat.encoder.freezing import Frozen, encode_frozen, freeze
+from csplat.encoder import Draft, Frozen
 from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.simplify import Simplified, SimplifyOptions, Target, simplify
@@ -74,7 +74,7 @@ def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
     """The scene, tuned as a file, and who judges it by pictures that were kept aside."""
     source = learnt_from(name)
     views = split_views(renders_of(source, virtual_cameras(source, 52, 48, 36), BLACK, None), BLACK, aside=4)
-    frozen = freeze(source, COARSE)
+    frozen = Draft.of(source, COARSE).frozen()
     aside = Judge([view.camera for view in views.validation], [view.wanted for view in views.validation])
     return frozen, finetune(frozen, views, SHORT), aside
 
@@ -82,7 +82,7 @@ def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
 def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:
     """What the file decodes to without and with tuning."""
     frozen, result, _ = tuned(name)
-    before, after = (decode(encode_frozen(frozen, held).data) for held in (frozen.start(), result.held))
+    before, after = (decode(frozen.coded(held).write().data) for held in (frozen.start(), result.held))
     return before, after
 
 

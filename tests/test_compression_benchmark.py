@@ -34,7 +34,7 @@ from compression_sizes import (  # noqa: E402
 from compression_tables import tables  # noqa: E402
 
 from csplat import EncodeOptions  # noqa: E402 - wants what is looked for above; so do all below
-from csplat.encoder.freezing import encode_frozen, freeze  # noqa: E402
+from csplat.encoder import Draft  # noqa: E402
 from csplat.errors import InputError  # noqa: E402
 from csplat_trainer.finetune import FinetuneOptions, finetune, renders_of, split_views  # noqa: E402
 from csplat_trainer.sensitivity import measure_sensitivity  # noqa: E402
@@ -80,7 +80,7 @@ def test_integers_take_whole_bytes_by_the_range_of_their_column():
     "options", [BOOKS, replace(BOOKS, codebook_stages=2), EncodeOptions(attribute_psnr=28.0, sh_coding="scalar")]
 )
 def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, options):
-    frozen = freeze(source, options)
+    frozen = Draft.of(source, options).frozen()
     colours, shapes = books_of(frozen)
     n = len(source)
     rows = n if colours is None else colours.entries + colours.escaped
@@ -91,15 +91,15 @@ def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, option
 
 
 def test_a_file_is_smaller_than_its_integers(source):
-    frozen = freeze(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar"))
-    assert len(encode_frozen(frozen, frozen.start()).data) < integer_bytes(integer_columns(frozen, frozen.start()))
+    frozen = Draft.of(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar")).frozen()
+    assert len(frozen.coded(frozen.start()).write().data) < integer_bytes(integer_columns(frozen, frozen.start()))
 
 
 # controls
 
 
 def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(source):
-    plain = freeze(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar"))
+    plain = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar")).frozen()
     frozen = Unquantised.of(plain)
     start = frozen.start()
     for name in ("means", "scales", "opacities", "sh0"):
@@ -116,7 +116,7 @@ def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(sourc
 def test_the_control_learns(source):
     wanted = renders_of(source, cameras(10), BLACK, None)
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
-    frozen = Unquantised.of(freeze(off, EncodeOptions(preset="fast", sh_coding="scalar")))
+    frozen = Unquantised.of(Draft.of(off, EncodeOptions(preset="fast", sh_coding="scalar")).frozen())
     options = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, byte_cost=0.0)
     log = finetune(frozen, split_views(wanted, BLACK, aside=2), options).log
     assert log["best_psnr"] > log["start_psnr"] + 3.0
@@ -200,7 +200,7 @@ def test_scenes_are_chosen_by_name(tmp_path):
 
 def run(capture, out, *words):
     extra = ("--scenes", "", "--extra", "shell", capture / "scene.ply", capture, "-", "black")
-    small = ("--iterations", 40, "--quality", 30, "--shapes", 32, "--codebook-size", 16, "--threads", 1)
+    small = ("--iterations", 40, "--attribute-psnr", 30, "--shapes", 32, "--codebook-size", 16, "--threads", 1)
     return main([str(word) for word in (*words, *extra, *small, "--out", out)])
 
 

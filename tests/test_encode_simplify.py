@@ -11,8 +11,7 @@ pytest.importorskip("numba", reason="simplification wants the extra [render]")
 
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import decode_scene
-from csplat.encoder import encode_with_report
-from csplat.encoder.between import Between
+from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.app import app
@@ -43,43 +42,13 @@ def source():
     )
 
 
-def between(source, rows, colours=None):
-    return Between(len(source), rows, colours or (lambda seen: (seen.sh0, seen.shN)), {"why": "a test"})
-
-
-# the encoder's stages
-
-
-def test_geometry_is_shown_as_it_is_decoded(source):
-    seen = []
-
-    def colours(model):
-        seen.append(model)
-        return model.sh0, model.shN
-
-    rows = np.arange(0, 400, 2)
-    options = EncodeOptions(tile_splats=64, sh_coding="scalar")
-    result = encode_with_report(source.select(rows), options, between=between(source, rows, colours))
-    decoded = decode(result.data)
-    place = np.searchsorted(rows, result.source_index)
-    for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_array_equal(getattr(seen[0], name)[place], getattr(decoded, name))
-    np.testing.assert_array_equal(source.sh0[rows], seen[0].sh0)
-
-
-def test_colours_that_were_fitted_are_those_of_the_file(source):
-    rows = np.arange(400)
-    result = encode_with_report(
-        source, EncodeOptions(attribute_psnr=80.0), between=between(source, rows, lambda m: (m.sh0 + 1, m.shN * 0))
-    )
-    decoded = decode(result.data)
-    np.testing.assert_allclose(source.sh0[result.source_index] + 1, decoded.sh0, atol=0.01)
-    assert not decoded.shN.any()
+# what files state of themselves
 
 
 def test_the_file_says_what_it_stands_for(source):
     rows = np.arange(100, 300)
-    result = encode_with_report(source.select(rows), between=between(source, rows))
+    origin = Origin(len(source), rows, refitted=True)
+    result = encode_with_report(source.select(rows), origin=origin, said={"simplified": {"why": "a test"}})
     scene = decode_scene(result.data)
     stated = scene.stated_errors
     assert (400, 200, True) == (stated.source_count, stated.pruned_count, stated.refitted)
@@ -91,7 +60,8 @@ def test_the_file_says_what_it_stands_for(source):
 
 def test_the_geometry_of_a_refitted_file_is_proved(source):
     rows = np.arange(100, 300)
-    result = encode_with_report(source.select(rows), between=between(source, rows, lambda m: (m.sh0 + 1, m.shN)))
+    draft = Draft.of(source.select(rows), origin=Origin(len(source), rows))
+    result = draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN).coded().write()
     scene = decode_scene(result.data)
     whole = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
     assert whole.holds
@@ -108,29 +78,13 @@ def test_the_geometry_of_a_refitted_file_is_proved(source):
 def test_a_file_of_adjusted_shapes_states_its_means_alone(source):
     rows = np.arange(100, 300)
     adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
-    said = replace(between(source, rows), adjusted=True)
-    result = encode_with_report(adjusted, between=said)
+    result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
     scene = decode_scene(result.data)
     assert ["means"] == [record.measure for record in scene.stated_errors.records]
     assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
     assert prove(source, scene.model, scene.header, scene.stated_errors).holds
     moved = replace(source, means=source.means + np.float32(0.1))
     assert not prove(moved, scene.model, scene.header, scene.stated_errors).holds
-
-
-def test_a_file_says_how_good_its_renders_are(source):
-    seen = []
-
-    def figures(data):
-        seen.append(decode(data))
-        return {"psnr": 41.5}
-
-    rows = np.arange(100, 300)
-    result = encode_with_report(source.select(rows), between=replace(between(source, rows), figures=figures))
-    scene = decode_scene(result.data)
-    assert {"why": "a test", "psnr": 41.5} == scene.options["simplified"]
-    np.testing.assert_array_equal(seen[0].means, scene.model.means)
-    np.testing.assert_array_equal(seen[0].shN, scene.model.shN)
 
 
 # absent bands

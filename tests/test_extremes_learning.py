@@ -27,8 +27,7 @@ from extremes_learnt import (
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import read_header, read_stated_errors
-from csplat.encoder import encode_with_report
-from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.proof import prove
@@ -197,9 +196,9 @@ def test_splats_wider_than_float32_are_tuned():
     source = learnt_from("needles").select(slice(40))
     source = replace(source, scales=np.full_like(source.scales, 100.0))
     views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, aside=2)
-    frozen = freeze(source, COARSE)
+    frozen = Draft.of(source, COARSE).frozen()
     result = finetune(frozen, views, replace(SHORT, iterations=20))
-    assert_finite(decode(encode_frozen(frozen, result.held).data))
+    assert_finite(decode(frozen.coded(result.held).write().data))
 
 
 def test_colours_that_square_beyond_float32_are_refused_before_anything_is_tuned():

@@ -18,7 +18,7 @@ from captures import H, W, cameras, photograph, shell
 
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import read_options, read_stated_errors
-from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.encoder import Draft
 from csplat.errors import InputError
 from csplat_render import render
 from csplat_render.cameras import save_cameras
@@ -67,21 +67,21 @@ def psnr(model, views):
     ids=["codebook", "scalar", "shapes and stages", "no SH"],
 )
 def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
-    frozen = freeze(source, encoding)
-    before = encode_frozen(frozen, frozen.start()).data
+    frozen = Draft.of(source, encoding).frozen()
+    before = frozen.coded(frozen.start()).write().data
     tuned = finetune(frozen, views, replace(QUICK, iterations=300))
-    after = encode_frozen(frozen, tuned.held).data
+    after = frozen.coded(tuned.held).write().data
     assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 1.0
     assert len(after) < 1.1 * len(before)
 
 
 def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
-    frozen = freeze(source, COARSE)
+    frozen = Draft.of(source, COARSE).frozen()
     tuned = finetune(frozen, views, QUICK)
-    decoded = decode(encode_frozen(frozen, tuned.held).data)
+    decoded = decode(frozen.coded(tuned.held).write().data)
     rasteriser, error = Rasteriser(), []
     rows = np.argsort(frozen.source_index)
-    order = np.argsort(encode_frozen(frozen, tuned.held).source_index)
+    order = np.argsort(frozen.coded(tuned.held).write().source_index)
     seen = frozen.seen(tuned.held)
     for name in ("means", "shN"):
         assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
@@ -95,14 +95,14 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
 def test_costly_bytes_make_small_files(source, views):
     sizes = []
     for cost in (0.0, 1e-3, 1e-2):
-        frozen = freeze(source, EncodeOptions(sh_coding="scalar"))
+        frozen = Draft.of(source, EncodeOptions(sh_coding="scalar")).frozen()
         tuned = finetune(frozen, views, replace(QUICK, iterations=150, byte_cost=cost))
-        sizes.append(len(encode_frozen(frozen, tuned.held).data))
+        sizes.append(len(frozen.coded(tuned.held).write().data))
     assert sizes[0] > sizes[1] > sizes[2]
 
 
 def test_what_does_not_get_better_stays_as_it_was(source, views):
-    frozen = freeze(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"))
+    frozen = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
     tuned = finetune(frozen, views, replace(QUICK.scaled(5.0), byte_cost=0.0))
     assert 0 == tuned.log["best_iteration"]
     start = frozen.start()
@@ -110,7 +110,7 @@ def test_what_does_not_get_better_stays_as_it_was(source, views):
 
 
 def test_a_run_that_gains_nothing_ends_early(source, views):
-    frozen = freeze(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"))
+    frozen = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
     options = replace(QUICK, iterations=300, patience=2, byte_cost=0.0).scaled(5.0)
     log = finetune(frozen, views, options).log
     assert log["settled"]
@@ -123,7 +123,7 @@ def test_a_run_that_gains_nothing_ends_early(source, views):
 
 def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     """A sum over users, against finite differences of the loss by an entry's values."""
-    frozen = freeze(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
+    frozen = Draft.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)).frozen()
     scene, view = TunedScene(frozen), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
     seen, _ = scene.seen()
@@ -161,7 +161,7 @@ def test_sums_by_entry_agree_with_their_twin():
 
 
 def test_a_step_moves_values_through_their_quantisers(source, views):
-    scene = TunedScene(freeze(source, COARSE))
+    scene = TunedScene(Draft.of(source, COARSE).frozen())
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
@@ -192,7 +192,7 @@ def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common()
 
 
 def test_costs_take_the_integers_that_are_coded(source):
-    frozen = freeze(source, EncodeOptions(sh_coding="scalar", chroma_shift=1))
+    frozen = Draft.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)).frozen()
     scene = TunedScene(frozen)
     seen, _ = scene.seen()
     found = colour_integers_of(seen.shN, frozen.plan.sh_step, 1)
@@ -205,7 +205,7 @@ def test_costs_take_the_integers_that_are_coded(source):
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
 def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
     """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
-    frozen = freeze(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0))
+    frozen = Draft.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()
     scene = TunedScene(frozen)
     seen, _ = scene.seen()
     stored = scene.stored(seen)
@@ -244,7 +244,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
 
 
 def test_a_weight_of_bytes_is_loss_per_bit_and_splat(source):
-    scene = TunedScene(freeze(source, COARSE))
+    scene = TunedScene(Draft.of(source, COARSE).frozen())
     seen, _ = scene.seen()
     costs = Costs.counted(scene.frozen, scene.stored(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
@@ -257,17 +257,17 @@ def test_a_weight_of_bytes_is_loss_per_bit_and_splat(source):
 def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
-        frozen = freeze(source, COARSE)
+        frozen = Draft.of(source, COARSE).frozen()
         tuned = finetune(frozen, views, replace(QUICK, seed=seed, iterations=40), threads=threads)
-        files.append(encode_frozen(frozen, tuned.held).data)
+        files.append(frozen.coded(tuned.held).write().data)
     assert files[0] == files[1]
     assert files[0] != files[2]
 
 
 def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
-    frozen = freeze(
+    frozen = Draft.of(
         source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
-    )
+    ).frozen()
     file = tmp_path / "c.npz"
     middle = []
 
@@ -278,13 +278,13 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
     whole = finetune(frozen, views, QUICK, progress=keep, checkpoint=file, checkpoint_every=15)
     file.write_bytes(middle[0])
     rest = finetune(frozen, views, QUICK, resume=file)
-    assert encode_frozen(frozen, whole.held).data == encode_frozen(frozen, rest.held).data
+    assert frozen.coded(whole.held).write().data == frozen.coded(rest.held).write().data
     assert whole.log["losses"] == rest.log["losses"]
     assert whole.log["looks"] == rest.log["looks"]
 
 
 def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
-    frozen, file = freeze(source, COARSE), tmp_path / "c.npz"
+    frozen, file = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz"
     finetune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
     with pytest.raises(InputError, match="another byte_cost"):
         finetune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
@@ -296,8 +296,8 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_pa
 
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
     file = tmp_path / "c.npz"
-    finetune(freeze(source, COARSE), views, replace(QUICK, iterations=5), checkpoint=file)
-    other = freeze(source, replace(COARSE, attribute_psnr=29.0))
+    finetune(Draft.of(source, COARSE).frozen(), views, replace(QUICK, iterations=5), checkpoint=file)
+    other = Draft.of(source, replace(COARSE, attribute_psnr=29.0)).frozen()
     with pytest.raises(InputError, match="another scene"):
         finetune(other, views, QUICK, resume=file)
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
@@ -309,7 +309,7 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_pat
     for content in (*wrong, (tmp_path / "n.npz").read_bytes(), (tmp_path / "n.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(InputError, match="not a checkpoint") as caught:
-            finetune(freeze(source, COARSE), views, QUICK, resume=tmp_path / "bad.npz")
+            finetune(Draft.of(source, COARSE).frozen(), views, QUICK, resume=tmp_path / "bad.npz")
         assert "pickle" not in str(caught.value)
 
 
@@ -323,7 +323,7 @@ def test_values_that_are_not_finite_end_a_run(source, views, monkeypatch):
 
     monkeypatch.setattr(TunedScene, "step", spoilt)
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="a value is not finite at step 20"):
-        finetune(freeze(source, COARSE), views, QUICK)
+        finetune(Draft.of(source, COARSE).frozen(), views, QUICK)
 
 
 # options and views
@@ -389,7 +389,7 @@ def capture(source, tmp_path_factory):
 def test_the_command_tunes_prunes_and_reports(capture, tmp_path):
     out, report, log = tmp_path / "s.csplat", tmp_path / "report.json", tmp_path / "log.json"
     said = call(
-        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--quality", 28, "--iterations", 200,
+        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--attribute-psnr", 28, "--iterations", 200,
         "--report", report, "--json", log, "--deflate", "zlib",
     )  # fmt: skip
     facts = json.loads(report.read_text())
@@ -439,7 +439,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
 def test_a_scene_can_be_tuned_to_its_own_renders(capture, tmp_path):
     out, report = tmp_path / "s.csplat", tmp_path / "report.json"
     call(
-        "finetune", capture / "scene.ply", "--self", "-o", out, "--quality", 28, "--iterations", 150, "--views", 24,
+        "finetune", capture / "scene.ply", "--self", "-o", out, "--attribute-psnr", 28, "--iterations", 150, "--views", 24,
         "--lr-factor", 0.3, "--view-size", "64x48", "--report", report, "-q",
     )  # fmt: skip
     facts = json.loads(report.read_text())
@@ -536,7 +536,7 @@ def test_every_knob_of_the_encoder_is_there():
 
 
 def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--quality", 28, "-q")
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, "-q")
     call(*words, "-o", tmp_path / "whole.csplat", "--iterations", 50)
     short = tmp_path / "run.npz"
     call(*words, "-o", tmp_path / "a.csplat", "--iterations", 50, "--checkpoint", short, "--checkpoint-every", 20)
@@ -550,7 +550,7 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
         ((), "one of --data and --self"),
         (("--self", "--data", "x"), "one of --data and --self"),
         (("--data", "x", "--cameras", "y"), "--cameras goes with --self"),
-        (("--self", "--quality", "5"), "quality is 5"),
+        (("--self", "--attribute-psnr", "5"), "attribute_psnr is 5"),
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
         (("--self", "--lr-factor", "1e9"), "lr_"),
         (("--self", "--near", "0.1"), "for the photographs of --data"),
@@ -623,7 +623,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
     white = np.ones(3, np.float32)
     views = split_views([View(picture.camera, picture) for picture in data.train], white)
-    frozen = freeze(model, EncodeOptions(preset="small", attribute_psnr=34.0))
+    frozen = Draft.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)).frozen()
     tuned = finetune(frozen, views, FinetuneOptions(iterations=400))
     judges = [View(one.camera, one) for one in data.test[::10]]
 
@@ -637,4 +637,4 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
 
     plain = decode(encode(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     best, lost = score(model), score(plain)
-    assert score(decode(encode_frozen(frozen, tuned.held).data)) > lost + 0.6 * (best - lost)
+    assert score(decode(frozen.coded(tuned.held).write().data)) > lost + 0.6 * (best - lost)

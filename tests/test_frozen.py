@@ -5,9 +5,7 @@ import pytest
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.decoder import decode_scene, read_options, read_stated_errors
-from csplat.encoder import encode_with_report
-from csplat.encoder.between import Between
-from csplat.encoder.freezing import encode_frozen, freeze
+from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 
@@ -54,16 +52,16 @@ def assert_seen_is_decoded(frozen, held, result):
 @pytest.mark.parametrize("values", ["start", "moved"])
 def test_what_is_seen_is_what_is_decoded(make_model, way, values):
     model = make_model(260, 3)
-    frozen = freeze(model, EncodeOptions(**WAYS[way]))
+    frozen = Draft.of(model, EncodeOptions(**WAYS[way])).frozen()
     held = moved(frozen) if values == "moved" else frozen.start()
-    assert_seen_is_decoded(frozen, held, encode_frozen(frozen, held))
+    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 @pytest.mark.parametrize("way", ["scalar", "codebook", "two stages", "tiles, axis", "shapes"])
 def test_a_scene_that_did_not_move_decodes_as_if_it_had_not_been_frozen(make_model, way):
     model, options = make_model(260, 3), EncodeOptions(**WAYS[way])
-    plain, frozen = encode_with_report(model, options), freeze(model, options)
-    result = encode_frozen(frozen, frozen.start())
+    plain, frozen = encode_with_report(model, options), Draft.of(model, options).frozen()
+    result = frozen.coded(frozen.start()).write()
     before, after = decode(plain.data), decode(result.data)
     for name in ARRAYS:
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
@@ -71,18 +69,18 @@ def test_a_scene_that_did_not_move_decodes_as_if_it_had_not_been_frozen(make_mod
 
 
 def test_rotations_stay_as_they_are_where_the_gauge_would_turn_them(make_model):
-    frozen = freeze(make_model(200, 0))
+    frozen = Draft.of(make_model(200, 0)).frozen()
     held = frozen.start()
     held.quats[:] = np.array([0.55, 0.6, -0.4, 0.42], np.float32) / np.float32(np.linalg.norm([0.55, 0.6, -0.4, 0.42]))
     held.scales[:] = np.array([-5.0, -4.0, -3.0], np.float32)
     seen = frozen.seen(held)
     assert np.abs(seen.quats - held.quats).max() < 0.05
     assert (np.diff(seen.scales, axis=1) > 0).all()
-    assert_seen_is_decoded(frozen, held, encode_frozen(frozen, held))
+    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 def test_negative_w_is_the_same_rotation_with_the_other_sign(make_model):
-    frozen = freeze(make_model(50, 0))
+    frozen = Draft.of(make_model(50, 0)).frozen()
     held = frozen.start()
     before = frozen.seen(held)
     held.quats *= np.float32(-1.0)
@@ -91,19 +89,19 @@ def test_negative_w_is_the_same_rotation_with_the_other_sign(make_model):
 
 
 def test_centres_stay_in_their_tiles(make_model):
-    frozen = freeze(make_model(300, 0), EncodeOptions(tile_splats=100, position_bits=16))
+    frozen = Draft.of(make_model(300, 0), EncodeOptions(tile_splats=100, position_bits=16)).frozen()
     held = frozen.start()
     held.means *= np.float32(50.0)
     frozen.constrain(held)
     assert (held.means >= frozen.low).all()
     assert (held.means <= frozen.high).all()
-    assert_seen_is_decoded(frozen, held, encode_frozen(frozen, held))
+    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 def test_bands_that_are_zero_stay_zero(make_model):
     model = make_model(300, 3)
     model.shN[::2, 3:] = 0.0
-    frozen = freeze(model, EncodeOptions(sh_coding="scalar"))
+    frozen = Draft.of(model, EncodeOptions(sh_coding="scalar")).frozen()
     seen = frozen.seen(moved(frozen))
     came_from = frozen.source_index % 2 == 0
     assert not seen.shN[came_from, 3:].any()
@@ -111,7 +109,7 @@ def test_bands_that_are_zero_stay_zero(make_model):
 
 
 def test_entries_serve_all_their_users(make_model):
-    frozen = freeze(make_model(260, 2), EncodeOptions(**WAYS["codebook"]))
+    frozen = Draft.of(make_model(260, 2), EncodeOptions(**WAYS["codebook"])).frozen()
     held = frozen.start()
     before = frozen.seen(held).shN
     users = frozen.stages[0] == 3
@@ -125,10 +123,9 @@ def test_entries_serve_all_their_users(make_model):
 def test_errors_are_stated_against_the_source(make_model):
     source = make_model(300, 2)
     rows = np.arange(0, 300, 3)
-    between = Between(300, rows, said={"why": "a test"})
-    frozen = freeze(source.select(rows), between=between, source=source)
+    frozen = Draft.of(source.select(rows), origin=Origin(300, rows)).frozen(source)
     held = moved(frozen, share=0.05)
-    result = encode_frozen(frozen, held, {"steps": 7})
+    result = frozen.coded(held).write({"finetuned": {"steps": 7}})
     assert_seen_is_decoded(frozen, held, result)
     stated = read_stated_errors(result.data)
     assert (300, 200, True) == (stated.source_count, stated.pruned_count, stated.refitted)
@@ -137,29 +134,30 @@ def test_errors_are_stated_against_the_source(make_model):
     for record in stated.records:
         assert truth[record.measure][0] <= record.max <= truth[record.measure][0] * 1.0001 + 1e-12
         assert truth[record.measure][1] <= record.rms <= truth[record.measure][1] * 1.0001 + 1e-12
-    assert {"simplified": {"why": "a test"}, "steps": 7} == read_options(result.data)["finetuned"]
+    assert {"steps": 7} == read_options(result.data)["finetuned"]
 
 
 def test_extra_columns_follow_their_splats(make_model):
     model = make_model(100, 0, extra={"id": np.arange(100, dtype=np.int32)})
-    result = encode_frozen(frozen := freeze(model, EncodeOptions(keep_extra=True)), frozen.start())
+    frozen = Draft.of(model, EncodeOptions(keep_extra=True)).frozen()
+    result = frozen.coded(frozen.start()).write()
     assert np.array_equal(result.source_index, decode_scene(result.data).model.extra["id"])
 
 
 def test_refuses_a_scene_without_splats(make_model):
     with pytest.raises(InputError, match="without splats"):
-        freeze(make_model(0, 0))
+        Draft.of(make_model(0, 0)).frozen()
 
 
 def test_refuses_a_part_without_its_source(make_model):
     with pytest.raises(InputError, match="source"):
-        freeze(make_model(5, 0), between=Between(9, np.arange(5)))
+        Draft.of(make_model(5, 0), origin=Origin(9, np.arange(5))).frozen()
 
 
 def test_the_sample_is_decoded_as_it_was_seen(sample_path):
-    frozen = freeze(read_ply(sample_path), EncodeOptions(preset="small"))
+    frozen = Draft.of(read_ply(sample_path), EncodeOptions(preset="small")).frozen()
     held = moved(frozen, share=0.02)
-    assert_seen_is_decoded(frozen, held, encode_frozen(frozen, held))
+    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 @pytest.mark.parametrize(
@@ -173,16 +171,16 @@ def test_the_sample_is_decoded_as_it_was_seen(sample_path):
     ],
 )
 def test_shared_scenes_are_decoded_as_they_were_seen(data_dir, name, options):
-    frozen = freeze(read_ply(data_dir / "ply" / f"{name}.ply"), EncodeOptions(**options))
+    frozen = Draft.of(read_ply(data_dir / "ply" / f"{name}.ply"), EncodeOptions(**options)).frozen()
     held = moved(frozen, share=0.02)
-    assert_seen_is_decoded(frozen, held, encode_frozen(frozen, held))
+    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 def test_bytes_do_not_depend_on_threads(make_model):
     model = make_model(400, 3)
     files = []
     for threads in (1, 2):
-        frozen = freeze(model, EncodeOptions(tile_splats=100, threads=threads))
-        files.append(encode_frozen(frozen, moved(frozen)).data)
+        frozen = Draft.of(model, EncodeOptions(tile_splats=100, threads=threads)).frozen()
+        files.append(frozen.coded(moved(frozen)).write().data)
     assert files[0] == files[1]
     assert files[0] != encode(model, EncodeOptions(tile_splats=100))

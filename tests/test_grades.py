@@ -13,14 +13,13 @@ import pytest
 from checked import encoded
 
 import csplat
-from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
 from csplat.encoder.apart import cut_scene
 from csplat.encoder.curvature import GRADED, Curvatures, step_errors
-from csplat.encoder.freezing import freeze
+from csplat.encoder.draft import sample_rows
 from csplat.encoder.grades import choose_grades
 from csplat.encoder.importance import trusted
 from csplat.encoder.measure import covariance_entries
-from csplat.encoder.pipeline import sample_rows
 from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
@@ -171,9 +170,9 @@ def test_where_nothing_is_lost_all_is_one_grade(model):
 
 
 def test_a_frozen_scene_has_one_grade(model):
-    frozen = freeze(model, importance=important(model))
-    assert frozen.decided.grades is None
-    assert frozen.decided.options.grades is None
+    frozen = Draft.of(model, importance=important(model), graded=False).frozen()
+    assert frozen.draft.grades is None
+    assert frozen.draft.options.grades is None
 
 
 def test_huge_values_stay_apart_from_their_grade(model):
@@ -186,20 +185,17 @@ def test_huge_values_stay_apart_from_their_grade(model):
     assert np.delete(errors, 5).max() < 5.0  # the coarsest grade's step, not that of 3e12
 
 
-def test_colours_are_chosen_for_what_a_decoder_sees(model):
-    from csplat.encoder.between import Between
-
-    shown = []
-
-    def colours(seen):
-        shown.append(seen)
-        return seen.sh0, seen.shN
-
-    between = Between(COUNT, np.arange(COUNT), colours)
-    result = encode_with_report(model, EncodeOptions(), importance=important(model), between=between)
+def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
+    draft = Draft.of(model, importance=important(model))
+    result = draft.coded().write()
     decoded = csplat.decode(result.data)
     for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_array_equal(getattr(shown[0], name)[result.source_index], getattr(decoded, name))
+        np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
+
+
+def test_several_grades_are_not_frozen(model):
+    with pytest.raises(InputError, match="several grades"):
+        Draft.of(model, importance=important(model)).frozen()
 
 
 def test_codings_are_tried_on_splats_of_all_grades(model):

@@ -16,8 +16,7 @@ from chromium import absent
 import csplat
 from csplat import _spec
 from csplat.decoder import decode_scene
-from csplat.encoder import EncodeOptions, Importance, encode_with_report
-from csplat.encoder.between import Between
+from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
 from csplat.encoder.gauge import fix_gauge
 from csplat.encoder.measure import covariance_entries
 from csplat.encoder.shape_covariances import mean_axes, unit_covariances
@@ -126,19 +125,12 @@ def test_huge_scales_leave_their_tile_without(make_model):
     assert books(result.data)
 
 
-def test_whoever_fits_colours_is_shown_the_decoded_shapes(make_model):
-    model = few_shapes(make_model, degree=0)
-    shown = []
-
-    def colours(scene):
-        shown.append(scene)
-        return scene.sh0, scene.shN
-
-    between = Between(len(model), np.arange(len(model)), colours)
-    result = encode_with_report(model, EncodeOptions(shape_codebook_size=16), between=between)
+def test_the_scene_of_a_draft_has_the_decoded_shapes(make_model):
+    draft = Draft.of(few_shapes(make_model, degree=0), EncodeOptions(shape_codebook_size=16))
+    result = draft.coded().write()
     decoded = csplat.decode(result.data)
     for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_array_equal(getattr(shown[0], name)[result.source_index], getattr(decoded, name))
+        np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
 def test_matrices_that_do_not_fit_are_refused(make_model):

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from csplat.decoder import decode, decode_integers, read_header
-    from csplat.encoder import EncodeOptions
-    from csplat.encoder.pipeline import encode
+    from csplat.encoder import EncodeOptions, encode
     from csplat.errors import (
         CsplatError,
         FormatError,

@@ -11,10 +11,7 @@ from compression_sizes import books_of, float_bytes, integer_bytes, integer_colu
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeResult
-from csplat.encoder.between import Between
-from csplat.encoder.frozen import Frozen, Held
-from csplat.encoder.pipeline import write_decided
+from csplat.encoder import EncodeResult, Frozen, Held
 from csplat.model import SplatModel
 
 __all__ = ["ablation"]
@@ -33,7 +30,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[dict[str, Any]]:
     """
     frozen, start, log = tuned.frozen, tuned.frozen.start(), tuned.seconds
     before = frozen.seen(start)
-    pruned, size = frozen.decided.model, len(tuned.chosen.model)
+    pruned, size = frozen.draft.model, len(tuned.chosen.model)
     colours, shapes = books_of(frozen)
     coefficients = 3 * bench.source.shN.shape[1]
     by_colour = _served_colours(frozen, before.shN)
@@ -67,7 +64,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[dict[str, Any]]:
 
 def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
     """The scene before quantisation, SH by codebook where one serves."""
-    model = frozen.decided.model
+    model = frozen.draft.model
     if not frozen.stage_sizes:
         return model
     served = np.zeros_like(model.shN)  # bands that are not kept are gone
@@ -88,7 +85,7 @@ def _served_shapes(
 
 def _as_model(frozen: Frozen, held: Held) -> SplatModel:
     """What a decoder will see, from memory."""
-    seen, model = frozen.seen(held), frozen.decided.model
+    seen, model = frozen.seen(held), frozen.draft.model
     shN = np.zeros_like(model.shN)
     shN[:, : seen.shN.shape[1]] = seen.shN
     arrays = {name: getattr(seen, name) for name in ARRAYS if name != "shN"}
@@ -97,11 +94,11 @@ def _as_model(frozen: Frozen, held: Held) -> SplatModel:
 
 def _unordered(frozen: Frozen, held: Held) -> EncodeResult:
     """The same file with the splats of each tile in the order of the source, their centres coded axis by axis."""
-    decided = frozen.decisions(held)
-    tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in decided.tiles]
-    books = replace(decided.books, plan=replace(decided.books.plan, morton=False))
-    between = Between(len(frozen.source), frozen.source_index, key="finetuned")
-    return write_decided(replace(decided, tiles=tiles, books=books), between=between)
+    draft = frozen.draft
+    tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in draft.tiles]
+    return (
+        replace(frozen, draft=replace(draft, tiles=tiles, plan=replace(draft.plan, morton=False))).coded(held).write()
+    )
 
 
 def _same_set(one: SplatModel, other: SplatModel) -> bool:

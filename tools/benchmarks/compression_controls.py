@@ -12,11 +12,7 @@ from compression_sizes import Book, coded_colour_bytes
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions
-from csplat.encoder.freezing import encode_frozen, freeze
-from csplat.encoder.frozen import Frozen, Held, Seen
-from csplat.encoder.importance import Importance
-from csplat.encoder.kmeans import cluster
+from csplat.encoder import Draft, EncodeOptions, Frozen, Held, Importance, Seen, cluster
 from csplat.model import SplatModel
 from csplat_trainer.finetune import finetune
 from csplat_trainer.sensitivity import Sensitivity
@@ -41,7 +37,7 @@ class Unquantised(Frozen):
         """The same scene; it must have no codebooks."""
         assert not frozen.stage_sizes
         assert frozen.shapes is None
-        return cls(frozen.decided, frozen.source, frozen.source_index, frozen.low, frozen.high, None)
+        return cls(**{**vars(frozen), "zero": None})
 
     def constrain(self, held: Held) -> None:
         """Leave values where they are: no file bounds them."""
@@ -59,9 +55,7 @@ def control(bench: Bench) -> dict[str, Any]:
     """
     chosen, _ = bench.chosen()
     options = EncodeOptions(preset="fast", sh_coding="scalar", threads=bench.threads)
-    frozen = freeze(
-        chosen.model, options, importance=chosen.importance, between=bench.between(chosen.rows), source=bench.source
-    )
+    frozen = bench.frozen(chosen.model, chosen.rows, options, chosen.importance)
     start = time.perf_counter()
     run = finetune(
         Unquantised.of(frozen), bench.views, replace(bench.tuning, byte_cost=0.0, patience=0), threads=bench.threads
@@ -69,16 +63,14 @@ def control(bench: Bench) -> dict[str, Any]:
     seconds = time.perf_counter() - start
     held = run.held
     trained = replace(
-        frozen.decided.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,
+        frozen.draft.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,
         sh0=held.sh0, shN=held.sh,
     )  # fmt: skip
     rows = np.searchsorted(chosen.rows, frozen.source_index)
     told = chosen.importance
     weights = told.select(rows) if isinstance(told, Importance) else told[rows]
-    again = freeze(
-        trained, bench.encoding, importance=weights, between=bench.between(frozen.source_index), source=bench.source
-    )
-    data = encode_frozen(again, again.start()).data
+    again = bench.frozen(trained, frozen.source_index, bench.encoding, weights)
+    data = again.coded(again.start()).write().data
     scores = bench.judge({"source": bench.source, "trained on": trained, "then a file": decode(data)})
     return {
         "steps": run.log["steps"],
@@ -99,7 +91,7 @@ def sh0_rows(bench: Bench, size: int, escape: float) -> list[dict[str, Any]]:
         escape: share of the splats that keep colours of their own.
     """
     chosen, _ = bench.chosen()
-    step = freeze(chosen.model, bench.encoding).plan.sh_step
+    step = Draft.of(chosen.model, bench.encoding, graded=False).frozen().plan.sh_step
     weights = np.asarray(bench.sensitivity.colour_squares[chosen.rows], np.float32)
     coefficients = 3 * chosen.model.shN.shape[1]
     models, books = {"all": chosen.model}, {}

@@ -13,8 +13,7 @@ from compression_controls import control, eight_bits, histogram, sh0_rows
 from compression_runs import Bench
 from compression_scenes import Kept
 
-from csplat.encoder import EncodeOptions
-from csplat.encoder.freezing import freeze
+from csplat.encoder import Draft, EncodeOptions
 from csplat_trainer.finetune import FinetuneOptions, finetune
 from csplat_trainer.sensitivity import measure_sensitivity
 
@@ -99,5 +98,6 @@ def warm(bench: Bench) -> None:
     """Compile what a tuning runs: no row is to pay for it."""
     some = bench.source.select(slice(0, 500))
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
-    finetune(freeze(some, options), bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
+    frozen = Draft.of(some, options, graded=False).frozen()
+    finetune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
     measure_sensitivity(some, bench.looks.cameras[:1], metric=True)

@@ -15,10 +15,7 @@ from compression_sizes import books_of
 from numpy.typing import NDArray
 
 from csplat.decoder import decode, read_header
-from csplat.encoder import EncodeOptions, EncodeResult
-from csplat.encoder.between import Between
-from csplat.encoder.freezing import encode_frozen, freeze
-from csplat.encoder.frozen import Frozen, Held
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Held, Importance, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -135,9 +132,16 @@ class Bench:
             )
         return replace(chosen, importance=removal.squared_weight), clock.seconds
 
-    def between(self, rows: NDArray[np.int64]) -> Between:
-        """Where the splats come from."""
-        return Between(len(self.source), rows)
+    def frozen(
+        self, model: SplatModel, rows: NDArray[np.int64], encoding: EncodeOptions,
+        importance: NDArray[Any] | Importance, progress: _Stages | None = None,
+    ) -> Frozen:  # fmt: skip
+        """Freeze splats that are some of the source's."""
+        draft = Draft.of(
+            model, encoding, importance=importance, origin=Origin(len(self.source), rows), graded=False,
+            progress=progress,
+        )  # fmt: skip
+        return draft.frozen(self.source, progress)
 
     def tuned(self, encoding: EncodeOptions, pick: Pick | None = None) -> Tuned:
         """Freeze, tune, write.
@@ -150,15 +154,12 @@ class Bench:
         views, stages = self.views, _Stages()
         clock = Clock(dict(seconds))
         with clock.stage("clustering"):
-            frozen = freeze(
-                chosen.model, encoding, importance=chosen.importance, between=self.between(chosen.rows),
-                source=self.source, progress=stages,
-            )  # fmt: skip
-        plain = encode_frozen(frozen, frozen.start())  # not a part of the work: what it would have been without
+            frozen = self.frozen(chosen.model, chosen.rows, encoding, chosen.importance, stages)
+        plain = frozen.coded(frozen.start()).write()  # not a part of the work: what it would have been without
         with clock.stage("tuning"):
             run = finetune(frozen, views, self.tuning, threads=self.threads)
         with clock.stage("encoding"):
-            result = encode_frozen(frozen, run.held)
+            result = frozen.coded(run.held).write()
         return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
 
     def row(self, tuned: Tuned) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.frozen import Frozen, Held
-from csplat.encoder.quantise import lattice_step
+from csplat.encoder import Frozen, Held
 from csplat_tools.finetune_report import PLY_SPLAT_BYTES
 from csplat_trainer.finetune.rate import colour_integers_of
 
@@ -111,9 +110,7 @@ def integer_columns(frozen: Frozen, held: Held) -> Sequence[NDArray[np.int64]]:
     plan, seen = frozen.plan, frozen.seen(held)
     quats, scales, sizes = frozen.seen_shape_rows(held, seen)
     sh = frozen.seen_rows(held.sh)
-    columns = [
-        _lattice(seen.means[tile.rows], lattice_step(plan.lattice.step, tile.exponent)) for tile in frozen.decided.tiles
-    ]
+    columns = [_lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in frozen.draft.tiles]
     columns += [
         _lattice(scales, plan.scale_step),
         _lattice(sizes[:, None], plan.scale_step),

@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import Limits, decode
-from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
-from csplat.encoder.between import Between
-from csplat.encoder.importance import Importance
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -196,15 +194,11 @@ def _encoded(
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{importance}: no view saw any splat; nothing would be left")
-    between = Between(
-        len(model),
-        rows,
-        said={"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source},
-        key="pruned",
-        refitted=False,
-    )
-    chosen = weights.select(rows) if isinstance(weights, Importance) else None
-    result = encode_with_report(model.select(rows), options, importance=chosen, between=between, progress=progress)
+    said = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
+    result = encode_with_report(
+        model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
+        origin=Origin(len(model), rows), said={"pruned": said}, progress=progress,
+    )  # fmt: skip
     if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
         missed = (
             f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.importance import Importance
+from csplat.encoder import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.console import note

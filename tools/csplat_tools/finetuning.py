@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult
-from csplat.encoder.between import Between
-from csplat.encoder.freezing import encode_frozen, freeze
-from csplat.encoder.frozen import Frozen, Seen
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Origin, Seen
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -210,12 +207,12 @@ def begin(
         views = looks.views(source, sources, encoding.threads)
         chosen = choose_splats(source, looks, sources, importance, encoding.threads, progress)
     with clock.stage("encoding"):
-        between = Between(len(source), chosen.rows)
-        frozen = freeze(
-            chosen.model, encoding, importance=chosen.importance, between=between, source=source,
-            progress=progress,
+        draft = Draft.of(
+            chosen.model, encoding, importance=chosen.importance, origin=Origin(len(source), chosen.rows),
+            graded=False, progress=progress,
         )  # fmt: skip
-        plain = encode_frozen(frozen, frozen.start())
+        frozen = draft.frozen(source, progress)
+        plain = frozen.coded(frozen.start()).write()
     return Begun(views, chosen, frozen, plain)
 
 
@@ -253,8 +250,13 @@ def tune(
             resume=resume, threads=threads,
         )  # fmt: skip
     with clock.stage("encoding"):
-        said = {"views": len(begun.views.train), "steps": tuned.log["best_iteration"], **begun.chosen.said}
-        result = encode_frozen(frozen, tuned.held, said)
+        said = {
+            "simplified": {},  # `simplified_from` says it, where splats were taken away
+            "views": len(begun.views.train),
+            "steps": tuned.log["best_iteration"],
+            **begun.chosen.said,
+        }
+        result = frozen.coded(tuned.held).write({"finetuned": said})
         decoded = decode(result.data)
     _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
     return Tuned(result, decoded, tuned.log)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.importance import Importance, trusted
+from csplat.encoder import Importance, trusted
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.model import SplatModel

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
-from csplat.encoder.curvature import Curvatures
-from csplat.encoder.importance import Importance
+from csplat.encoder import Curvatures, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from csplat.encoder.quantise import colour_integers, largest_exact
 from csplat.encoder.sparse import zero_book, zero_or_value_block
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
+
+if TYPE_CHECKING:
+    from csplat.encoder.draft import Draft
 
 __all__ = ["Books", "books_of", "choose_sh", "with_zero_books"]
 
@@ -42,9 +46,8 @@ _CODEBOOK_ID = 0
 
 @dataclass(frozen=True)
 class Books:
-    """What was decided: the plan (its SH coding and step), what tiles need, what the index says, and chunks."""
+    """What was decided of SH: what tiles need, what the index says, and chunks."""
 
-    plan: Plan
     tables: ShTables
     records: Sequence[CodebookTable] = ()
     chunks: Sequence[FileChunk] = ()
@@ -66,54 +69,43 @@ class _Stages:
 
 
 def choose_sh(
-    model: SplatModel,
-    weights: F32 | None,
-    extras: Sequence[str],
-    sample: Rows,
-    plan: Plan,
-    options: EncodeOptions,
-    threads: int,
-    report: Progress,
-    metric: Metric | None = None,
-    *,
-    measured: bool = False,
-) -> Books:
+    draft: Draft, weights: F32 | None, metric: Metric | None, sample: Rows, report: Progress
+) -> tuple[Plan, Books]:
     """Decide how SH is coded, and train the codebook if there is to be one.
 
     Args:
-        model: the scene.
-        weights: [N] float32, importance of the splats; None where nothing needs it.
-        extras: names of the extra columns that are carried.
-        sample: rows of one tile, on which scalar coding is tried.
-        plan: with `sh_coding` "auto", "codebook", "scalar" or "none".
-        options: `codebook_size`, `codebook_stages`, `escape_fraction`, `seed`.
-        threads: how many to use; the result does not depend on it.
-        report: progress.
+        draft: the scene; its plan's `sh_coding` is "auto", "codebook", "scalar" or "none".
+        weights: [N] float32, importance of the splats, a guess where the draft has none; None where nothing needs it.
         metric: how errors of the coefficients of all bands weigh together; None: each for itself, by `weights`.
-        measured: the weights were; otherwise they are a guess.
+        sample: rows of one tile, on which scalar coding is tried.
+        report: progress.
+
+    Returns:
+        The plan with the coding of SH and its step, and the codebooks.
     """
-    tables = ShTables(weights, _reference(weights), extras=extras)
-    scalar = Books(replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), tables)
+    model, plan, options = draft.model, draft.plan, draft.options
+    tables = ShTables(weights, _reference(weights), extras=tuple(model.extra) if options.keep_extra else ())
+    scalar = replace(plan, sh_coding="scalar" if plan.sh_degree else "none"), Books(tables)
     if plan.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
         return scalar
     fine = replace(plan, sh_coding="codebook", sh_step=plan.codebook_step)
     kept = (plan.sh_degree + 1) ** 2 - 1
     if plan.sh_coding == "auto" and (len(model) < _LEAST or not _escapes_fit(model.shN[:, :kept], fine)):
         return scalar
-    judge = _Judge(weights, None if metric is None else metric.first(kept), measured)
-    stages = _train(model, judge, fine, options, threads, report)
+    judge = _Judge(weights, None if metric is None else metric.first(kept), draft.importance is not None)
+    stages = _train(model, judge, fine, options, report)
     books = _books(tables, stages, fine)
     if plan.sh_coding == "auto" and not _codebook_pays(model, judge, stages, books, sample[:_SAMPLE], plan):
         return scalar
-    return books
+    return fine, books
 
 
-def with_zero_books(books: Books, used: Iterable[int]) -> Books:
+def with_zero_books(books: Books, plan: Plan, used: Iterable[int]) -> Books:
     """Add the codebooks of absent bands that tiles turned out to want."""
     if books.records:
         return books
     bands = sorted(set(used))  # their ids are their bands
-    pairs = [zero_book(band, books.plan) for band in bands]
+    pairs = [zero_book(band, plan) for band in bands]
     return replace(books, records=[record for record, _ in pairs], chunks=[chunk for _, chunk in pairs])
 
 
@@ -143,10 +135,8 @@ class _Judge:
         return np.asarray(squares * self.weights[rows])
 
 
-def _train(
-    model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions, threads: int, report: Progress
-) -> _Stages:
-    weights = judge.weights
+def _train(model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions, report: Progress) -> _Stages:
+    weights, threads = judge.weights, options.thread_count
     points = _lattice_points(model.shN, plan)
     sizes = _sizes(len(model), plan, options)
     effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if sizes[0] >= _MANY else {}
@@ -268,7 +258,7 @@ def books_of(tables: ShTables, plan: Plan) -> Books:
     record = CodebookTable(
         _CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, plan.sh_degree), tuple(stage.shape[2] for stage in columns)
     )
-    return Books(plan, replace(tables, ids=(_CODEBOOK_ID,), layers=tuple(bands)), (record,), tuple(chunks))
+    return Books(replace(tables, ids=(_CODEBOOK_ID,), layers=tuple(bands)), (record,), tuple(chunks))
 
 
 def _codebook_pays(model: SplatModel, judge: _Judge, stages: _Stages, books: Books, sample: Rows, plan: Plan) -> bool:

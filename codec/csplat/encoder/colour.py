@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,11 @@ class ShTables:
     ids: Sequence[int] = ()
     layers: Sequence[int] = ()
     extras: Sequence[str] = ()
+
+    def select(self, order: NDArray[Any]) -> ShTables:
+        """The same for the splats `order`."""
+        weights = None if self.weights is None else self.weights[order]
+        return replace(self, weights=weights, index=[stage[order] for stage in self.index])
 
 
 @dataclass(frozen=True)

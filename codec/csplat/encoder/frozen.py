@@ -1,29 +1,33 @@
 """A scene whose coding is decided and whose values may still move: what fine-tuning tunes is what is written.
 
-`freeze` (freezing.py) lets the encoder decide everything that is decided once: lattices, tiles, codebooks and who uses
-which entry, who bypasses them, who lacks an SH band. `Frozen.seen` then says, for any values, what a decoder of the
-file will see, by the functions that code the tiles; `encode_frozen` writes the file of these values.
+`Draft.frozen` lets the encoder decide everything that is decided once: lattices, tiles, codebooks and who uses which
+entry, who bypasses them, who lacks an SH band. `Frozen.seen` then says, for any values, what a decoder of the file will
+see, by the functions that code the tiles; `Frozen.coded` codes these values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.codebook import books_of
+from csplat.encoder.codebook import Books, books_of
+from csplat.encoder.coded import Coded
 from csplat.encoder.colour import ShTables, quantise_colour, quantise_rows, served_rows
 from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
-from csplat.encoder.pipeline import Decisions
-from csplat.encoder.plan import Plan
+from csplat.encoder.measure import measured_sums
+from csplat.encoder.plan import Plan, Progress
 from csplat.encoder.quantise import colour_integers, colour_lifted, lattice_values, quat_levels, quat_values
 from csplat.encoder.shape_tables import ShapeTables
 from csplat.encoder.tile import coarseness
 from csplat.model import SplatModel
+
+if TYPE_CHECKING:
+    from csplat.encoder.draft import Draft
 
 __all__ = ["Frozen", "Held", "Seen"]
 
@@ -78,26 +82,38 @@ class Frozen:
     """What the encoder decided.
 
     Attributes:
-        decided: by the encoder, with the scene in the order of its tiles and in its gauge.
+        draft: the scene in the order of its tiles and in its gauge, and all else that does not move.
+        tables: how SH is coded.
         source: the scene that errors are stated against.
-        source_index: [N] int64, which splat of the source each one is.
         low, high: [N, 3] float32, the box of each splat's tile: centres stay within, for the lattice holds no more.
         zero: [N, K] bool, SH coefficients that are zero and stay so, where every splat has its own; else None.
-        said: what the file's options say was done before.
     """
 
-    decided: Decisions
+    draft: Draft
+    tables: ShTables
     source: SplatModel
-    source_index: I64
     low: F32
     high: F32
     zero: NDArray[np.bool_] | None
-    said: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, draft: Draft, tables: ShTables, source: SplatModel) -> Frozen:
+        """What `Draft.frozen` returns, of a draft in that order."""
+        means = draft.model.means
+        low, high = np.empty_like(means), np.empty_like(means)
+        for tile in draft.tiles:
+            low[tile.rows], high[tile.rows] = means[tile.rows].min(axis=0), means[tile.rows].max(axis=0)
+        return cls(draft, tables, source, low, high, _zeros(draft, tables))
 
     @property
     def plan(self) -> Plan:
         """Lattices and codings."""
-        return self.decided.books.plan
+        return self.draft.plan
+
+    @property
+    def source_index(self) -> I64:
+        """Which splat of the source each one is, [N]."""
+        return self.draft.origin.source_index
 
     @property
     def stages(self) -> Sequence[I32]:
@@ -105,12 +121,12 @@ class Frozen:
 
         The size of the first stage says "escaped".
         """
-        return [np.asarray(index, np.int32) for index in self.decided.books.tables.index]
+        return [np.asarray(index, np.int32) for index in self.tables.index]
 
     @property
     def stage_sizes(self) -> tuple[int, ...]:
         """Entries of the codebook's stages."""
-        return tuple(int(stage.shape[2]) for stage in self.decided.books.tables.entries)
+        return tuple(int(stage.shape[2]) for stage in self.tables.entries)
 
     @property
     def escaped(self) -> I64:
@@ -122,15 +138,15 @@ class Frozen:
     @property
     def shapes(self) -> ShapeTables | None:
         """The codebook of shapes, if there is one."""
-        return self.decided.shapes
+        return self.draft.shapes
 
     def start(self) -> Held:
         """Values as the encoder found them."""
-        model, plan = self.decided.model, self.plan
+        model, plan = self.draft.model, self.plan
         kept = (plan.sh_degree + 1) ** 2 - 1
         sh = np.ascontiguousarray(model.shN[:, :kept])
         if self.stage_sizes:
-            entries = [_as_values(stage, plan) for stage in self.decided.books.tables.entries]
+            entries = [_as_values(stage, plan) for stage in self.tables.entries]
             sh = np.concatenate([*entries, sh[self.escaped]])
         quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
         if self.shapes is not None:
@@ -153,10 +169,35 @@ class Frozen:
         if self.shapes is not None:
             held.sizes[self.shapes.escaped] = 0.0
 
+    def coded(self, held: Held, progress: Progress | None = None) -> Coded:
+        """Code these values; `decode` gives `seen(held)` back, in the order of the file's source index.
+
+        Args:
+            held: values, constrained.
+            progress: as of `Draft.of`.
+
+        Returns:
+            A file that states errors against the source, but none of colours: they were fitted anew.
+        """
+        shapes, quats, scales = self._shapes(held)
+        model, kept = self.draft.model, held.sh.shape[1]
+        shN, books = np.zeros_like(model.shN), Books(self.tables)
+        if self.stage_sizes:
+            shN[self.escaped, :kept] = held.sh[sum(self.stage_sizes) :]
+            books = books_of(self._tables(held.sh), self.plan)
+        else:
+            shN[:, :kept] = held.sh
+        decoded = replace(model, **vars(self.seen(held)))
+        model = replace(
+            model, means=held.means, quats=quats, scales=scales, opacities=held.opacities, sh0=held.sh0, shN=shN
+        )
+        errors = measured_sums(self.source, decoded, self.source_index)
+        return Coded.of(replace(self.draft, model=model, shapes=shapes), books, errors=errors, progress=progress)
+
     def seen(self, held: Held) -> Seen:
         """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""
-        tiles, plan = self.decided.tiles, self.plan
-        if self.decided.options.threads == 1:
+        tiles, plan = self.draft.tiles, self.plan
+        if self.draft.options.threads == 1:
             shN, (quats, scales) = self.seen_sh(held.sh), self._seen_shapes(held)
             means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
         else:
@@ -169,21 +210,21 @@ class Frozen:
     def seen_sh0(self, sh0: F32) -> F32:
         """Degree-0 colours [N, 3] as a decoder will see them."""
         plan, seen = self.plan, np.empty_like(sh0)
-        for tile in self.decided.tiles:
+        for tile in self.draft.tiles:
             columns = np.ascontiguousarray(sh0[tile.rows].T)
             seen[tile.rows] = quantise_colour(columns, plan.sh0_step, plan.chroma_shift, tile.coarse.sh0).decoded.T
         return seen
 
     def seen_sh(self, sh: F32) -> F32:
         """SH of all splats [N, K, 3] as a decoder will see it, from the rows that the file holds."""
-        plan, tables = self.plan, self.decided.books.tables
+        plan, tables = self.plan, self.tables
         if self.stage_sizes:
             tables = self._tables(sh)
             seen = served_rows(list(tables.index), plan, tables)
             seen[self.escaped] = self._seen_escapes(sh)
             return seen
         seen = np.empty_like(sh)
-        for tile in self.decided.tiles:
+        for tile in self.draft.tiles:
             seen[tile.rows] = quantise_rows(sh[tile.rows], plan, coarseness(tile.rows, plan, tables))[2]
         return seen
 
@@ -206,26 +247,11 @@ class Frozen:
 
     def _seen_shapes(self, held: Held) -> tuple[F32, F32]:
         shapes, quats, scales = self._shapes(held)
-        return seen_shapes(quats, scales, self.decided.tiles, self.plan, shapes)
+        return seen_shapes(quats, scales, self.draft.tiles, self.plan, shapes)
 
     def _seen_escapes(self, sh: F32) -> F32:
         coarse = np.full(len(self.escaped), self.plan.escape_coarse, np.int32)
         return quantise_rows(sh[sum(self.stage_sizes) :], self.plan, coarse)[2]
-
-    def decisions(self, held: Held) -> Decisions:
-        """The same decisions with these values: what is written."""
-        shapes, quats, scales = self._shapes(held)
-        model, kept = self.decided.model, held.sh.shape[1]
-        shN, books = np.zeros_like(model.shN), self.decided.books
-        if self.stage_sizes:
-            shN[self.escaped, :kept] = held.sh[sum(self.stage_sizes) :]
-            books = books_of(self._tables(held.sh), self.plan)
-        else:
-            shN[:, :kept] = held.sh
-        model = replace(
-            model, means=held.means, quats=quats, scales=scales, opacities=held.opacities, sh0=held.sh0, shN=shN
-        )
-        return replace(self.decided, model=model, books=books, shapes=shapes)
 
     def _shapes(self, held: Held) -> tuple[ShapeTables | None, F32, F32]:
         """The codebook of shapes with these values, and rotations and scales by splat, which it stands in for."""
@@ -235,7 +261,7 @@ class Frozen:
         scales = np.rint(held.scales[:size].T / plan.scale_step)
         entries = np.concatenate([scales.astype(np.int32), quat_levels(held.quats[:size].T, plan.quat_levels)])
         summand = np.rint(held.sizes / plan.scale_step).astype(np.int32)
-        by_splat = np.zeros_like(self.decided.model.quats), np.zeros_like(self.decided.model.scales)
+        by_splat = np.zeros_like(self.draft.model.quats), np.zeros_like(self.draft.model.scales)
         by_splat[0][:, 0] = 1.0
         by_splat[0][own], by_splat[1][own] = held.quats[size:], held.scales[size:]
         return ShapeTables(entries, self.shapes.index, summand), *by_splat
@@ -245,7 +271,22 @@ class Frozen:
         for size in self.stage_sizes:
             entries.append(_as_integers(sh[first : first + size], self.plan))
             first += size
-        return replace(self.decided.books.tables, entries=entries)
+        return replace(self.tables, entries=entries)
+
+
+def _zeros(draft: Draft, tables: ShTables) -> NDArray[np.bool_] | None:
+    plan = draft.plan
+    kept = (plan.sh_degree + 1) ** 2 - 1
+    if tables.entries or not kept:
+        return None
+    zero = np.empty((len(draft.model), kept), np.bool_)
+    for tile in draft.tiles:
+        columns, _, _ = quantise_rows(draft.model.shN[tile.rows, :kept], plan, coarseness(tile.rows, plan, tables))
+        for band in range(1, plan.sh_degree + 1):
+            span = slice(band * band - 1, (band + 1) ** 2 - 1)
+            largest = np.abs(columns[:, span]).max(axis=(0, 1))
+            zero[tile.rows, span] = (largest == 0)[:, None]
+    return zero
 
 
 def _as_values(entries: I32, plan: Plan) -> F32:

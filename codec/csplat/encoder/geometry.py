@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,8 @@ from csplat.encoder.quantise import (
 )
 from csplat.encoder.shape_tables import ShapePart, ShapeTables
 from csplat.encoder.tiling import EVEN, Coarse, Tile
-from csplat.model import SplatModel
 
-__all__ = ["Shape", "quantise_shape", "quantised_geometry", "seen_means", "seen_opacities", "seen_shapes"]
+__all__ = ["Shape", "quantise_shape", "seen_means", "seen_opacities", "seen_shapes"]
 
 Integers = NDArray[Any]
 F32 = NDArray[np.float32]
@@ -60,25 +59,6 @@ def quantise_shape(quats: F32, scales: F32, plan: Plan, part: ShapePart | None =
     if part is not None:
         n[:, part.served], q[:, part.served] = part.scales, part.quats
     return Shape(n, exponent, q, lattice_values(n, step), quat_values(q, plan.quat_levels))
-
-
-def quantised_geometry(
-    model: SplatModel, tiles: Sequence[Tile], plan: Plan, shapes: ShapeTables | None = None
-) -> SplatModel:
-    """The scene with means, rotations, scales and opacities as a decoder will see them, colours as they are.
-
-    Args:
-        model: the scene.
-        tiles: how it is cut: a tile's lattice may be coarser than the file's.
-        plan: the lattices.
-        shapes: the codebook of shapes, if there is one.
-
-    Returns:
-        The scene, in the same order.
-    """
-    quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, shapes)
-    means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, tiles, plan)
-    return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
 
 
 def seen_means(means: F32, tiles: Sequence[Tile], plan: Plan) -> F32:

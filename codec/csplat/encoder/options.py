@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
@@ -98,6 +99,11 @@ class EncodeOptions:
                 what = "an integer, " if kind is int else ""
                 raise InputError(f"{name} is {value!r}, wanted {what}{low:g} to {high:g}")
             object.__setattr__(self, name, number)  # a plain number: NumPy's are no JSON
+
+    @property
+    def thread_count(self) -> int:
+        """`threads`, or as many as there are cores."""
+        return self.threads or os.cpu_count() or 1
 
     def chosen(self) -> dict[str, Any]:
         """Return what the caller set, by name, without what cannot change the bytes (`threads`)."""

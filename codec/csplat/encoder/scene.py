@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from csplat import _spec
-from csplat.encoder.between import Between
 from csplat.encoder.codebook import Books
 from csplat.encoder.colour import ShTables
 from csplat.encoder.container import FileChunk, Scene, json_payload
-from csplat.encoder.grades import Grades
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan
 from csplat.encoder.shape_tables import ShapeTables
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
+
+if TYPE_CHECKING:
+    from csplat.encoder.draft import Draft, Origin
 
 __all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene", "stated_errors"]
 
@@ -27,18 +28,10 @@ _COLOURS = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spe
 _SHAPES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
 
-def chosen_settings(
-    plan: Plan,
-    tables: ShTables,
-    options: EncodeOptions,
-    between: Between | None = None,
-    shapes: ShapeTables | None = None,
-    grades: Grades | None = None,
-) -> dict[str, Any]:
+def chosen_settings(draft: Draft, tables: ShTables) -> dict[str, Any]:
     """Return what was asked and what followed, JSON-compatible; it becomes the OPTS chunk."""
-    said = {} if between is None else {between.key: dict(between.said)}
+    plan, options = draft.plan, draft.options
     return {
-        **said,
         "asked": options.chosen(),
         "encoder": _versions(plan),
         "position_step": plan.lattice.step,
@@ -54,8 +47,8 @@ def chosen_settings(
         "chroma_shift": plan.chroma_shift,
         "adaptive": plan.adaptive if plan.sh_coding == "scalar" else 0.0,
         "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
-        **_of_shapes(shapes),
-        **({} if grades is None else {"grades": grades.as_json()}),
+        **_of_shapes(draft.shapes),
+        **({} if draft.grades is None else {"grades": draft.grades.as_json()}),
         "effort": plan.coding.effort,
         "deflate": plan.coding.library,
         "seed": options.seed,
@@ -85,40 +78,33 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     return records
 
 
-def stated_errors(errors: ErrorSums, between: Between | None) -> dict[str, tuple[float, float]]:
+def stated_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:
     """Return (max, rms) by measure; those of what was fitted anew say nothing, and are left out."""
     stated = errors.stated()
-    if between is None or not between.refitted:
+    if not origin.refitted:
         return stated
-    fitted = (*_COLOURS, *_SHAPES) if between.adjusted else _COLOURS
+    fitted = (*_COLOURS, *_SHAPES) if origin.adjusted else _COLOURS
     return {name: pair for name, pair in stated.items() if name not in fitted}
 
 
-def file_chunks(
-    model: SplatModel, errors: ErrorSums, settings: dict[str, Any], plan: Plan, between: Between | None = None
-) -> list[FileChunk]:
+def file_chunks(draft: Draft, errors: ErrorSums, settings: dict[str, Any]) -> list[FileChunk]:
     """Return the chunks of the whole file: metadata, cameras, options, stated errors."""
-    chunks = []
+    model, coding, chunks = draft.model, draft.plan.coding, []
     try:
         if model.metadata:
-            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(model.metadata), plan.coding)))
+            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(model.metadata), coding)))
         if model.cameras is not None:
-            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), plan.coding)))
+            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), coding)))
     except (TypeError, ValueError) as problem:
         raise InputError(f"metadata or cameras are not JSON: {problem}") from None
-    chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, plan.coding)))
-    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _stated_errors(model, errors, between)))
+    chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, coding)))
+    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _stated_errors(draft, errors)))
     return chunks
 
 
-def file_scene(
-    model: SplatModel,
-    plan: Plan,
-    books: Books,
-    extras: Sequence[_spec.ExtraRecord],
-    chunks: Sequence[FileChunk],
-) -> Scene:
+def file_scene(draft: Draft, books: Books, chunks: Sequence[FileChunk]) -> Scene:
     """Gather what header and index say of the scene."""
+    model, plan = draft.model, draft.plan
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
     flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
@@ -130,18 +116,17 @@ def file_scene(
         unit_metres=model.unit_metres or 0.0,
         origin=model.origin,
         attributes=plan.attribute_records(),
-        extras=extras,
+        extras=draft.extras,
         codebooks=books.records,
         chunks=[*chunks, *books.chunks],
     )
 
 
-def _stated_errors(model: SplatModel, errors: ErrorSums, between: Between | None) -> bytes:
+def _stated_errors(draft: Draft, errors: ErrorSums) -> bytes:
+    model, origin = draft.model, draft.origin
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
-    bounds = sorted((ids[name], *pair) for name, pair in stated_errors(errors, between).items())
-    count, flags = len(model), 0
-    if between is not None:
-        count, flags = between.source_count, _spec.ERROR_FLAG_REFITTED if between.refitted else 0
+    bounds = sorted((ids[name], *pair) for name, pair in stated_errors(errors, origin).items())
+    count, flags = origin.source_count, origin.refitted * _spec.ERROR_FLAG_REFITTED
     head = _spec.StatedErrorsHead(count, count - len(model), model.sh_degree, flags, len(bounds))
     records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
     return _spec.pack_stated_errors_head(head) + b"".join(records)

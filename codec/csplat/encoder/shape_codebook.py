@@ -77,7 +77,7 @@ class _Scene:
 
 def choose_shapes(
     model: SplatModel, weights: F32, metric: Metric | None, tiles: Sequence[Tile], plan: Plan, options: EncodeOptions,
-    threads: int, report: Progress,
+    report: Progress,
 ) -> ShapeTables | None:  # fmt: skip
     """Make the codebook, and find who is served by it.
 
@@ -88,7 +88,6 @@ def choose_shapes(
         tiles: how the scene is cut.
         plan: the lattices.
         options: `shape_codebook_size`, `shape_escape_fraction`, `seed`.
-        threads: how many to use; the result does not depend on it.
         report: progress.
 
     Returns:
@@ -105,7 +104,7 @@ def choose_shapes(
     tables: ShapeTables | None = None
     for step in range(_ROUNDS):
         report("shapes", step / _ROUNDS)
-        entries, index = _cluster(scene, taking, size, plan, options.seed, threads)
+        entries, index = _cluster(scene, taking, size, plan, options.seed, options.thread_count)
         errors, summand = _served_errors(scene, entries, index, plan)
         if fraction is None:
             served = _worth_it(scene, errors, index, summand)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import EncodeOptions, Importance
-from csplat.encoder.grades import most_grades
+from csplat.encoder import EncodeOptions, Importance, most_grades
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera

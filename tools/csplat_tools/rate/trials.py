@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
-from csplat.encoder.between import Between
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
 from csplat.model import SplatModel
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.simplify.judge import Judge
@@ -160,15 +159,16 @@ class Trials:
         for trial in self.made:
             if trial.part is part and trial.options == options:
                 return trial
-        between, importance = None, self._measured if self.gradable and choice.graded else self._importance
+        origin, said = None, dict[str, Any]()
+        importance = self._measured if self.gradable and choice.graded else self._importance
         if part.rows is not None:
             if isinstance(importance, Importance):
                 importance = importance.select(part.rows)
             elif importance is not None:
                 importance = importance[part.rows]
-            between = Between(len(self._source), part.rows, said=part.said, key="pruned", refitted=False)
+            origin, said = Origin(len(self._source), part.rows), {"pruned": part.said}
         result = encode_with_report(
-            part.model, options, importance=importance, between=between, progress=self._progress
+            part.model, options, importance=importance, origin=origin, said=said, progress=self._progress
         )
         trial = Trial(part, choice, options, quality, result)
         self.made.append(trial)

@@ -6,13 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
-from csplat.encoder.between import Between
-from csplat.encoder.grades import most_grades
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, Importance, Origin, most_grades
 from csplat.model import SplatModel
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.colours import fit
@@ -23,7 +18,6 @@ from csplat_trainer.sensitivity_file import StoredSensitivity
 
 __all__ = ["Candidate", "SimplifiedFile"]
 
-F32 = NDArray[np.float32]
 Progress = Callable[[str, float], None]
 
 _GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 of plane3 take 3 % more with grades
@@ -71,36 +65,31 @@ class Candidate:
         """Encode at a quality, the preset's if it is None. The file says how good its renders are."""
         session = self._session
         report: dict[str, Any] = {"splats": len(self._rows), "splats_before": len(session.source), "quality": quality}
-
-        def colours(seen: SplatModel) -> tuple[F32, F32]:
-            start, options = seen, replace(session.options, steps=_SHORT)
-            if self._last is not None:
-                start = replace(seen, sh0=self._last.sh0, shN=self._last.shN)
-            fitted = fit(
-                start, session.views.used, session.wanted, options, error=self._error, centre=self._pruned,
-                fixed=True, progress=self._progress,
-            )  # fmt: skip
-            self._last = fitted.model
-            if fitted.stays is not None:
-                report["zero_bands"] = (~fitted.stays).sum(axis=0).tolist()
-            report["check_psnr"] = session.checked.psnr(fitted.model)
-            return fitted.model.sh0, fitted.model.shN
-
-        def figures(data: bytes) -> dict[str, float]:
-            report["psnr"] = self._judge.psnr(decode(data))
-            return {"psnr": round(report["psnr"], 3), "check_psnr": round(report["check_psnr"], 3)}
-
-        said = {"splats": len(session.source), "views": len(session.views.used), "method": session.options.method}
-        adjusted = session.options.refit and session.options.adjust
-        between = Between(len(session.source), self._rows, colours, said, adjusted=adjusted, figures=figures)
-        result = encode_with_report(
-            self.fitted,
-            replace(encoding, attribute_psnr=quality),
+        draft = Draft.of(
+            self.fitted, replace(encoding, attribute_psnr=quality),
             importance=self._measured() if encoding.shape_codebook_size or self._grades(encoding) else self._weights,
-            between=between,
+            origin=Origin(len(session.source), self._rows, adjusted=session.options.refit and session.options.adjust),
             progress=self._progress,
-        )
-        return SimplifiedFile(result, report)
+        )  # fmt: skip
+        start, last = draft.scene, self._last
+        fitted = fit(
+            start if last is None else replace(start, sh0=last.sh0, shN=last.shN), session.views.used, session.wanted,
+            replace(session.options, steps=_SHORT), error=self._error, centre=self._pruned, fixed=True,
+            progress=self._progress,
+        )  # fmt: skip
+        self._last = fitted.model
+        if fitted.stays is not None:
+            report["zero_bands"] = (~fitted.stays).sum(axis=0).tolist()
+        coded = draft.with_colours(fitted.model.sh0, fitted.model.shN).coded(self._progress)
+        report["check_psnr"] = session.checked.psnr(fitted.model)
+        report["psnr"] = self._judge.psnr(decode(coded.write().data))
+        said = {
+            "splats": len(session.source),
+            "views": len(session.views.used),
+            "method": session.options.method,
+            **{name: round(report[name], 3) for name in ("psnr", "check_psnr")},
+        }
+        return SimplifiedFile(coded.write({"simplified": said}), report)
 
     def _grades(self, encoding: EncodeOptions) -> bool:
         """Whether splats are to be sorted into grades."""

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.kmeans import cluster
+from csplat.encoder import cluster, fix_gauge
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat_tools.strategies.sizes import attribute_floats, index_bits, raw_bytes

@@ -1,33 +1,27 @@
 """Reduce and encode in one go, and state what that did to the source.
 
-Bands that are distilled are fitted to the geometry as a decoder will see it. A clustered scene is written twice: the
-errors that its file states are those against the source, which the encoder has not seen.
+Bands that are distilled are fitted to the geometry as a decoder will see it. The errors that the file of a clustered
+scene states are those against the source, which the encoder has not seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodeResult
-from csplat.encoder.between import Between
-from csplat.encoder.measure import measured_sums
-from csplat.encoder.pipeline import decide, write_decided
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, Origin
 from csplat.model import SplatModel
 from csplat_tools.strategies.reduction import Reduction, find_teacher, reduced_by, target_degree
 
 if TYPE_CHECKING:
     from csplat_render import Camera
-    from csplat_tools.strategies.distilling import Teacher
 
 __all__ = ["encode_reduced"]
 
-F32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
 
@@ -68,32 +62,19 @@ def encode_reduced(
     teacher = find_teacher(source, reduction, cameras, background)
     clusters = reduction.kmeans is not None
     reduced = reduced_by(source, reduction, teacher if clusters else None, progress)
-    between = Between(len(source), reduced.source_index, said=reduced.said, key=_KEY, refitted=teacher is not None)
+    said, origin = dict(reduced.said), Origin(len(source), reduced.source_index, refitted=teacher is not None)
     model = _with_bands(reduced.model, source.sh_degree) if clusters else source.select(reduced.source_index)
-    if teacher is not None:
-        between = _taught(between, teacher, None if clusters else degree, progress)
-    decided = decide(model, encoding, between=between, progress=progress)
-    if not clusters:
-        return write_decided(decided, between=between, progress=progress)
-    first = write_decided(decided, between=replace(between, figures=None), progress=progress)
-    measured = measured_sums(source, decode(first.data), first.source_index)
-    return write_decided(decided, between=between, measured=measured, progress=progress)
-
-
-def _taught(between: Between, teacher: Teacher, degree: int | None, progress: Progress | None) -> Between:
-    """Colours that are fitted to the quantised geometry, if a degree is given, and renders that are judged."""
-
-    def colours(seen: SplatModel) -> tuple[F32, F32]:
-        if degree is None:
-            return seen.sh0, seen.shN
-        taught = _with_bands(teacher.taught(seen, degree, progress), seen.sh_degree)
-        return taught.sh0, taught.shN
-
-    def figures(data: bytes) -> dict[str, Any]:
-        return {"check_psnr": round(teacher.check.psnr(decode(data)), 3)}
-
-    said = {**between.said, "views": len(teacher.cameras)}
-    return replace(between, colours=colours, figures=figures, said=said)
+    draft = Draft.of(model, encoding, origin=origin, progress=progress)
+    if teacher is not None and not clusters:
+        taught = _with_bands(teacher.taught(draft.scene, degree, progress), source.sh_degree)
+        draft = draft.with_colours(taught.sh0, taught.shN)
+    coded = draft.coded(progress)
+    if teacher is not None or clusters:
+        decoded = decode(coded.write().data)
+        coded = coded.against(source, decoded) if clusters else coded
+        if teacher is not None:
+            said |= {"views": len(teacher.cameras), "check_psnr": round(teacher.check.psnr(decoded), 3)}
+    return coded.write({_KEY: said})
 
 
 def _with_bands(model: SplatModel, sh_degree: int) -> SplatModel:

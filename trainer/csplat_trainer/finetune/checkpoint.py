@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
-from csplat.encoder.frozen import Frozen, Held
+from csplat.encoder import Frozen, Held
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, Parameters

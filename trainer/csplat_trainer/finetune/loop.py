@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from csplat.encoder.frozen import Frozen, Held, Seen
+from csplat.encoder import Frozen, Held, Seen
 from csplat.errors import InputError
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasterise import Rasteriser, Splats
@@ -127,8 +127,8 @@ class _Run:
         self._views, self._options = views, options
         self._scene = TunedScene(frozen)
         self._rasteriser = Rasteriser(threads=threads)
-        self._antialiased = frozen.decided.model.antialiased
-        self._extent = float(np.exp(np.clip(np.median(np.median(frozen.decided.model.scales, axis=1)), -80.0, 80.0)))
+        self._antialiased = frozen.draft.model.antialiased
+        self._extent = float(np.exp(np.clip(np.median(np.median(frozen.draft.model.scales, axis=1)), -80.0, 80.0)))
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _Buffers] = {}

@@ -14,7 +14,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from csplat.encoder.frozen import Frozen
+from csplat.encoder import Frozen
 from csplat_trainer.kernels import parallel_kernel
 from csplat_trainer.parameters import Splats
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from csplat.encoder.frozen import Frozen, Held, Seen
+from csplat.encoder import Frozen, Held, Seen
 from csplat_render.arrays import Gradients
 from csplat_trainer.finetune.rate import Costs, Stored
 from csplat_trainer.kernels import parallel_kernel

@@ -1,0 +1,172 @@
+"""A scene whose tiles are coded: a file, but for what it is to say of itself."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.codebook import Books, with_zero_books
+from csplat.encoder.container import write
+from csplat.encoder.measure import ErrorSums, measured_sums
+from csplat.encoder.plan import Progress
+from csplat.encoder.scene import chosen_settings, file_chunks, file_scene, stated_errors
+from csplat.encoder.shape_tables import SHAPE_BOOK, shape_book
+from csplat.encoder.tile import EncodedTile, encode_tile
+from csplat.encoder.tiling import Tile
+from csplat.model import SplatModel
+
+if TYPE_CHECKING:
+    from csplat.encoder.draft import Draft
+
+__all__ = ["Coded", "EncodeReport", "EncodeResult"]
+
+_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of one, that nobody has to be told of
+
+
+@dataclass(frozen=True)
+class EncodeReport:
+    """What the encoder chose and what it cost.
+
+    Attributes:
+        options: what the caller asked for, and the steps and codings that followed; it stands in the file too.
+        errors: (max, rms) by measure, as the file states them (spec 5.5).
+        splat_count: splats of the file. tile_count: its tiles. size_bytes: its size.
+        notes: what a user should know beside the errors, a sentence each.
+    """
+
+    options: dict[str, Any]
+    errors: dict[str, tuple[float, float]]
+    splat_count: int
+    tile_count: int
+    size_bytes: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EncodeResult:
+    """A file, and which source splat each of its splats is.
+
+    Attributes:
+        data: the file.
+        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model, or of the one that
+            its `Origin` counts the splats of.
+        report: choices and errors.
+    """
+
+    data: bytes
+    source_index: NDArray[np.int64]
+    report: EncodeReport
+
+
+@dataclass(frozen=True, eq=False)
+class Coded:
+    """Tiles of a file.
+
+    Attributes:
+        draft: all that was decided.
+        books: of the whole file.
+        tiles: coded.
+        errors: that the file states.
+    """
+
+    draft: Draft
+    books: Books
+    tiles: Sequence[EncodedTile]
+    errors: ErrorSums
+
+    @classmethod
+    def of(
+        cls, draft: Draft, books: Books, *, errors: ErrorSums | None = None, progress: Progress | None = None
+    ) -> Coded:
+        """Code the tiles of a draft whose plan is complete.
+
+        Args:
+            draft: everything but SH, whose coding its plan names.
+            books: of SH.
+            errors: to state; `None`: those of the coding.
+            progress: as of `Draft.of`.
+        """
+        tiles = _coded_tiles(draft, books, progress)
+        errors = errors or ErrorSums.total(part.errors for part in tiles)
+        books = with_zero_books(
+            books, draft.plan, (id for part in tiles for id in part.tile.tables if id != SHAPE_BOOK)
+        )
+        if draft.shapes is not None:
+            record, chunk = shape_book(draft.shapes, draft.plan.coding)
+            books = replace(books, records=[*books.records, record], chunks=[*books.chunks, chunk])
+        return cls(draft, books, tiles, errors)
+
+    @property
+    def source_index(self) -> NDArray[np.int64]:
+        """Which splat of the source each splat of the file is, [N] in the order of a decoder."""
+        rows = np.concatenate([part.rows for part in self.tiles]) if self.tiles else np.zeros(0, np.int64)
+        index: NDArray[np.int64] = self.draft.origin.source_index[rows]
+        return index
+
+    def against(self, source: SplatModel, decoded: SplatModel) -> Coded:
+        """The same, but stating errors against a scene that the encoder was not shown.
+
+        Args:
+            source: the scene that the origin counts the splats of.
+            decoded: what the file decodes to.
+        """
+        return replace(self, errors=measured_sums(source, decoded, self.source_index))
+
+    def write(self, said: Mapping[str, Any] | None = None) -> EncodeResult:
+        """Write the file. This takes no time beside coding: do it twice, where a file says how good itself is.
+
+        Args:
+            said: what its options say beside those of the encoder, JSON-compatible, by a name for each.
+
+        Raises:
+            InputError: an error that no file can state.
+        """
+        draft, plan = self.draft, self.draft.plan
+        settings = {**(said or {}), **chosen_settings(draft, self.books.tables)}
+        chunks = file_chunks(draft, self.errors, settings)
+        data = write(file_scene(draft, self.books, chunks), [part.tile for part in self.tiles])
+        stated = stated_errors(self.errors, draft.origin)
+        notes = _notes(self.tiles, strict=plan.lattice.strict)
+        report = EncodeReport(settings, stated, len(draft.model), len(self.tiles), len(data), notes)
+        return EncodeResult(data, self.source_index, report)
+
+
+def _coded_tiles(draft: Draft, books: Books, progress: Progress | None) -> list[EncodedTile]:
+    model, tiles, threads = draft.model, draft.tiles, draft.options.thread_count
+    done = 0
+
+    def one(tile: Tile) -> EncodedTile:
+        nonlocal done
+        coded = encode_tile(model, tile, draft.plan, books.tables, draft.shapes)
+        done += len(tile.rows)
+        if progress is not None:
+            progress("tiles", done / max(1, len(model)))
+        return coded
+
+    if threads == 1 or len(tiles) < 2:
+        return [one(tile) for tile in tiles]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, tiles))
+
+
+def _notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
+    """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours.
+
+    And where a bound of the means, finer than 16 bits of a tile of many, took tiles of few.
+    """
+    notes = []
+    splats = sum(len(part.rows) for part in tiles)
+    if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
+        notes.append(f"means: so small an error takes {len(tiles)} tiles, each of which takes bytes of its own")
+    counts = Counter(name for part in tiles for name in part.coarsened)
+    notes += [
+        f"{name}: huge values coarsen {count} of {len(tiles)} tiles; remove them, or see the stated errors"
+        for name, count in sorted(counts.items())
+    ]
+    return tuple(notes)

@@ -1,0 +1,227 @@
+"""A draft of a file: geometry is decided and shown as a decoder will see it, colours may still be chosen.
+
+    draft = Draft.of(model, options)
+    draft = draft.with_colours(*fitted_to(draft.scene))  # or not: the colours that the scene came with
+    coded = draft.coded()
+    coded.write({"fitted": {"psnr": judge(coded.write().data)}})
+
+The encoder has no renderer. Who has one looks at `Draft.scene` before colours are coded, and at the file before it says
+how good its renders are. Who tunes all values takes `Draft.frozen` instead of `Draft.coded`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.encoder.apart import cut_scene
+from csplat.encoder.codebook import Books, choose_sh
+from csplat.encoder.coded import Coded
+from csplat.encoder.frozen import Frozen
+from csplat.encoder.gauge import fix_gauge
+from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
+from csplat.encoder.grades import Grades, choose_grades
+from csplat.encoder.importance import (
+    Importance,
+    known_curvatures,
+    sh_metric,
+    shape_metric,
+    shape_weights,
+    splat_weights,
+)
+from csplat.encoder.options import EncodeOptions
+from csplat.encoder.plan import Plan, Progress, make_plan
+from csplat.encoder.scene import extra_columns
+from csplat.encoder.shape_codebook import choose_shapes
+from csplat.encoder.shape_tables import ShapeTables
+from csplat.encoder.tile import tile_order
+from csplat.encoder.tiling import Tile
+from csplat.errors import InputError
+from csplat.model import SplatModel
+
+__all__ = ["Draft", "Origin", "sample_rows"]
+
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What a scene stands for: splats of a larger one, or of one that looked different.
+
+    Attributes:
+        source_count: splats of the scene that it was made from.
+        source_index: [N] int64, which of them each splat is.
+        refitted: colours are others than those of the source; the file states no errors of them.
+        adjusted: opacities, rotations or scales are, too.
+    """
+
+    source_count: int
+    source_index: I64
+    refitted: bool = False
+    adjusted: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A scene whose geometry is decided: lattices, grades, tiles, codebook of shapes.
+
+    Attributes:
+        model: the scene, with the colours that are to be coded.
+        options: what was asked.
+        origin: what the scene stands for.
+        importance: how much pictures depend on its splats, as far as the caller knows.
+        plan: lattices and codings; that of SH may still be open.
+        tiles: which rows of the model, on which lattice.
+        extras: records of the extra columns that are carried.
+        shapes: the codebook of shapes, if there is one.
+        grades: of the splats, if there are several.
+    """
+
+    model: SplatModel
+    options: EncodeOptions
+    origin: Origin
+    importance: NDArray[Any] | Importance | None
+    plan: Plan
+    tiles: Sequence[Tile]
+    extras: Sequence[_spec.ExtraRecord]
+    shapes: ShapeTables | None
+    grades: Grades | None
+
+    @classmethod
+    def of(
+        cls,
+        model: SplatModel,
+        options: EncodeOptions | None = None,
+        *,
+        importance: NDArray[Any] | Importance | None = None,
+        origin: Origin | None = None,
+        graded: bool = True,
+        progress: Progress | None = None,
+    ) -> Draft:
+        """Decide a scene's geometry.
+
+        Args:
+            model: the scene.
+            options: presets and knobs; the default preset is "balanced".
+            importance: [N] weights >= 0 of the splats, in place of opacity × projected area; or more than that.
+            origin: what the scene stands for; `None`: itself.
+            graded: splats may be sorted into grades; otherwise all are of one, whatever is known of them.
+            progress: called with the stage's name and the share done, 0 to 1; from any thread.
+
+        Raises:
+            InputError: values that no lattice can hold, an option that the model does not allow, an importance of
+                other splats, or an origin of others.
+        """
+        options, origin = options or EncodeOptions(), origin or Origin(len(model), np.arange(len(model)))
+        if len(origin.source_index) != len(model):
+            raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
+        plan = make_plan(model, options, importance_given=importance is not None)
+        extras = extra_columns(model, options)
+        curvatures = known_curvatures(model, importance) if graded else None
+        plan, grades = choose_grades(model, curvatures, plan, options)
+        tiles = cut_scene(model, plan, grades)
+        shapes = None
+        if options.shape_codebook_size and len(model):
+            weights = shape_weights(model, importance)
+            metric = shape_metric(weights, importance)
+            shapes = choose_shapes(model, weights, metric, tiles, plan, options, progress or _silent)
+        return cls(model, options, origin, importance, plan, tiles, extras, shapes, grades)
+
+    @cached_property
+    def scene(self) -> SplatModel:
+        """The scene as a decoder will see it, in its order of splats, but for the colours, which are as they are."""
+        model, tiles, plan = self.model, self.tiles, self.plan
+        quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, self.shapes)
+        means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, tiles, plan)
+        return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
+
+    def with_colours(self, sh0: F32, shN: F32) -> Draft:
+        """The same geometry with colours that were fitted anew.
+
+        Args:
+            sh0: [N, 3] float32.
+            shN: [N, K, 3] float32, of the model's SH degree.
+
+        Raises:
+            InputError: they are of another shape or type, or not finite.
+        """
+        model = replace(self.model, sh0=sh0, shN=shN)
+        return replace(self, model=model, origin=replace(self.origin, refitted=True))
+
+    def coded(self, progress: Progress | None = None) -> Coded:
+        """Decide how SH is coded, and code the tiles: most of the work.
+
+        Raises:
+            InputError: values that no lattice can hold.
+        """
+        plan, books = self._sh(progress)
+        return Coded.of(replace(self, plan=plan), books, progress=progress)
+
+    def frozen(self, source: SplatModel | None = None, progress: Progress | None = None) -> Frozen:
+        """Decide how SH is coded, and leave all values open.
+
+        Args:
+            source: the scene that the origin counts the splats of; `None`: the model itself.
+            progress: as of `of`.
+
+        Raises:
+            InputError: there are no splats, or several grades; or the source has another number of splats.
+        """
+        if not len(self.model):
+            raise InputError("a scene without splats has nothing to tune")
+        if self.grades is not None:  # what tunes it reckons with one step per attribute
+            raise InputError("the splats are of several grades, wanted one: draft them with graded=False")
+        source = self.model if source is None else source
+        if len(source) != self.origin.source_count:
+            raise InputError(f"a source of {len(source)} splats, wanted {self.origin.source_count}: that of the origin")
+        plan, books = self._sh(progress)
+        plan = replace(plan, gauged=True)
+        rows = [tile_order(self.model, tile, plan)[0] for tile in self.tiles]
+        order = np.concatenate(rows).astype(np.int64)
+        draft = replace(self._in_order(order, [len(part) for part in rows]), plan=plan)
+        return Frozen.of(draft, books.tables.select(order), source)
+
+    def _sh(self, progress: Progress | None) -> tuple[Plan, Books]:
+        model, plan, importance = self.model, self.plan, self.importance
+        needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
+        weights = splat_weights(model, importance) if needs_weights else None
+        sample = sample_rows(model, self.tiles, self.grades)
+        return choose_sh(self, weights, sh_metric(model, weights, importance), sample, progress or _silent)
+
+    def _in_order(self, order: I64, counts: Sequence[int]) -> Draft:
+        """The same for splats in the order of their tiles, in their gauge; what SH needs of importance is decided."""
+        model = self.model.select(order)
+        rotation, scales = fix_gauge(model.quats, model.scales)
+        ends = np.cumsum(counts)
+        return replace(
+            self,
+            model=replace(model, quats=np.ascontiguousarray(rotation.T), scales=np.ascontiguousarray(scales.T)),
+            origin=Origin(self.origin.source_count, self.origin.source_index[order], refitted=True),
+            importance=None,
+            tiles=[
+                replace(tile, rows=np.arange(end - count, end))
+                for tile, count, end in zip(self.tiles, counts, ends, strict=True)
+            ],
+            shapes=None if self.shapes is None else self.shapes.select(order),
+        )
+
+
+def sample_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
+    """Rows like those of one tile, on which codings are tried: of all grades, where there are several."""
+    if not tiles:
+        return np.zeros(0, np.intp)
+    if grades is None:
+        return tiles[len(tiles) // 2].rows
+    return np.arange(0, len(model), math.ceil(len(model) / _spec.TILE_SPLATS_MAX))
+
+
+def _silent(stage: str, done: float) -> None:
+    """Report to nobody."""

@@ -1,0 +1,136 @@
+"""Drafts: geometry is shown before colours are coded, and a file is written with what it says of itself."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from csplat import EncodeOptions, decode, encode
+from csplat.decoder import decode_scene, read_options, read_stated_errors
+from csplat.encoder import Draft, Origin, encode_with_report
+from csplat.encoder.measure import measure_errors
+from csplat.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+GEOMETRY = ("means", "quats", "scales", "opacities")
+COLOURS = ("sh0", "shN")
+WAYS = {
+    "plain": {},
+    "tiles": {"tile_splats": 50},
+    "axis": {"means_coding": "axis"},
+    "coarse": {"attribute_psnr": 30.0, "tile_splats": 90},
+    "shapes": {"shape_codebook_size": 32},
+    "threads": {"tile_splats": 50, "threads": 2},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
+    model = make_model(260, 2)
+    draft = Draft.of(model, EncodeOptions(**WAYS[way]))
+    result = draft.coded().write()
+    decoded = decode(result.data)
+    for name in GEOMETRY:
+        assert getattr(decoded, name).tobytes() == getattr(draft.scene, name)[result.source_index].tobytes(), name
+    for name in COLOURS:
+        assert getattr(model, name).tobytes() == getattr(draft.scene, name).tobytes(), name
+
+
+def test_a_draft_makes_the_file_of_encode(make_model):
+    model = make_model(300, 3)
+    assert encode(model) == Draft.of(model).coded().write().data
+
+
+def test_other_colours_change_colours_alone(make_model):
+    model = make_model(260, 2)
+    draft = Draft.of(model, EncodeOptions(attribute_psnr=80.0))
+    fitted = draft.with_colours(model.sh0 + 1, 0 * model.shN)
+    before, after = (decode_scene(one.coded().write().data) for one in (draft, fitted))
+    for name in GEOMETRY:
+        assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
+    np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
+    assert not after.model.shN.any()
+    assert (False, True) == (before.stated_errors.refitted, after.stated_errors.refitted)
+    assert ["means", "covariance", "opacities"] == [record.measure for record in after.stated_errors.records]
+    assert model.sh0 is draft.model.sh0  # the draft is as it was
+
+
+def test_colours_of_other_splats_are_refused(make_model):
+    model = make_model(20, 1)
+    with pytest.raises(InputError):
+        Draft.of(model).with_colours(model.sh0[:-1], model.shN)
+
+
+def test_a_file_is_written_twice_with_the_same_splats(make_model):
+    model = make_model(200, 2)
+    coded = Draft.of(model, EncodeOptions(tile_splats=70)).coded()
+    first = coded.write()
+    second = coded.write({"fitted": {"psnr": 41.5}})
+    assert first.data == coded.write().data
+    assert {"fitted": {"psnr": 41.5}, **read_options(first.data)} == read_options(second.data)
+    one, other = decode(first.data), decode(second.data)
+    for name in (*GEOMETRY, *COLOURS):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    assert np.array_equal(first.source_index, second.source_index)
+
+
+def test_what_is_said_stands_in_the_options(make_model):
+    said = {"simplified": {"why": "a test"}, "more": 7}
+    result = encode_with_report(make_model(50, 0), said=said)
+    options = read_options(result.data)
+    assert result.report.options == options
+    assert said == {name: options[name] for name in said}
+    assert {"preset": "balanced"} == options["asked"]
+
+
+def test_a_file_says_what_it_stands_for(make_model):
+    model, rows = make_model(300, 1), np.arange(100, 250)
+    result = Draft.of(model.select(rows), origin=Origin(300, rows)).coded().write()
+    stated = read_stated_errors(result.data)
+    assert (300, 150, False) == (stated.source_count, stated.pruned_count, stated.refitted)
+    assert set(rows) == set(result.source_index)
+    assert {"means", "covariance", "opacities", "sh0", "sh1"} == set(result.report.errors)
+
+
+def test_an_origin_of_other_splats_is_refused(make_model):
+    with pytest.raises(InputError, match="an origin of 5 splats, wanted 4"):
+        Draft.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
+
+
+def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
+    source = make_model(150, 1)
+    drawn = replace(source, means=source.means + np.float32(0.25))
+    coded = Draft.of(drawn).coded()
+    decoded = decode(coded.write().data)
+    result = coded.against(source, decoded).write()
+    truth = measure_errors(source, decoded, result.source_index)
+    assert 0.4 < truth["means"][0] < 0.5
+    for name, (largest, rms) in truth.items():
+        stated = result.report.errors[name]
+        assert largest <= stated[0] <= largest * 1.0001 + 1e-11
+        assert rms <= stated[1] <= rms * 1.0001 + 1e-11
+
+
+def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
+    model = make_model(300, 2)
+    draft = Draft.of(model, EncodeOptions(sh_coding="scalar"))
+    frozen = draft.frozen()
+    plain, thawed = draft.coded().write(), frozen.coded(frozen.start()).write()
+    assert np.array_equal(plain.source_index, thawed.source_index)
+    one, other = decode(plain.data), decode(thawed.data)
+    for name in ("means", "opacities", *COLOURS):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_those_who_use_the_encoder_import_none_of_its_modules():
+    places = [ROOT / "trainer", ROOT / "tools", ROOT / "conformance"]
+    found = [
+        f"{path.relative_to(ROOT)}: {line}"
+        for place in places
+        for path in sorted(place.rglob("*.py"))
+        for line in path.read_text().splitlines()
+        if re.match(r"\s*(from|import) csplat\.encoder\.", line)
+    ]
+    assert [] == found
