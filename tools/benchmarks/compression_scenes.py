@@ -34,7 +34,7 @@ class Scene:
         name: what tables and files call it.
         data: the data set.
         size: width and height of the photographs; `None`: as they are.
-        background: behind everything, in training and after.
+        background: behind everything, in training and after: that of the data set where its pictures were trained on.
         ply: the splats; `None`: they are trained by `training`.
         training: how, if the data set is at hand.
     """
@@ -64,10 +64,10 @@ SCENES = {
         _FOX,
         replace(
             _FOX, name="fox", ply=None,
-            training=TrainOptions(max_splats=120_000, iterations=7_000, background="black"),
+            training=TrainOptions(max_splats=120_000, iterations=7_000),
         ),
         Scene(
-            "desk29", DATA / "images" / "desk29", (476, 268), _WHITE,
+            "desk29", DATA / "images" / "desk29", (476, 268), _BLACK,
             training=TrainOptions(max_splats=40_000, iterations=10_000),
         ),
     )
