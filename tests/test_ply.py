@@ -281,7 +281,7 @@ def test_splats_in_one_point_far_away_are_exact(tmp_path):
 
 
 def test_what_a_scene_was_trained_on_goes_through_files(tmp_path, make_model):
-    trained = TrainedOn((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für\nalle")
+    trained = TrainedOn((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
     write_ply(tmp_path / "a.ply", make_model(metadata={"training": trained.as_json()}))
     model = read_ply(tmp_path / "a.ply")
     assert {"training": trained.as_json()} == model.metadata
@@ -313,6 +313,7 @@ def test_what_is_not_said_in_our_words_is_not_written(tmp_path, make_model):
         ('{"background": [0, 0, 0], "test_every": false}', "test_every of training is"),
         ('{"background": [0, 0, 0], "near": 1e999}', "near of training is"),
         ('{"background": [0, 0, 0], "images": 4}', "images of training is"),
+        ('{"background": [0, 0, 0], "images": "\\ud800"}', "images of training is"),
     ],
 )
 def test_refuses_a_training_that_it_cannot_read(tmp_path, said, reason):

@@ -57,7 +57,7 @@ class TrainedOn:
         size = _member(said, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
         near = _member(said, "near", _is_length, "a number above 0")
         every = _member(said, "test_every", _is_split, "0, or a whole number above 1")
-        images = _member(said, "images", lambda value: isinstance(value, str), "a name")
+        images = _member(said, "images", _is_name, "a name")
         if background is None:
             raise InputError(f"{TRAINING} names no background")
         red, green, blue = (float(value) for value in background)
@@ -107,6 +107,10 @@ def _is_length(value: Any) -> bool:
 
 def _is_split(value: Any) -> bool:
     return type(value) is int and (value == 0 or 1 < value <= _MAX_COUNT)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable() and value != ""  # no surrogates, no ends of lines
 
 
 def _is_count(value: Any) -> bool:
