@@ -76,7 +76,7 @@ class TrainedOn:
         colour = _COLOURS.get(self.background) or " ".join(f"{value:g}" for value in self.background)
         words = [f"{colour} background"]
         if self.test_every is not None:
-            words.append(f"one of {self.test_every} photographs held out" if self.test_every else "none held out")
+            words.append(f"1 in {self.test_every} photographs held out" if self.test_every else "none held out")
         if self.size is not None:
             words.append(f"scaled to {self.size[0]}×{self.size[1]}")
         if self.images is not None:

@@ -36,7 +36,7 @@ class DataSet:
         points_rgb: [P, 3] float32 in 0..1, their colours.
         report: what was found, left out and changed, a line each.
         coordinate_system: as in `SplatModel`, where the kind of set has a custom.
-        test_every: so `split_every` split it; `None` where the set names its test pictures.
+        test_every: every so-manieth picture was held out; `None` where the set names its test pictures.
         size: what the pictures are scaled to, width and height; `None`: they are not.
         images: the folder of pictures that was asked for; `None`: the reader chose.
     """

@@ -23,7 +23,6 @@ __all__ = ["read_blender", "read_transforms"]
 F64 = NDArray[np.float64]
 
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
-
 _NAMED_MISSING = 5  # files that a message names, at most
 _SCALE_TOLERANCE = 1e-3
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
