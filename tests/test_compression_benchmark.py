@@ -183,15 +183,14 @@ def test_scenes_are_chosen_by_name(tmp_path):
     for words, message in (
         ((["lego9"], [], []), "no scene is called 'lego9'"),
         (([], ["x=a.ply"], []), "no scene is called 'x'"),
-        (([], [], [["a", "a.ply", str(tmp_path), "-", "green"]]), "background of a is 'green'"),
-        (([], [], [["a", "a.ply", str(tmp_path), "10", "black"]]), "size of a is '10'"),
-        (([], [], [["a", str(tmp_path / "a.ply"), str(tmp_path), "-", "black"]]), "a.ply does not exist"),
+        (([], [], [["a", "a.ply", str(tmp_path), "10"]]), "size of a is '10'"),
+        (([], [], [["a", str(tmp_path / "a.ply"), str(tmp_path), "-"]]), "a.ply does not exist"),
     ):
         with pytest.raises(InputError, match=message):
             choose_scenes(*words)
     (tmp_path / "a.ply").touch()
-    (scene,) = choose_scenes([], [], [["a", str(tmp_path / "a.ply"), str(tmp_path), "64x48", "white"]])
-    assert ("a", (64, 48), (1.0, 1.0, 1.0), None) == (scene.name, scene.size, scene.background, scene.training)
+    (scene,) = choose_scenes([], [], [["a", str(tmp_path / "a.ply"), str(tmp_path), "64x48"]])
+    assert ("a", (64, 48), None) == (scene.name, scene.size, scene.training)
     assert 20_000 == SCENES["lego20k"].training.max_splats
 
 
@@ -199,7 +198,7 @@ def test_scenes_are_chosen_by_name(tmp_path):
 
 
 def run(capture, out, *words):
-    extra = ("--scenes", "", "--extra", "shell", capture / "scene.ply", capture, "-", "black")
+    extra = ("--scenes", "", "--extra", "shell", capture / "scene.ply", capture, "-")
     small = ("--iterations", 40, "--attribute-psnr", 30, "--shapes", 32, "--codebook-size", 16, "--threads", 1)
     return main([str(word) for word in (*words, *extra, *small, "--out", out)])
 

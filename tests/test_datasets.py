@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ pytest.importorskip("scipy", reason="undistortion needs scipy: pip install 'cspl
 Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
 # Importing them needs what is looked for above.
+from PIL import ImageFile  # noqa: E402
+
 from csplat_render.cameras import intrinsics, look_at  # noqa: E402
 from csplat_trainer.data import load  # noqa: E402
 from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
@@ -134,6 +137,15 @@ def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, wi
     (folder / "points3D.bin").write_bytes(data)
 
 
+@pytest.fixture
+def colmap_set(tmp_path):
+    shots = cameras(9)
+    for i, camera in enumerate(shots):
+        write_picture(tmp_path / "images" / f"im {i:03}.png", camera)
+    write_colmap(tmp_path / "sparse" / "0", shots)
+    return tmp_path
+
+
 @pytest.fixture(params=["binary", "text"])
 def colmap(tmp_path, request):
     shots = cameras(9)
@@ -199,7 +211,9 @@ def test_colmap_sets_bring_points_and_colours(colmap):
 
 def test_test_txt_names_the_test_pictures(colmap):
     (colmap / "sparse" / "0" / "test.txt").write_text("im 002.png\nim 005.png\n")
-    assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in load(colmap).test]
+    data = load(colmap)
+    assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in data.test]
+    assert data.trained_on(data.background).test_every is None
 
 
 def test_the_smallest_sufficient_folder_of_pictures_is_read(tmp_path):
@@ -384,6 +398,61 @@ def test_refuses_a_file_that_is_no_picture(ngp):
     (ngp / "images" / "0001.png").write_text("not a picture")
     with pytest.raises(InputError, match=r"0001\.png"):
         load(ngp)
+
+
+def test_a_picture_that_is_cut_short_is_refused_when_all_are_read(ngp):
+    path = ngp / "images" / "0001.png"
+    path.write_bytes(path.read_bytes()[:60])
+    data = load(ngp)
+    with pytest.raises(InputError, match=r"0001\.png is not an image that can be read"):
+        data.read()
+
+
+@pytest.mark.parametrize("kind", ["blender", "ngp", "colmap"])
+@pytest.mark.parametrize("size", [None, (24, 16)])
+def test_nothing_is_decoded_before_it_is_asked_for(request, monkeypatch, kind, size):
+    folder = request.getfixturevalue(kind if kind != "colmap" else "colmap_set")
+    decoded = set()
+    decode = ImageFile.ImageFile.load
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: decoded.add(file.filename) or decode(file))
+    data = load(folder, size)
+    wanted = (size or (W, H))[::-1]
+    assert not decoded
+    assert all(picture.has_alpha == (kind == "blender") for picture in (*data.train, *data.test))
+    assert data.background == ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0))
+    assert not decoded
+    assert wanted == data.test[0].pixels.shape[:2]
+    assert wanted == replace(data.test[0], camera=data.test[0].camera).pixels.shape[:2]
+    assert 1 == len(decoded)  # a picture with another camera shares what was read
+    data.read()
+    assert len(data.train) + len(data.test) == len(decoded)
+
+
+def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):
+    path = blender / "train" / "r_0.png"
+    with Image.open(path) as image:
+        image.quantize(16).save(path, transparency=0)
+    picture = load(blender).train[0]
+    assert picture.has_alpha
+    assert (H, W, 4) == picture.pixels.shape
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "expected"),
+    [
+        ("blender", {"test_every": 5}, {"background": [1.0] * 3}),
+        ("ngp", {}, {"background": [0.0] * 3, "test_every": 8}),
+        ("ngp", {"test_every": 0}, {"background": [0.0] * 3, "test_every": 0}),
+        ("colmap_set", {"test_every": 5, "images": "images"}, {"test_every": 5, "images": "images"}),
+        ("colmap_set", {"size": (24, 16), "near": 0.004}, {"size": [24, 16], "near": 0.004, "test_every": 8}),
+    ],
+)
+def test_a_set_says_how_it_was_read(request, kind, options, expected):
+    data = load(request.getfixturevalue(kind), **options)
+    said = data.trained_on(data.background).as_json()
+    assert expected == {name: said[name] for name in expected}
+    assert {"background", "near", *expected, *(("test_every",) if kind != "blender" else ())} == set(said)
+    assert data.coordinate_system == ("RFU" if kind == "blender" else "unspecified")
 
 
 def test_refuses_text_that_is_no_json(tmp_path):

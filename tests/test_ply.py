@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from csplat import decode, encode
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
 from csplat.ply_columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
+from csplat.training import TrainedOn
 
 ARRAYS = ("means", "quats", "scales", "sh0", "shN")
 
@@ -276,6 +278,49 @@ def test_splats_in_one_point_far_away_are_exact(tmp_path):
     write_doubles(tmp_path / "a.ply", positions)
     model = read_ply(tmp_path / "a.ply")
     assert np.array_equal(model.means + np.array(model.origin), positions)
+
+
+def test_what_a_scene_was_trained_on_goes_through_files(tmp_path, make_model):
+    trained = TrainedOn((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
+    write_ply(tmp_path / "a.ply", make_model(metadata={"training": trained.as_json()}))
+    model = read_ply(tmp_path / "a.ply")
+    assert {"training": trained.as_json()} == model.metadata
+    write_ply(tmp_path / "b.ply", decode(encode(model)))
+    assert trained == TrainedOn.of(read_ply(tmp_path / "b.ply").metadata)
+    line = header_of(tmp_path / "b.ply")[-1]
+    assert line.startswith('comment csplat training {"background": [1.0, 1.0, 1.0], "test_every": 5')
+
+
+def test_what_is_not_said_in_our_words_is_not_written(tmp_path, make_model):
+    write_ply(tmp_path / "a.ply", make_model(metadata={"training": "on a laptop"}))
+    assert {} == read_ply(tmp_path / "a.ply").metadata
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        ("", "not JSON"),
+        ("white", "not JSON"),
+        ("[" * 100_000, "too many brackets"),
+        ("[]", r"training is \[\], wanted an object"),
+        ("{}", "training names no background"),
+        ('{"background": [0, 0]}', "background of training is"),
+        ('{"background": [0, 0, 1.5]}', "background of training is"),
+        ('{"background": [0, 0, NaN]}', "background of training is"),
+        ('{"background": [0, 0, true]}', "background of training is"),
+        ('{"background": [0, 0, 0], "size": [3.5, 2]}', "size of training is"),
+        ('{"background": [0, 0, 0], "test_every": 1}', "test_every of training is 1"),
+        ('{"background": [0, 0, 0], "test_every": false}', "test_every of training is"),
+        ('{"background": [0, 0, 0], "near": 1e999}', "near of training is"),
+        ('{"background": [0, 0, 0], "images": 4}', "images of training is"),
+        ('{"background": [0, 0, 0], "images": "\\ud800"}', "images of training is"),
+    ],
+)
+def test_refuses_a_training_that_it_cannot_read(tmp_path, said, reason):
+    names = columns_of(0)
+    write_rows(tmp_path / "a.ply", names, random_rows(names), comments=[f"csplat training {said}"])
+    with pytest.raises(InputError, match=f"csplat training.*cannot be understood: {reason}"):
+        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("comment", ["csplat origin 1 2", "csplat origin a b c", "csplat absolute_origin 1 2 inf"])

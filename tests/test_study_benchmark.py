@@ -119,8 +119,7 @@ def small(tmp_path, monkeypatch):
 
     def known(iterations, count):
         return {
-            name: Scene(name, folder, None, BLACK, training=replace(one.training, background="black"))
-            for name, one in baselines(iterations, count).items()
+            name: Scene(name, folder, None, training=one.training) for name, one in baselines(iterations, count).items()
         }
 
     monkeypatch.setattr(study, "baselines", known)

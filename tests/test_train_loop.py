@@ -4,11 +4,15 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
+from typer.testing import CliRunner
 
 from csplat import read_ply, write_ply
 from csplat.errors import InputError
+from csplat.training import TrainedOn
 from csplat_render.cameras import intrinsics, orbit
 from csplat_render.rasterise import Rasteriser
+from csplat_tools.app import app
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
@@ -117,8 +121,9 @@ def test_the_hull_holds_what_all_masks_show(make_data, make_model):
 
 def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
     data = make_data(make_model, alpha=False)
-    result = train(data, TrainOptions(**QUICK, background="black"))
+    result = train(data, TrainOptions(**QUICK))
     assert np.isfinite(result.model.means).all()
+    assert (0.0, 0.0, 0.0) == TrainedOn.of(result.model.metadata).background
     with pytest.raises(InputError, match="no alpha channel"):
         train(data, TrainOptions(**QUICK, init="hull"))
     with pytest.raises(InputError, match="no points"):
@@ -135,8 +140,6 @@ def test_points_are_where_splats_start(make_data, make_model):
 
 
 def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
-    from PIL import Image
-
     (tmp_path / "train").mkdir()
     frames = []
     data = make_data(make_model)
@@ -151,12 +154,71 @@ def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
     files = ["--json", str(tmp_path / "log.json"), "--plot", str(tmp_path / "loss.png")]
     done = subprocess.run([*run, *options, *files], capture_output=True, text=True, check=False)
     assert (0, "") == (done.returncode, done.stdout), done.stderr
-    assert read_ply(tmp_path / "o.ply").sh_degree == 1
+    model = read_ply(tmp_path / "o.ply")
+    assert (1, "RFU") == (model.sh_degree, model.coordinate_system)
     assert 30 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
     assert (tmp_path / "loss.png").read_bytes().startswith(b"\x89PNG")
     again = subprocess.run([*run, "--device", "mps"], capture_output=True, text=True, check=False)
     assert 2 == again.returncode
     assert "mps is not supported" in " ".join(again.stderr.split())
+
+
+def write_set(folder, data):
+    """The pictures as a transforms.json set, which names no split."""
+    frames = []
+    for number, picture in enumerate((*data.train, *data.test)):
+        Image.fromarray(picture.pixels).save(folder / f"{number:02}.png")
+        pose = np.linalg.inv(picture.camera.viewmat) @ np.diag([1, -1, -1, 1])
+        frames.append({"file_path": f"{number:02}.png", "transform_matrix": pose.tolist()})
+    document = {"fl_x": data.train[0].camera.K[0, 0], "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def call(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result
+
+
+QUICK_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "background", "every", "size"),
+    [(True, "auto", 5, None), (False, "auto", 10, "40x30"), (False, "white", 8, None), (True, "random", 8, "40x40")],
+)
+def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, alpha, background, every, size):
+    folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
+    reading = ["--test-every", every, *(() if size is None else ("--size", size))]
+    ply, log = tmp_path / "a.ply", tmp_path / "log.json"
+    told = call("train", folder, "-o", ply, "--background", background, "--json", log, *reading, *QUICK_WORDS)
+    call("encode", ply, tmp_path / "a.csplat")
+    call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
+    said = TrainedOn.of(read_ply(ply).metadata)
+    assert said == TrainedOn.of(read_ply(tmp_path / "b.ply").metadata)
+    assert (every, size) == (said.test_every, None if said.size is None else "{}x{}".format(*said.size))
+    assert said.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
+    assert str(said) in told.stderr
+    assert str(said) in call("info", tmp_path / "a.csplat").stdout
+    assert said.as_json() == json.loads(call("info", tmp_path / "a.csplat", "--json").stdout)["metadata"]["training"]
+    colour = ",".join(str(value) for value in said.background)
+    judged = json.loads(call("compare", ply, ply, "--data", folder, "--background", colour, "--json", *reading).stdout)[
+        "photographs"
+    ]["a"]
+    metrics = json.loads(log.read_text())["metrics"]
+    for name in ("psnr", "psnr_mean"):
+        assert judged[name] == pytest.approx(metrics[name], abs=0.01)
+
+
+def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
+    folder = write_set(tmp_path, make_data(make_model))
+    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
+    result = CliRunner().invoke(app, ["train", str(folder), "-o", str(tmp_path / "a.ply")])
+    assert 1 == result.exit_code
+    assert "11.png is not an image that can be read" in result.stderr
+    assert not (tmp_path / "a.ply").exists()
 
 
 def test_the_command_says_which_extra_is_missing(tmp_path):

@@ -66,7 +66,8 @@ class SplatModel:
         flat: splats are discs (2DGS): the third, smallest scale means nothing.
         cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
             with OpenCV axes, pixel centres at +0.5; `None` where there are none.
-        metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str).
+        metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str),
+            `training` (see `csplat.training`).
         extra: further columns by name, each [N], integer or floating.
 
     Raises:

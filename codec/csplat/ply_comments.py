@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,10 +10,12 @@ from typing import Any
 
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
+from csplat.training import TRAINING, TrainedOn
 
 __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
 _PREFIX = "csplat"
+_SHOWN = 80  # characters of a comment in a message
 
 
 @dataclass
@@ -23,7 +26,7 @@ class SceneFacts:
         origin: `None` where no comment names one.
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments`, the lines that are not ours; `licence`.
+        metadata: `comments`, the lines that are not ours; `licence`; `training`.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -40,13 +43,15 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
 
     Raises:
         InputError: a line begins as ours but its value cannot be understood. To skip an origin
-            would put the scene elsewhere.
+            would put the scene elsewhere, to skip its background would judge it wrongly.
     """
     facts = SceneFacts()
     others: list[str] = []
     for comment in comments:
         words = comment.split()
-        if words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
+        if words[:2] == [_PREFIX, TRAINING]:
+            facts.metadata[TRAINING] = _training(comment).as_json()
+        elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
             others.append(comment)
     if others:
         facts.metadata["comments"] = others
@@ -78,6 +83,9 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
     licence = model.metadata.get("licence")
     if isinstance(licence, str):
         lines.append(f"{_PREFIX} licence {' '.join(licence.split())}")
+    trained = TrainedOn.of(model.metadata)
+    if trained is not None:
+        lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")  # ASCII, whatever names hold
     return [line.encode("ascii", "replace").decode("ascii") for line in lines]
 
 
@@ -99,6 +107,19 @@ def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
     else:
         return False
     return True
+
+
+def _training(comment: str) -> TrainedOn:
+    """Its object in JSON, which may hold spaces that count."""
+    try:
+        return TrainedOn.from_json(json.loads("".join(comment.split(None, 2)[2:])))
+    except RecursionError:
+        reason = "too many brackets"
+    except ValueError:
+        reason = "not JSON"
+    except InputError as error:
+        reason = str(error)
+    raise InputError(f"the header comment {comment[:_SHOWN]!r} cannot be understood: {reason}")
 
 
 def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:

@@ -34,7 +34,7 @@ def write_ply(path: str | os.PathLike[str], model: SplatModel, *, absolute: bool
     """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
 
     Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow
-    the others; cameras and metadata but comments and licence are not written.
+    the others; cameras and metadata but comments, licence and training are not written.
 
     Args:
         path: the file; it takes its name when it is complete, replacing an older one.

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from csplat.errors import InputError
 
 __all__ = ["TRAINING", "TrainedOn"]
 
 #: The key of the metadata under which it stands.
 TRAINING = "training"
+
+_MAX_COUNT = 2**31 - 1
+_COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 
 @dataclass(frozen=True)
@@ -33,23 +38,30 @@ class TrainedOn:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> TrainedOn | None:
-        """What a scene's metadata says; `None` where it says nothing that can be understood."""
-        said = metadata.get(TRAINING)
+        """What a scene's metadata says; `None` where it says nothing, or nothing that can be understood."""
+        try:
+            return cls.from_json(metadata[TRAINING]) if TRAINING in metadata else None
+        except InputError:
+            return None
+
+    @classmethod
+    def from_json(cls, said: object) -> TrainedOn:
+        """The inverse of `as_json`; members of other names are passed over.
+
+        Raises:
+            InputError: there is no background, or a member is not what it is called.
+        """
         if not isinstance(said, Mapping):
-            return None
-        background = _numbers(said.get("background"), 3)
-        if background is None or not all(0.0 <= value <= 1.0 for value in background):
-            return None
-        size, near, every, images = (said.get(name) for name in ("size", "near", "test_every", "images"))
-        pixels, plane = _numbers(size, 2), _numbers([near], 1)
-        red, green, blue = background
-        return cls(
-            background=(red, green, blue),
-            test_every=every if isinstance(every, int) and not isinstance(every, bool) and every >= 0 else None,
-            size=(int(pixels[0]), int(pixels[1])) if pixels is not None and min(pixels) >= 1.0 else None,
-            near=plane[0] if plane is not None and plane[0] > 0.0 else None,
-            images=images if isinstance(images, str) else None,
-        )
+            raise InputError(f"{TRAINING} is {said!r}, wanted an object")
+        background = _member(said, "background", lambda value: _are(value, 3, _is_share), "three numbers of 0 to 1")
+        size = _member(said, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
+        near = _member(said, "near", _is_length, "a number above 0")
+        every = _member(said, "test_every", _is_split, "0, or a whole number above 1")
+        images = _member(said, "images", _is_name, "a name")
+        if background is None:
+            raise InputError(f"{TRAINING} names no background")
+        red, green, blue = (float(value) for value in background)
+        return cls((red, green, blue), every, None if size is None else (size[0], size[1]), near, images)
 
     def as_json(self) -> dict[str, Any]:
         """What goes into the metadata, without what is not known."""
@@ -59,12 +71,47 @@ class TrainedOn:
                 said[name] = getattr(self, name)
         return said if self.size is None else {**said, "size": list(self.size)}
 
+    def __str__(self) -> str:
+        """The same in words, for people."""
+        colour = _COLOURS.get(self.background) or " ".join(f"{value:g}" for value in self.background)
+        words = [f"{colour} background"]
+        if self.test_every is not None:
+            words.append(f"1 in {self.test_every} photographs held out" if self.test_every else "none held out")
+        if self.size is not None:
+            words.append(f"scaled to {self.size[0]}×{self.size[1]}")
+        if self.images is not None:
+            words.append(f"from {self.images}")
+        if self.near is not None:
+            words.append(f"near plane {self.near:.4g}")
+        return ", ".join(words)
 
-def _numbers(values: object, count: int) -> list[float] | None:
-    """So many finite numbers, or `None`."""
-    if not isinstance(values, list | tuple) or len(values) != count:
-        return None
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        return None
-    numbers = [float(value) for value in values]
-    return numbers if all(math.isfinite(number) for number in numbers) else None
+
+def _member(said: Mapping[str, Any], name: str, suits: Callable[[Any], bool], wanted: str) -> Any:
+    value = said.get(name)
+    if value is not None and not suits(value):
+        raise InputError(f"{name} of {TRAINING} is {value!r}, wanted {wanted}")
+    return value
+
+
+def _are(values: object, count: int, suits: Callable[[Any], bool]) -> bool:
+    return isinstance(values, list | tuple) and len(values) == count and all(suits(value) for value in values)
+
+
+def _is_share(value: Any) -> bool:
+    return type(value) in (int, float) and 0.0 <= value <= 1.0
+
+
+def _is_length(value: Any) -> bool:
+    return type(value) in (int, float) and 0.0 < value <= sys.float_info.max
+
+
+def _is_split(value: Any) -> bool:
+    return type(value) is int and (value == 0 or 1 < value <= _MAX_COUNT)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable() and value != ""  # no surrogates, no ends of lines
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 < value <= _MAX_COUNT

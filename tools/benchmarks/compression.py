@@ -97,8 +97,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", default=",".join(SCENES), help="names, separated by commas; default: %(default)s")
     parser.add_argument("--ply", action="append", default=[], metavar="NAME=FILE", help="splats, instead of training")
     parser.add_argument(
-        "--extra", nargs=5, action="append", default=[], metavar=("NAME", "PLY", "DATA", "WxH", "COLOUR"),
-        help="a further scene; WxH may be -, the background black or white",
+        "--extra", nargs=4, action="append", default=[], metavar=("NAME", "PLY", "DATA", "WxH"),
+        help="a further scene; WxH may be -",
     )  # fmt: skip
     parser.add_argument(
         "--train-iterations", type=int, metavar="N", help="of scenes that are trained; default: each its own"

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from csplat_trainer.report import Progress
 
 __all__ = ["SCENES", "Kept", "Scene", "choose_scenes", "file_digest", "trained"]
 
-_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _TOLD = 5  # lines of progress of a training
 
 
@@ -34,7 +34,6 @@ class Scene:
         name: what tables and files call it.
         data: the data set.
         size: width and height of the photographs; `None`: as they are.
-        background: behind everything, in training and after.
         ply: the splats; `None`: they are trained by `training`.
         training: how, if the data set is at hand.
     """
@@ -42,17 +41,21 @@ class Scene:
     name: str
     data: Path
     size: tuple[int, int] | None
-    background: tuple[float, float, float]
     ply: Path | None = None
     training: TrainOptions | None = None
+
+    @cached_property
+    def background(self) -> tuple[float, float, float]:
+        """Behind everything, in training and after: what suits the data set."""
+        return load(self.data, self.size).background
 
 
 def _lego(count: int) -> Scene:
     options = TrainOptions(max_splats=count, iterations=30_000)
-    return Scene(f"lego{count // 1000}k", DATA / "images" / "lego200", (200, 200), _WHITE, training=options)
+    return Scene(f"lego{count // 1000}k", DATA / "images" / "lego200", (200, 200), training=options)
 
 
-_FOX = Scene("fox120k", DATA / "images" / "fox", (270, 480), _BLACK, DATA / "ply" / "fox120k.ply")
+_FOX = Scene("fox120k", DATA / "images" / "fox", (270, 480), DATA / "ply" / "fox120k.ply")
 
 #: By name. `fox` is trained on the photographs of `fox120k`, so that its training has a time.
 SCENES = {
@@ -64,10 +67,10 @@ SCENES = {
         _FOX,
         replace(
             _FOX, name="fox", ply=None,
-            training=TrainOptions(max_splats=120_000, iterations=7_000, background="black"),
+            training=TrainOptions(max_splats=120_000, iterations=7_000),
         ),
         Scene(
-            "desk29", DATA / "images" / "desk29", (476, 268), _WHITE,
+            "desk29", DATA / "images" / "desk29", (476, 268),
             training=TrainOptions(max_splats=40_000, iterations=10_000),
         ),
     )
@@ -82,7 +85,7 @@ def choose_scenes(
     Args:
         names: keys of `SCENES`.
         plys: NAME=FILE, splats that stand for those that would be trained.
-        extra: each [NAME, PLY, DATA, WxH, COLOUR]: further scenes; `-` for WxH as they are; black or white.
+        extra: each [NAME, PLY, DATA, WxH]: further scenes; `-` for WxH as they are.
         iterations: training steps of those that are trained; `None`: as each scene has them.
 
     Raises:
@@ -98,10 +101,7 @@ def choose_scenes(
             one if one.training is None else replace(one, training=replace(one.training, iterations=iterations))
             for one in scenes
         ]
-    for name, ply, data, size, colour in extra:
-        if colour not in ("black", "white"):
-            raise InputError(f"the background of {name} is {colour!r}, wanted black or white")
-        scenes.append(Scene(name, Path(data), _size(name, size), _WHITE if colour == "white" else _BLACK, Path(ply)))
+    scenes += [Scene(name, Path(data), _size(name, size), Path(ply)) for name, ply, data, size in extra]
     for one in scenes:
         for path in (one.data, one.ply):
             if path is not None and not path.exists():

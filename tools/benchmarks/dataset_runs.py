@@ -143,7 +143,7 @@ def _train(
     record_path: Path,
     tell: Callable[[str], object],
 ) -> dict[str, Any]:
-    data = _load(folder, record, None)
+    data = _load(folder, record)
     for line in (*data.report, *record["remarks"]):
         tell(line)
     options = TrainOptions(
@@ -152,7 +152,6 @@ def _train(
         sh_degree=settings.sh_degree,
         seed=settings.seed,
         device=settings.device,
-        background=_background_name(data),
     )
     every = max(1, options.iterations // _TOLD // options.log_every) * options.log_every
 
@@ -185,7 +184,7 @@ def _score(
     lpips: Lpips | None,
     tell: Callable[[str], object],
 ) -> dict[str, Any]:
-    data = _load(folder, record, "test")
+    data = _load(folder, record)
     if not data.test:
         raise InputError(f"{folder.path} holds out no pictures to score by")
     source = read_ply(ply)
@@ -204,26 +203,21 @@ def _score(
     return {
         "test_views": len(data.test),
         "pixels": [camera.W, camera.H],
-        "background": _background_name(data),
+        "background": data.background,
         "splats": len(source),
         "sh_degree": source.sh_degree,
         "files": files,
     }
 
 
-def _load(folder: SceneFolder, record: dict[str, Any], only: str | None) -> DataSet:
+def _load(folder: SceneFolder, record: dict[str, Any]) -> DataSet:
     size = None if record["size"] is None else (int(record["size"][0]), int(record["size"][1]))
-    return load(folder.path, size, images=record["images"], test_every=TEST_EVERY, only=only)
-
-
-def _background_name(data: DataSet) -> str:
-    """White behind pictures with an alpha channel, as the NeRF-synthetic tables; black behind photographs."""
-    return "white" if any(picture.has_alpha for picture in (*data.train, *data.test)) else "black"
+    return load(folder.path, size, images=record["images"], test_every=TEST_EVERY)
 
 
 def _quality(model: SplatModel, data: DataSet, lpips: Lpips | None, sheets: _Sheets) -> dict[str, Any]:
     """Scores of the held-out views as `evaluate` gives them; papers print `psnr_mean`."""
-    background = np.full(3, 1.0 if _background_name(data) == "white" else 0.0, np.float32)
+    background = np.array(data.background, np.float32)
     rasteriser = Rasteriser(gradients=False)
     numbers = iter(range(len(data.test)))  # `evaluate` renders them in their order
 

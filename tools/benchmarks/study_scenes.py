@@ -27,7 +27,7 @@ __all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "la
 Colour = tuple[float, float, float]
 Tell = Callable[[str], object]
 
-_BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+_BLACK = (0.0, 0.0, 0.0)
 _LPIPS_WEIGHT = 0.1
 
 #: What the published study trains, and variants of it, by name: how each differs.
@@ -90,7 +90,7 @@ def baselines(iterations: int, count: int) -> dict[str, Scene]:
         "study1k-lpips": replace(plain, lpips_weight=_LPIPS_WEIGHT),
     }
     data = DATA / "images" / "lego200"
-    return {name: Scene(name, data, (200, 200), _WHITE, training=options) for name, options in how.items()}
+    return {name: Scene(name, data, (200, 200), training=options) for name, options in how.items()}
 
 
 def open_subject(

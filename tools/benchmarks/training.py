@@ -63,7 +63,9 @@ def _measure(
     from csplat_trainer.parameters import Parameters
     from csplat_trainer.starting import scene_of, starting_splats
 
-    pictures = load(folder, size).train
+    data = load(folder, size)
+    data.read()
+    pictures = data.train
     options = TrainOptions(max_splats=count, sh_degree=_DEGREE, strategy="fixed", iterations=warm + steps)
     rng, scene = np.random.default_rng(0), scene_of(pictures)
     with thread_count(threads):

@@ -104,6 +104,7 @@ class Looks:
         if not quiet:
             for line in data.report:
                 note(line)
+        data.read()  # a damaged picture is found before anything is measured
         train, test = (
             [replace(one, camera=relative_to(source.origin, one.camera)) for one in part]
             for part in (data.train, data.test)

@@ -48,7 +48,7 @@ class DataViews:
     test_every: int = 8
 
     def read(self) -> list[Picture]:
-        """Read them, undistorted, with their cameras in the coordinates of the set.
+        """Find them, undistorted, with their cameras in the coordinates of the set; each is read when it is looked at.
 
         Raises:
             InputError: there is no data set, it is damaged, or has no such pictures; or a package is not installed.
@@ -58,7 +58,7 @@ class DataViews:
 
         if self.split not in SPLITS:
             raise InputError(f"the split is {self.split!r}, wanted one of {', '.join(SPLITS)}")
-        data = load(self.path, self.size, images=self.images, test_every=self.test_every, only=self.split)
+        data = load(self.path, self.size, images=self.images, test_every=self.test_every)
         pictures = data.test if self.split == "test" else data.train
         if not pictures:
             raise InputError(f"{data.name} has no {self.split} pictures")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from csplat.errors import InputError
+from csplat.training import TrainedOn
 from csplat_tools.console import note, step_progress
 from csplat_tools.extras import need_trainer
 from csplat_tools.inout import write_model
@@ -69,6 +70,7 @@ def run_training(
     if not quiet:
         for line in data.report:
             note(line)
+    data.read()  # a damaged picture is found before kernels are compiled
     outputs = Outputs(
         files.checkpoint,
         files.checkpoint_every,
@@ -91,6 +93,7 @@ def run_training(
         plot_loss(files.plot, result.log["losses"], Path(source).name)
     if not quiet:
         note(_summary(result.log, result.metrics))
+        note(f"{files.output} says how to compare it with its photographs: {TrainedOn.of(result.model.metadata)}")
 
 
 def _check_inputs(options: TrainOptions, files: Files) -> None:

@@ -6,7 +6,7 @@ import math
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 import csplat
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.training import TRAINING
 from csplat_render.lpips import Lpips, load_lpips
+from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.data import DataSet
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
@@ -37,7 +39,8 @@ __all__ = ["train"]
 
 F32 = NDArray[np.float32]
 
-_COLOURS = {"black": 0.0, "white": 1.0, "random": 1.0}  # random: what evaluations are in front of
+_BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+_COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
 _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
 
@@ -62,7 +65,6 @@ def train(
     Raises:
         InputError: there is no picture, an option does not suit the data, or a file is not what it
             is said to be.
-
     """
     run = _Run(data, options or TrainOptions(), outputs or Outputs())
     return run.to_the_end(progress)
@@ -82,6 +84,7 @@ class _Run:
     def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
         if not data.train:
             raise InputError("there is no picture to train on")
+        data.read()
         self._data, self._options, self._outputs = data, options, outputs
         self._scene = scene_of(data.train)
         self._rng = Generator(PCG64(options.seed))
@@ -95,7 +98,8 @@ class _Run:
             parameters = self._go_on(load_checkpoint(outputs.resume))
         self._lpips = _lpips(options, outputs)
         self._engine = _engine(parameters, options, self._lpips)
-        self._background = np.full(3, _COLOURS[options.background], np.float32)
+        self._behind = _COLOURS.get(options.background, data.background)
+        self._background = np.array(self._behind, np.float32)
 
     def to_the_end(self, progress: Callable[[Progress], None] | None) -> TrainResult:
         options, outputs = self._options, self._outputs
@@ -200,7 +204,7 @@ class _Run:
             iteration=self._iteration,
             iterations=self._options.iterations,
             loss=sum(window.losses) / len(window.losses),
-            psnr=99.0 if mse <= 10.0**-9.9 else -10.0 * math.log10(mse),
+            psnr=psnr_of_mse(mse),
             splat_count=len(self._engine.parameters),
             sh_degree=degree,
             seconds=seconds,
@@ -247,7 +251,9 @@ class _Run:
         )
 
     def _model(self) -> SplatModel:
-        return to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
+        model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
+        said = {TRAINING: self._data.trained_on(self._behind).as_json()}
+        return replace(model, coordinate_system=self._data.coordinate_system, metadata=said)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
         return {

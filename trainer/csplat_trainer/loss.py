@@ -9,7 +9,6 @@ losses are a choice of weights: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of sim
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,11 +45,6 @@ class LossValue:
     l1: float
     ssim: float
     mse: float
-
-    @property
-    def psnr(self) -> float:
-        """PSNR in dB for a peak of 1, at most 99."""
-        return 99.0 if self.mse <= 10.0**-9.9 else -10.0 * math.log10(self.mse)
 
 
 class PhotometricLoss:

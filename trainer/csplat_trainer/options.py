@@ -16,7 +16,7 @@ __all__ = ["BACKGROUNDS", "DEVICES", "INITS", "LOSSES", "STRATEGIES", "TrainOpti
 STRATEGIES = ("mcmc", "fixed", "gradient", "none")
 LOSSES = ("inria", "study", "l1")
 INITS = ("auto", "points", "hull", "box")
-BACKGROUNDS = ("black", "white", "random")
+BACKGROUNDS = ("auto", "black", "white", "random")
 DEVICES = ("cpu", "cuda")
 
 
@@ -38,7 +38,8 @@ class TrainOptions:
         init: where splats start: at the data set's points, inside the visual hull of the alpha
             masks, anywhere in the scene's box, or (`auto`) the first of these that there is.
         initial_splats: how many there are at first; 0: the strategy decides.
-        background: behind the splats, where pictures have an alpha channel.
+        background: behind the splats, and behind pictures that have an alpha channel. `auto`: white
+            if any has one, else black; `random`: another one at each step, judged in front of white.
         antialiased: train with the mip-splatting low-pass filter.
         loss: `inria` 0.8 L1 + 0.2 (1 − SSIM), `study` L1 + 0.2 (1 − SSIM), `l1` L1 alone.
         lpips_weight: of a perceptual term, LPIPS-Alex; 0: none. Needs torch and the weights.
@@ -78,7 +79,7 @@ class TrainOptions:
     strategy: str = "mcmc"
     init: str = "auto"
     initial_splats: int = 0
-    background: str = "white"
+    background: str = "auto"
     antialiased: bool = False
     loss: str = "inria"
     lpips_weight: float = 0.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import prange
@@ -12,11 +14,29 @@ from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_trainer.kernels import parallel_kernel
 
-__all__ = ["Picture", "compose"]
+__all__ = ["Picture", "UnreadPixels", "compose"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class UnreadPixels:
+    """Pixels that are read when they are first asked for, and then kept.
+
+    Attributes:
+        has_alpha: whether there is an alpha channel.
+        read: makes the array that `Picture` wants.
+    """
+
+    has_alpha: bool
+    read: Callable[[], U8]
+
+    @cached_property
+    def pixels(self) -> U8:
+        """As `read` returns them; raises what it raises."""
+        return self.read()
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,32 +45,48 @@ class Picture:
 
     Attributes:
         camera: where it was taken; its W and H are the picture's.
-        pixels: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
-            premultiplied) alpha.
+        source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
+            premultiplied) alpha; or such pixels that are not read yet.
 
     Raises:
         InputError: the pixels have another shape or dtype.
     """
 
     camera: Camera
-    pixels: U8
+    source: U8 | UnreadPixels
 
     def __post_init__(self) -> None:
-        shape = (self.camera.H, self.camera.W)
-        if self.pixels.dtype != np.uint8 or self.pixels.ndim != 3 or self.pixels.shape[2] not in (3, 4):
-            raise InputError(f"a picture is {self.pixels.dtype} {list(self.pixels.shape)}, wanted uint8 [H, W, 3 or 4]")
-        if self.pixels.shape[:2] != shape:
-            raise InputError(f"a picture has {self.pixels.shape[:2]} pixels, its camera {shape} (height, width)")
+        if not isinstance(self.source, UnreadPixels):
+            self._check(self.source)
+
+    @property
+    def pixels(self) -> U8:
+        """The pixels. Those that are not read yet are read.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        if not isinstance(self.source, UnreadPixels):
+            return self.source
+        self._check(self.source.pixels)
+        return self.source.pixels
 
     @property
     def has_alpha(self) -> bool:
-        """Whether there is an alpha channel."""
-        return bool(self.pixels.shape[2] == 4)
+        """Whether there is an alpha channel; nothing is read for it."""
+        return self.source.has_alpha if isinstance(self.source, UnreadPixels) else self.source.shape[2] == 4
 
     def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
         """Some pixels, RGBA in 0..1, [M, 4]; alpha 1 where there is none."""
         values = self.pixels[rows, columns].astype(np.float64) / 255.0
         return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
+
+    def _check(self, pixels: U8) -> None:
+        shape = (self.camera.H, self.camera.W)
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+            raise InputError(f"a picture is {pixels.dtype} {list(pixels.shape)}, wanted uint8 [H, W, 3 or 4]")
+        if pixels.shape[:2] != shape:
+            raise InputError(f"a picture has {pixels.shape[:2]} pixels, its camera {shape} (height, width)")
 
 
 def compose(picture: Picture, background: F32, out: F32) -> F32:

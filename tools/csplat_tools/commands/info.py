@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from csplat.training import TRAINING, TrainedOn
 from csplat_tools.console import format_bytes, format_table, guarded, say, say_json
 from csplat_tools.inout import mapped_csplat
 from csplat_tools.reading import describe_file
@@ -48,10 +49,13 @@ def _format(described: dict[str, Any]) -> str:
         parts.append("\n".join(_codebook(one) for one in described["codebooks"]))
     if described["stated_errors"] is not None:
         parts.append(_stated_errors(described["stated_errors"]))
+    metadata = dict(described["metadata"] or {})
+    if TrainedOn.of(metadata) is not None:  # in words above
+        del metadata[TRAINING]
     parts += [
-        f"{title}  {json.dumps(described[key], sort_keys=True)}"
-        for key, title in (("options", "options "), ("metadata", "metadata"))
-        if described[key]
+        f"{title}  {json.dumps(value, sort_keys=True)}"
+        for title, value in (("options ", described["options"]), ("metadata", metadata))
+        if value
     ]
     return "\n\n".join(parts)
 
@@ -75,6 +79,9 @@ def _scene(described: dict[str, Any]) -> str:
         lines.append(f"extra        {extras}")
     if described["cameras"] is not None:
         lines.append(f"cameras      {described['cameras']}")
+    trained = TrainedOn.of(described["metadata"] or {})
+    if trained is not None:
+        lines.append(f"trained on   {trained}")
     return "\n".join(lines)
 
 

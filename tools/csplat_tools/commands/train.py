@@ -60,7 +60,8 @@ def train(
         int, typer.Option(metavar="N", rich_help_panel=_SPLATS, help="How many at first; 0: the strategy decides.")
     ] = _DEFAULT.initial_splats,
     background: Annotated[
-        str, typer.Option(metavar="|".join(BACKGROUNDS), rich_help_panel=_LOSS, help="Behind RGBA pictures.")
+        str,
+        typer.Option(metavar="|".join(BACKGROUNDS), rich_help_panel=_LOSS, help="auto: white behind RGBA, else black."),
     ] = _DEFAULT.background,
     antialiased: Annotated[
         bool, typer.Option("--antialiased", rich_help_panel=_LOSS, help="Train with the mip-splatting filter.")
@@ -123,6 +124,11 @@ def train(
     DATA is a NeRF-synthetic folder, an instant-ngp transforms.json or its
     folder, or a COLMAP folder with its pictures. Test pictures are held out:
     those that the data set names, or every eighth.
+
+    What is behind the splats is white where pictures have an alpha channel
+    and black where they have none. Comments in OUT.ply say that, which
+    pictures were held out, their size and the near plane, so that other
+    commands judge the scene alike; encode and decode keep it.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000

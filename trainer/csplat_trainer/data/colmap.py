@@ -67,8 +67,13 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
         raise InputError(f"{pictures}: none of the {len(registered)} pictures is there ({missing[0]}, …)")
     points_path = _file(model, "points3D")
     points, colours = read_points(points_path) if points_path is not None else (None, None)
-    train, test = _split(shots, model, folder, test_every, report)
-    return Found("COLMAP set", train, test, points, colours, report)
+    named = _named(shots, model, folder, report)
+    if named is not None:
+        return Found("COLMAP set", *named, points, colours, report)
+    train, test = split_every(shots, test_every)
+    if test:
+        report.append(f"no split is named: every {test_every}th picture is a test picture")
+    return Found("COLMAP set", train, test, points, colours, report, test_every)
 
 
 def _file(model: Path, name: str) -> Path | None:
@@ -76,9 +81,8 @@ def _file(model: Path, name: str) -> Path | None:
     return next((path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()), None)
 
 
-def _split(
-    shots: list[Shot], model: Path, folder: Path, test_every: int, report: list[str]
-) -> tuple[list[Shot], list[Shot]]:
+def _named(shots: list[Shot], model: Path, folder: Path, report: list[str]) -> tuple[list[Shot], list[Shot]] | None:
+    """The split that a test.txt names; `None` where there is none."""
     for path in (model / "test.txt", folder / "test.txt"):
         if path.is_file():
             held = {line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()}
@@ -86,10 +90,7 @@ def _split(
             test = [shot for shot in shots if shot.name in held or Path(shot.name).stem in held]
             report.append(f"{path.name} names the test pictures")
             return [shot for shot in shots if shot not in test], test
-    train, test = split_every(shots, test_every)
-    if test:
-        report.append(f"no split is named: every {test_every}th picture is a test picture")
-    return train, test
+    return None
 
 
 def _picture_folder(folder: Path, names: list[str], size: tuple[int, int] | None, images: str | None) -> Path:

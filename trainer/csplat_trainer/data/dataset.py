@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.model import UNSPECIFIED
+from csplat.training import TrainedOn
 from csplat_render.camera import DEFAULT_NEAR
 from csplat_trainer.pictures import Picture
 
@@ -18,6 +20,7 @@ __all__ = ["DataSet", "Found", "Lens", "Shot", "near_plane", "split_every"]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+_BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _NEAR = 0.03  # of the cameras' distance from what they look at
 
 
@@ -32,6 +35,10 @@ class DataSet:
         points: [P, 3] float32, points of the scene; `None` where the set has none.
         points_rgb: [P, 3] float32 in 0..1, their colours.
         report: what was found, left out and changed, a line each.
+        coordinate_system: as in `SplatModel`, where the kind of set has a custom.
+        test_every: every so-manieth picture was held out; `None` where the set names its test pictures.
+        size: what the pictures are scaled to, width and height; `None`: they are not.
+        images: the folder of pictures that was asked for; `None`: the reader chose.
     """
 
     name: str
@@ -40,6 +47,32 @@ class DataSet:
     points: F32 | None = None
     points_rgb: F32 | None = None
     report: tuple[str, ...] = ()
+    coordinate_system: str = UNSPECIFIED
+    test_every: int | None = None
+    size: tuple[int, int] | None = None
+    images: str | None = None
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """What belongs behind the splats: white if pictures have alpha, as in published tables; else black."""
+        return _WHITE if any(picture.has_alpha for picture in (*self.train, *self.test)) else _BLACK
+
+    def trained_on(self, background: tuple[float, float, float]) -> TrainedOn:
+        """What is to be said of a scene that was trained on this set.
+
+        Args:
+            background: red, green, blue behind the splats when the scene was judged.
+        """
+        return TrainedOn(background, self.test_every, self.size, self.train[0].camera.near, self.images)
+
+    def read(self) -> None:
+        """Read all pictures now, so that a damaged one is found before anything is done with the others.
+
+        Raises:
+            InputError: a file is no image, or is cut short.
+        """
+        for picture in (*self.train, *self.test):
+            _ = picture.pixels
 
 
 @dataclass(frozen=True)
@@ -103,6 +136,8 @@ class Found:
         points: [P, 3] float32 or `None`.
         points_rgb: [P, 3] float32 in 0..1 or `None`.
         report: lines for the user.
+        test_every: as in `DataSet`.
+        coordinate_system: as in `DataSet`.
     """
 
     kind: str
@@ -111,6 +146,8 @@ class Found:
     points: F32 | None = None
     points_rgb: F32 | None = None
     report: list[str] = field(default_factory=list)
+    test_every: int | None = None
+    coordinate_system: str = UNSPECIFIED
 
 
 def split_every(shots: Sequence[Shot], every: int) -> tuple[list[Shot], list[Shot]]:

@@ -1,4 +1,4 @@
-"""`load`: recognise a data set, read it, say what was found."""
+"""`load`: recognise a data set, find its pictures and cameras, say what was found."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from csplat.errors import InputError
 from csplat_render.camera import MAX_IMAGE_SIZE
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Found, near_plane
-from csplat_trainer.data.pixels import read_picture, undistorted_lens
+from csplat_trainer.data.pixels import picture_of, undistorted_lens
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["load"]
@@ -22,9 +22,8 @@ def load(
     images: str | None = None,
     test_every: int = 8,
     near: float | None = None,
-    only: str | None = None,
 ) -> DataSet:
-    """Read a data set of posed pictures.
+    """Find the posed pictures of a data set. Their pixels are read when they are asked for, or by `DataSet.read`.
 
     | recognised by | kind |
     |---|---|
@@ -39,10 +38,9 @@ def load(
             the smallest that is large enough.
         test_every: which share is held out where the set names no test pictures; 0: none.
         near: near plane of the cameras, scene units; `None`: one that suits the set.
-        only: read the pictures of one split, `train` or `test`, and leave the other empty; `None`: both.
 
     Returns:
-        All pictures, undistorted and in memory, with their cameras.
+        All pictures, undistorted, with their cameras.
 
     Raises:
         InputError: there is no data set, it is damaged, or it holds no pictures.
@@ -55,8 +53,7 @@ def load(
         raise InputError(f"{path} leaves no pictures to train on")
     shots = [*found.train, *found.test]
     near = near_plane(shots) if near is None else near
-    train = [read_picture(shot, size, near) for shot in found.train if only != "test"]
-    test = [read_picture(shot, size, near) for shot in found.test if only != "train"]
+    train, test = ([picture_of(shot, size, near) for shot in part] for part in (found.train, found.test))
     name = f"{found.kind} {path}"
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
@@ -66,7 +63,18 @@ def load(
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
         report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
-    return DataSet(name, train, test, found.points, found.points_rgb, tuple(report))
+    return DataSet(
+        name,
+        train,
+        test,
+        found.points,
+        found.points_rgb,
+        tuple(report),
+        found.coordinate_system,
+        found.test_every,
+        size,
+        images,
+    )
 
 
 def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> Found:

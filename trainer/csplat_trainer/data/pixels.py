@@ -1,7 +1,10 @@
-"""From a shot to a picture: read the file, undo the lens, change the size."""
+"""From a shot to a picture: its pixels are read when they are wanted; undo the lens, change the size."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +15,9 @@ from scipy.ndimage import map_coordinates
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_trainer.data.dataset import Lens, Shot
-from csplat_trainer.pictures import Picture
+from csplat_trainer.pictures import Picture, UnreadPixels
 
-__all__ = ["find_image", "image_size", "read_picture", "undistorted_lens"]
+__all__ = ["find_image", "image_size", "picture_of", "undistorted_lens"]
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -25,45 +28,32 @@ _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
 
 
-def read_picture(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture:
-    """Read a shot's file.
+def picture_of(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture:
+    """The picture of a shot, undistorted, RGBA where the file has transparency; its pixels are not read yet.
 
     Args:
         shot: which.
         size: width and height of the picture; `None`: the file's.
         near: the camera's near plane, scene units.
 
-    Returns:
-        The picture, undistorted, RGBA where the file has transparency.
-
     Raises:
-        InputError: the file is no image, or its lens cannot be undone.
+        InputError: the file does not begin as an image, or its lens cannot be undone.
     """
-    image = _open(shot.path)
-    lens = shot.lens.scaled(*image.size)
-    pixels: U8 = np.asarray(image)
-    if lens.distorts:
-        straight = undistorted_lens(lens)
-        pixels = _undistort(pixels, lens, straight)
-        lens = straight
-    if size is not None and size != image.size:
-        # Bicubic, as INRIA's loader; its negative lobes would push colours beyond a clipped alpha.
-        method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
-        pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
-        lens = lens.scaled(*size)
-    K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
-    height, width = pixels.shape[:2]
-    camera = Camera(K, shot.viewmat, width, height, near, shot.name)
-    return Picture(camera, np.ascontiguousarray(pixels))
+    with _opened(shot.path) as image:
+        (width, height), has_alpha = image.size, _has_alpha(image)
+    lens = shot.lens.scaled(width, height)
+    straight = undistorted_lens(lens) if lens.distorts else lens
+    read = partial(_read, shot.path, lens, straight, size)
+    width, height = size or (width, height)
+    seen = straight.scaled(width, height)
+    K = np.array([[seen.fx, 0.0, seen.cx], [0.0, seen.fy, seen.cy], [0.0, 0.0, 1.0]])
+    return Picture(Camera(K, shot.viewmat, width, height, near, shot.name), UnreadPixels(has_alpha, read))
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file; its pixels are not read."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} is not an image that can be read: {error}") from error
+    with _opened(path) as image:
+        return image.size
 
 
 def find_image(path: Path) -> Path | None:
@@ -93,14 +83,32 @@ def undistorted_lens(lens: Lens) -> Lens:
     raise InputError(f"the distortion {lens.distortion} cannot be undone over the whole picture")
 
 
-def _open(path: Path) -> Image.Image:
-    """An image in RGB or RGBA, eight bits, as it is stored: poses know nothing of EXIF rotation."""
+def _read(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> U8:
+    """Pixels of a file, straight, in the size that is wanted."""
+    with _opened(path) as image:
+        # As they are stored: poses know nothing of EXIF rotation.
+        pixels: U8 = np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"))
+    if lens.distorts:
+        pixels = _undistort(pixels, lens, straight)
+    if size is not None and size != (pixels.shape[1], pixels.shape[0]):
+        # Bicubic, as INRIA's loader; its negative lobes would push colours beyond a clipped alpha.
+        method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
+        pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
+    return np.ascontiguousarray(pixels)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image of which the head is read. What is wrong with the rest is said in the same way."""
     try:
         with Image.open(path) as image:
-            transparent = "A" in image.getbands() or "transparency" in image.info
-            return image.convert("RGBA" if transparent else "RGB")
+            yield image
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} is not an image that can be read: {error}") from error
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return "A" in image.getbands() or "transparency" in image.info
 
 
 def _border_is_inside(lens: Lens, straight: Lens) -> bool:

@@ -22,6 +22,7 @@ __all__ = ["read_blender", "read_transforms"]
 
 F64 = NDArray[np.float64]
 
+_BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _NAMED_MISSING = 5  # files that a message names, at most
 _SCALE_TOLERANCE = 1e-3
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -40,9 +41,11 @@ def read_blender(folder: Path) -> Found:
     train = _shots(folder / "transforms_train.json", report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        return Found("Blender set", train, _shots(test_path, report), report=report)
-    report.append("there is no transforms_test.json: no test pictures")
-    return Found("Blender set", train, [], report=report)
+        test = _shots(test_path, report)
+    else:
+        test = []
+        report.append("there is no transforms_test.json: no test pictures")
+    return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES)
 
 
 def read_transforms(path: Path, test_every: int) -> Found:
@@ -66,7 +69,7 @@ def read_transforms(path: Path, test_every: int) -> Found:
     train, test = split_every(shots, test_every)
     if test:
         report.append(f"no split is named: every {test_every}th picture is a test picture")
-    return Found("transforms.json set", train, test, report=report)
+    return Found("transforms.json set", train, test, report=report, test_every=test_every)
 
 
 def _shots(path: Path, report: list[str]) -> list[Shot]:
