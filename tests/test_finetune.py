@@ -25,7 +25,7 @@ from csplat_render.cameras import save_cameras
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.app import app
 from csplat_tools.commands.finetune import finetune as finetune_command
-from csplat_tools.finetune_report import PLY_SPLAT_BYTES
+from csplat_tools.finetune_report import ply_splat_bytes
 from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views
 from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin
@@ -399,7 +399,7 @@ def test_the_command_tunes_prunes_and_reports(capture, tmp_path):
     decoded = decode(out.read_bytes())
     assert (301, 300, 300) == (facts["source_splats"], facts["splats"], len(decoded))
     assert out.stat().st_size == facts["size_bytes"]
-    assert facts["ratio"] == pytest.approx(301 * PLY_SPLAT_BYTES / out.stat().st_size)
+    assert facts["ratio"] == pytest.approx(301 * ply_splat_bytes(facts["sh_degree"]) / out.stat().st_size)
     assert sum(facts["bytes_by_attribute"].values()) + facts["overhead_bytes"] == out.stat().st_size
     scores = facts["scores"]
     assert scores["source"]["psnr"] > scores["file"]["psnr"] > scores["before tuning"]["psnr"] + 1.0

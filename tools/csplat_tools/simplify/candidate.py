@@ -14,10 +14,10 @@ from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_
 from csplat.encoder.between import Between
 from csplat.encoder.grades import most_grades
 from csplat.model import SplatModel
+from csplat_render.judge import Judge
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session
-from csplat_tools.simplify.judge import Judge
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
