@@ -227,7 +227,7 @@ def test_a_file_of_a_target_psnr_is_never_larger_than_without(source, goal):
 
 def test_a_loss_against_photographs_lets_splats_go(source):
     """Photographs that the source misses by 25 dB: what may be lost is measured by renders, what was by photographs."""
-    cameras = camera_sequence(source, 24, (48, 36), seed=3)
+    cameras = camera_sequence(source, 160, (48, 36), seed=3)
     rng = np.random.default_rng(1)
     draw = renderer(source, BLACK)
     noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in cameras]

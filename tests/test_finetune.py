@@ -452,14 +452,14 @@ def test_a_scene_can_be_tuned_to_its_own_renders(capture, tmp_path):
 
 
 def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
-    save_cameras(tmp_path / "cameras.json", cameras(9))
+    save_cameras(tmp_path / "cameras.json", cameras(40))
     out = tmp_path / "s.csplat"
     result = call(
         "finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json", "-o", out,
         "--prune-unseen", "--iterations", 20, "--say-json", "-q",
     )  # fmt: skip
     facts = json.loads(result.stdout)
-    assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
+    assert (301, 300, 4) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
 
 
 def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):

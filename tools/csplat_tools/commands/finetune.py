@@ -25,6 +25,8 @@ __all__ = ["finetune"]
 _LIKE = "What the file is to look like (one of --data and --self)"
 _FILES = "Files on the way"
 _HOW = "How"
+_RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
+_MOST_ASIDE = 16  # but no more than these
 
 
 @guarded
@@ -190,7 +192,7 @@ def finetune(
         check_output(str(checkpoint), force=True, inputs=tuple(path for path in inputs if path is not None))
     find = partial(
         find_view_set, cameras=cameras, data=photographs, background=colour, count=views, size=parse_size(view_size),
-        aside=aside or (0 if data is not None else None),
+        aside=aside or _usually_aside(data, cameras, views),
     )  # fmt: skip
     files = Files(source, output, importance, source_index, log, report, checkpoint, checkpoint_every, resume, lpips)
     scene = Scene(facts, strict)
@@ -201,3 +203,10 @@ def finetune(
         say_json(found)
     elif not quiet:
         note(format_report(found))
+
+
+def _usually_aside(data: str | None, cameras: str | None, views: int) -> int | None:
+    """How many views decide which step was best: of photographs some that teach do, of few virtual views few."""
+    if data is not None:
+        return 0
+    return min(_MOST_ASIDE, views // _RENDERS_ASIDE) if cameras is None else None
