@@ -357,9 +357,9 @@ def test_a_camera_file_decides(shell, tmp_path):
     from csplat_render.cameras import save_cameras
 
     path = tmp_path / "cameras.json"
-    save_cameras(path, cameras(9))
+    save_cameras(path, cameras(40))
     distil = reducing(distil_sh=True, sh_degree=0, cameras=str(path)).encoder(quiet=True)
-    assert 8 == stored(shell, distil(shell, EncodeOptions(sh_degree=0), None).result).options["reduced"]["views"]
+    assert 26 == stored(shell, distil(shell, EncodeOptions(sh_degree=0), None).result).options["reduced"]["views"]
 
 
 @pytest.mark.parametrize(
