@@ -10,6 +10,7 @@ from csplat import write_ply
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.cameras import intrinsics, look_at
+from csplat_tools.views import BLACK, ViewSet, with_deciders
 
 W, H = 48, 40
 
@@ -17,6 +18,11 @@ W, H = 48, 40
 def cameras(count):
     K, angles = intrinsics(W, H, 60.0), np.linspace(0.2, 5.9, count)
     return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1), K, W, H) for a in angles]
+
+
+def views_of(seen_from, photographs=()):
+    """Views of which every eighth decides and the others teach; none judges."""
+    return with_deciders(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
 
 
 def shell(coefficients):

@@ -226,8 +226,8 @@ def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResul
 @cache
 def judge(name: str, size: tuple[int, int] = (640, 480)):
     """Who compares pictures with those of a condition, from the cameras of `psnr`."""
+    from csplat_render.judge import Judge
     from csplat_render.virtual import virtual_cameras
-    from csplat_tools.simplify.judge import Judge
 
     model = scene(name)[0]
     return Judge.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))

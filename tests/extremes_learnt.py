@@ -12,10 +12,10 @@ from extremes import COUNT, DRAWN, NAMES, judge, scene
 
 from csplat import EncodeOptions, SplatModel, decode
 from csplat.encoder import Draft, Frozen
+from csplat_render.judge import Judge, Look
 from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.simplify import Simplified, SimplifyOptions, Target, simplify
-from csplat_tools.simplify.judge import Judge
 from csplat_trainer.data import DataSet
 from csplat_trainer.finetune import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
 from csplat_trainer.loop import train
@@ -75,7 +75,9 @@ def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
     source = learnt_from(name)
     views = split_views(renders_of(source, virtual_cameras(source, 52, 48, 36), BLACK, None), BLACK, aside=4)
     frozen = Draft.of(source, COARSE).frozen()
-    aside = Judge([view.camera for view in views.validation], [view.wanted for view in views.validation])
+    aside = Judge(
+        [view.camera for view in views.validation], [Look(view.wanted.astype(np.float32)) for view in views.validation]
+    )
     return frozen, finetune(frozen, views, SHORT), aside
 
 

@@ -392,9 +392,10 @@ def find(name: str) -> Report:
 
 
 def psnr(source: csplat.SplatModel, decoded: csplat.SplatModel) -> float:
-    from csplat_tools.compare import compare_models
+    from csplat_render.judge import Judge
+    from csplat_tools.views import comparison_cameras
 
-    return compare_models(source, decoded, ssim=False).psnr
+    return Judge.of_source(source, comparison_cameras(source)).psnr(decoded)
 
 
 def main(arguments: list[str]) -> None:

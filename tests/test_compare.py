@@ -12,8 +12,8 @@ from csplat.encoder import encode_with_report
 from csplat.errors import InputError
 from csplat_tools.app import app
 from csplat_tools.attributes import attribute_errors
-from csplat_tools.compare import compare_models, comparison_cameras, render_source
 from csplat_tools.models import LoadedModel, load_model
+from csplat_tools.views import comparison_cameras
 
 
 @pytest.fixture
@@ -48,6 +48,12 @@ def camera_file(cameras, tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([camera.to_json() for camera in cameras]))
     return path
+
+
+def compare_models(source, other, cameras, **words):
+    from csplat_render.judge import Judge
+
+    return Judge.of_source(source, cameras).scores(other, **words)
 
 
 def loaded(model):
@@ -137,8 +143,8 @@ def test_psnr_is_that_of_the_clipped_error_pooled_over_everything(scene, cameras
     assert compared.psnr_mean == pytest.approx(np.mean(own), abs=1e-6)
     assert compared.psnr_worst == pytest.approx(min(own), abs=1e-6)
     assert compared.worst_view == int(np.argmin(own))
-    assert 99.0 == compared.views[2].psnr
-    assert 0.0 == compared.views[2].cover
+    assert 99.0 == compared.each[2].psnr
+    assert 0.0 == compared.each[2].cover
 
 
 def test_an_error_scores_lower_on_the_covered_pixels(scene, cameras):
@@ -146,12 +152,26 @@ def test_an_error_scores_lower_on_the_covered_pixels(scene, cameras):
     assert compared.psnr_covered < compared.psnr
 
 
-def test_pictures_of_the_source_serve_for_many_comparisons(scene, cameras):
-    views = list(render_source(scene, cameras))
-    other = decode(encode(scene, EncodeOptions(preset="small")))
-    again, first = (compare_models(scene, other, **words) for words in ({"source_views": views}, {"cameras": cameras}))
-    assert first.psnr == again.psnr
-    assert first.views == again.views
+def test_a_judge_serves_for_many_and_says_of_some_views_what_all_say_of_them(scene, cameras):
+    from csplat_render.judge import Judge
+
+    judge, other = Judge.of_source(scene, cameras), decode(encode(scene, EncodeOptions(preset="small")))
+    errors, scores = judge.errors(other), judge.scores(other)
+    assert [one.mse for one in scores.each] == pytest.approx(errors.tolist(), rel=1e-12)
+    assert judge.psnr(other) == pytest.approx(scores.psnr, rel=1e-12)
+    assert judge.some([0, 2]).errors(other).tolist() == [errors[0], errors[2]]
+    assert judge.some([1]).psnr(other) == pytest.approx(scores.each[1].psnr)
+
+
+def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras, monkeypatch):
+    from csplat_render import judge
+
+    other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
+    kept = judge.Judge.of_source(scene, cameras).scores(other)
+    monkeypatch.setattr(judge, "_KEPT_BYTES", 0)
+    again = judge.Judge.of_source(scene, cameras)
+    assert not any(isinstance(look, judge.Look) for look in again.looks)
+    assert kept == again.scores(other)
 
 
 def test_another_origin_changes_nothing(scene, cameras):

@@ -9,18 +9,21 @@ from typer.testing import CliRunner
 
 pytest.importorskip("numba", reason="simplification wants the extra [render]")
 
+from captures import views_of
+
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import decode_scene
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_render.judge import Judge, renderer
 from csplat_tools.app import app
 from csplat_tools.proof import prove
 from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
-from csplat_tools.simplify.judge import Judge, render_pictures
 from csplat_tools.simplify.order import Order
 from csplat_tools.simplify.sizing import first_count, next_count
-from csplat_tools.simplify.views import camera_sequence
+from csplat_tools.views import BLACK, camera_sequence
+from csplat_trainer.pictures import Picture
 
 SMALL = SimplifyOptions(views=16, view_size=(48, 36), steps=4, rounds=2)
 
@@ -161,7 +164,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(source):
     options = replace(SMALL, views=160, bands=False, steps=8)
     judge = Judge.of_source(scene, camera_sequence(scene, 60, (64, 48), seed=9), (0, 0, 0))
     own = camera_sequence(scene, 160, (48, 36), seed=1)
-    fitted = encode_simplified(scene, own, target=Target(keep=1.0), encoding=coarse, options=options)
+    fitted = encode_simplified(scene, views_of(own), target=Target(keep=1.0), encoding=coarse, options=options)
     plain = judge.psnr(decode(encode(scene, coarse)))
     assert judge.psnr(decode(fitted.result.data)) > plain + 0.3
 
@@ -169,7 +172,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(source):
 @pytest.mark.parametrize("goal", [30.0, 38.0])
 def test_a_file_of_a_target_psnr_is_never_larger_than_without(source, goal):
     cameras = camera_sequence(source, 24, (48, 36), seed=3)
-    file = encode_simplified(source, cameras, target=Target(psnr=goal), options=SMALL)
+    file = encode_simplified(source, views_of(cameras), target=Target(psnr=goal), options=SMALL)
     assert file.report["psnr"] >= goal
     sizes = [one["size_bytes"] for one in file.report["tried"]]
     assert len(file.result.data) == min(sizes)
@@ -178,13 +181,14 @@ def test_a_file_of_a_target_psnr_is_never_larger_than_without(source, goal):
 
 def test_a_loss_against_photographs_lets_splats_go(source):
     """Photographs that the source misses by 25 dB: what may be lost is measured by renders, what was by photographs."""
-    cameras = camera_sequence(source, 24, (48, 36), seed=3)
+    cameras = camera_sequence(source, 160, (48, 36), seed=3)
     rng = np.random.default_rng(1)
-    photographs = [np.clip(p + 0.06 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
-    judge = Judge(cameras, photographs)
-    file = encode_simplified(
-        source, cameras, target=Target(max_loss=0.5), options=SMALL, photographs=(cameras, photographs)
-    )
+    draw = renderer(source, BLACK)
+    noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in cameras]
+    pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
+    views = views_of(cameras, pictures)
+    judge = views.photograph_decider()
+    file = encode_simplified(source, views, target=Target(max_loss=0.5), options=SMALL)
     assert judge.psnr(source) < 28.0
     assert judge.psnr(decode(file.result.data)) >= judge.psnr(source) - 0.5
     assert file.report["splats"] < 400
@@ -192,10 +196,9 @@ def test_a_loss_against_photographs_lets_splats_go(source):
 
 
 def test_a_psnr_that_no_file_has_is_refused(source):
+    views = views_of(camera_sequence(source, 6, (48, 36)))
     with pytest.raises(InputError, match="no file reaches"):
-        encode_simplified(
-            source, camera_sequence(source, 6, (48, 36)), target=Target(psnr=99.0), options=replace(SMALL, steps=1)
-        )
+        encode_simplified(source, views, target=Target(psnr=99.0), options=replace(SMALL, steps=1))
 
 
 def test_bytes_do_not_depend_on_threads(source):

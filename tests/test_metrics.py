@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("numba", reason="SSIM wants the extra [render]")
 
 from csplat.errors import InputError
-from csplat_render.metrics import PSNR_CAP, Scorer, psnr, ssim
+from csplat_render.metrics import PSNR_CAP, Scores, psnr, score_view, ssim
 
 
 def pictures(seed=0, height=30, width=41, noise=0.1):
@@ -63,38 +63,34 @@ def test_ssim_of_a_picture_smaller_than_the_window():
 
 
 def test_the_error_is_pooled_and_the_mean_stands_beside_it():
-    scorer = Scorer()
     zero = np.zeros((4, 4, 3))
-    each = [scorer.add(zero, zero + 0.1), scorer.add(zero, zero + 0.01)]
-    scores = scorer.scores()
-    assert np.allclose([20.0, 40.0], each)
+    scores = Scores.of([score_view(zero, zero + 0.1), score_view(zero, zero + 0.01)])
+    assert np.allclose([20.0, 40.0], [one.psnr for one in scores.each])
     assert math.isclose(30.0, scores.psnr_mean)
     assert math.isclose(-10.0 * math.log10((0.01 + 0.0001) / 2.0), scores.psnr)
-    assert (0, 2) == (scores.worst_view, scores.views)
+    assert (0, 2) == (scores.worst_view, scores.as_json()["views"])
     assert math.isclose(20.0, scores.psnr_worst)
     assert scores.cover is None
     assert scores.psnr_covered is None
+    assert scores.lpips is None
 
 
 def test_views_of_different_sizes_weigh_by_their_pixels():
-    scorer = Scorer()
-    scorer.add(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))
-    scorer.add(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
-    assert math.isclose(-10.0 * math.log10(0.01 * 3 / 4), scorer.scores().psnr)
+    wide = score_view(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))
+    one = score_view(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
+    assert math.isclose(-10.0 * math.log10(0.01 * 3 / 4), Scores.of([wide, one]).psnr)
 
 
 def test_an_empty_background_inflates_psnr_by_what_covered_pixels_tell():
     reference, image = np.ones((10, 10, 3)), np.ones((10, 10, 3))
     reference[:5], image[:5] = 0.5, 0.6
-    alpha = np.zeros((10, 10))
-    alpha[:5] = 1.0
-    scorer = Scorer()
-    scorer.add(reference, image, alpha)
-    scores = scorer.scores()
+    covered = np.zeros((10, 10), bool)
+    covered[:5] = True
+    scores = Scores.of([score_view(reference, image, covered)])
     assert math.isclose(0.5, scores.cover)
     assert math.isclose(20.0, scores.psnr_covered)
     assert math.isclose(20.0 + 10.0 * math.log10(2.0), scores.psnr)
-    assert {"psnr", "psnr_mean", "psnr_worst", "ssim", "cover"} <= scores.to_json().keys()
+    assert {"psnr", "psnr_mean", "psnr_worst", "ssim", "cover"} <= scores.as_json().keys()
 
 
 def test_refuses_what_cannot_be_compared():
@@ -103,6 +99,6 @@ def test_refuses_what_cannot_be_compared():
         with pytest.raises(InputError):
             psnr(reference, image)
     with pytest.raises(InputError, match="no pictures"):
-        Scorer().scores()
-    with pytest.raises(InputError, match="alpha"):
-        Scorer().add(a, b, np.zeros((2, 2)))
+        Scores.of([])
+    with pytest.raises(InputError, match="cover"):
+        score_view(a, b, np.zeros((2, 2), bool))

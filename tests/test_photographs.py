@@ -18,9 +18,10 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 
 # Importing them needs what is looked for above.
 from csplat_render import render  # noqa: E402
-from csplat_render.cameras import intrinsics, look_at  # noqa: E402
+from csplat_render.cameras import intrinsics, look_at, relative_to  # noqa: E402
 from csplat_tools.compare_files import compare_files  # noqa: E402
-from csplat_tools.photographs import DataViews, relative_to, show_photograph  # noqa: E402
+from csplat_tools.views import DataOptions  # noqa: E402
+from csplat_trainer.evaluate import photograph_judge  # noqa: E402
 from csplat_trainer.pictures import Picture  # noqa: E402
 
 W, H = 64, 48
@@ -97,15 +98,15 @@ def test_training_pictures_are_the_others(scene, files, tmp_path):
     assert 6 == result["photographs"]["a"]["views"]
 
 
-def test_white_is_behind_pictures_with_alpha(scene, files, tmp_path):
+def test_a_colour_is_behind_pictures_with_alpha_and_behind_the_scene(scene, files, tmp_path):
     data = write_set(tmp_path / "object", scene, alpha=True)
     result = json.loads(call("compare", *files, "--data", data, "--json"))
-    assert [1.0, 1.0, 1.0] == result["background"]
+    assert [0.0, 0.0, 0.0] == result["background"]
     assert result["photographs"]["a"]["psnr"] > 45.0
     assert result["photographs"]["a"]["psnr_covered"] is not None
-    black = json.loads(call("compare", *files, "--data", data, "--background", "black", "--json"))
-    assert [0.0, 0.0, 0.0] == black["background"]
-    assert black["photographs"]["a"]["psnr"] > 45.0
+    white = json.loads(call("compare", *files, "--data", data, "--background", "white", "--json"))
+    assert [1.0, 1.0, 1.0] == white["background"]
+    assert white["photographs"]["a"]["psnr"] > 45.0
 
 
 def test_cameras_are_brought_to_the_origin_of_the_scene(scene, tmp_path):
@@ -146,19 +147,11 @@ def test_renders_have_the_names_and_sizes_of_the_photographs(scene, files, tmp_p
         assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
 
 
-def test_only_the_split_that_is_wanted_is_read(scene, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
-    path = data / "images" / "view3.png"
-    path.write_bytes(path.read_bytes()[:200])  # the head is whole
-    assert all(np.any(picture.pixels) for picture in DataViews(str(data)).read())
-    with pytest.raises(InputError, match=r"view3\.png"):
-        DataViews(str(data), split="train").read()[2].pixels.any()
-
-
 def test_a_set_without_test_pictures_is_refused(scene, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
+    write_ply(tmp_path / "a.ply", scene)
     with pytest.raises(InputError, match="has no test pictures"):
-        DataViews(str(data), test_every=0).read()
+        compare_files(*[str(tmp_path / "a.ply")] * 2, data=DataOptions(str(data), test_every=0))
 
 
 def test_cameras_and_data_exclude_each_other(files, tmp_path):
@@ -167,14 +160,16 @@ def test_cameras_and_data_exclude_each_other(files, tmp_path):
     assert 2 == invoke("compare", *files, "--size", "32x24").exit_code
     assert 2 == invoke("compare", *files, "--data", tmp_path, "--split", "val").exit_code
     with pytest.raises(InputError, match="not both"):
-        compare_files(str(files[0]), str(files[1]), cameras="x.json", data=DataViews(str(tmp_path)))
+        compare_files(str(files[0]), str(files[1]), cameras="x.json", data=DataOptions(str(tmp_path)))
 
 
 def test_a_photograph_is_shown_in_front_of_the_background():
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = (255, 0, 0, 51)
     picture = Picture(replace(cameras(1)[0], W=2, H=1), pixels)
-    shown = show_photograph(picture, (0.0, 1.0, 1.0))
+    look = photograph_judge([picture], (0.0, 1.0, 1.0)).look(0)
+    shown = look.picture
+    assert [[False, False]] == look.covered.tolist()
     assert np.float32 == shown.dtype
     assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
 

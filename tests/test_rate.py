@@ -24,10 +24,11 @@ from captures import cameras, shell
 
 from csplat.encoder.measure import measure_errors
 from csplat_render.cameras import intrinsics, look_at
+from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.compare import compare_models
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.trials import spread_of
+from csplat_tools.views import comparison_cameras
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +179,7 @@ def test_a_knob_and_its_bound_contradict_each_other(scene):
 def test_a_psnr_is_reached_and_hardly_exceeded(sample_path):
     source = read_ply(sample_path)
     found = encode_to_target(source, RateTarget(psnr=38.0), prune=False)
-    psnr = compare_models(source, decode(found.result.data), ssim=False).psnr
+    psnr = Judge.of_source(source, comparison_cameras(source)).psnr(decode(found.result.data))
     assert 38.0 <= psnr <= 38.3
     assert found.report["psnr"] == pytest.approx(psnr, abs=1e-4)
     assert found.report["size_bytes"] == len(found.result.data)
@@ -289,7 +290,7 @@ def test_of_surroundings_all_splats_stay_unless_asked(crowded):
 def test_extreme_scenes_meet_a_psnr(name):
     source = extremes.scene(name)[0]
     found = encode_to_target(source, RateTarget(psnr=17.0), views=24)
-    assert compare_models(source, decode(found.result.data), ssim=False).psnr >= 17.0
+    assert Judge.of_source(source, comparison_cameras(source)).psnr(decode(found.result.data)) >= 17.0
     assert len(decode(found.result.data)) >= 1
 
 

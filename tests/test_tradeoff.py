@@ -32,7 +32,7 @@ from csplat_tools.tradeoff.page import make_page, shown_points
 from csplat_tools.tradeoff.plots import PLOTS, draw_plot
 from csplat_tools.tradeoff.points import Failure, pareto_front
 from csplat_tools.tradeoff.running import measure_tradeoff
-from csplat_tools.tradeoff.setting import Inputs, read_setting
+from csplat_tools.tradeoff.setting import read_setting
 from csplat_tools.tradeoff.tables import format_tradeoff
 
 POINT = {
@@ -71,7 +71,7 @@ def swept(capture, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def setting(capture):
-    return read_setting(Inputs(str(capture / "scene.ply"), cameras=str(capture / "cameras.json")), deciding=False)
+    return read_setting(str(capture / "scene.ply"), cameras=str(capture / "cameras.json"))
 
 
 @pytest.fixture(scope="module")

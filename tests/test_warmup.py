@@ -39,12 +39,13 @@ _COMPARE = """
 warm_up(gradients=False, ssim=True, lpips=True)
 from csplat_render.convolving import convolve
 from csplat_render.lpips import SCALE
-from csplat_tools.compare import compare_models
+from csplat_render.judge import Judge
+from csplat_tools.views import comparison_cameras
 before = compiled()
 def lpips(a, b):
     kernel = np.full((11, 11, 3, 64), 0.1, np.float32)
     return float(convolve((a - b) / SCALE, kernel, np.zeros(64, np.float32), 4, 2).mean())
-compare_models(model, model.select(np.arange(30)), lpips=lpips)
+Judge.of_source(model, comparison_cameras(model)).scores(model.select(np.arange(30)), lpips=lpips)
 """
 _TELL = "print(json.dumps([before, compiled()]))"
 

@@ -83,12 +83,11 @@ def _main(bench: Bench, kept: Kept) -> dict[str, Any]:
 
 def facts_of(bench: Bench, training: dict[str, Any]) -> dict[str, Any]:
     """What tables say of the scene itself, and of its training."""
-    assert bench.looks.data is not None
     return {
         "splats": len(bench.source),
         "sh_degree": bench.source.sh_degree,
-        "train_views": len(bench.looks.data.train),
-        "test_views": len(bench.looks.data.test),
+        "train_views": len(bench.looks.teaches),
+        "test_views": len(bench.looks.judges),
         "scores": bench.judge({"source": bench.source})["source"],
         "training": training,
     }
@@ -100,4 +99,4 @@ def warm(bench: Bench) -> None:
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
     frozen = Draft.of(some, options, graded=False).frozen()
     finetune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
-    measure_sensitivity(some, bench.looks.cameras[:1], metric=True)
+    measure_sensitivity(some, bench.looks.teaches[:1], metric=True)

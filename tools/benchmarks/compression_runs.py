@@ -19,14 +19,15 @@ from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Held, Imp
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat_render.judge import renderer
 from csplat_render.lpips import Lpips
-from csplat_render.rasterise import Rasteriser
 from csplat_render.removal import measure_removal
-from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
+from csplat_tools.finetune_report import judge_models
+from csplat_tools.finetune_sources import Chosen, choose_splats, training_views
 from csplat_tools.finetuning import Clock
 from csplat_tools.importances import measure_views
 from csplat_tools.layout import describe
-from csplat_tools.photographs import show_photograph
+from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.finetune import FinetuneOptions, Views, finetune
 from csplat_trainer.report import save_picture, side_by_side
 from csplat_trainer.sensitivity import Sensitivity
@@ -85,8 +86,8 @@ class Bench:
     ) -> None:
         self.scene, self.encoding, self.tuning, self._lpips = scene, encoding, tuning, lpips
         self.source = read_ply(ply)
-        self._sources = Sources(str(scene.data), scene.size, background=scene.background)
-        self.looks = Looks.read(self.source, self._sources, quiet=True)
+        data = DataOptions(str(scene.data), scene.size)
+        self.looks = find_view_set(self.source, data=data, background=scene.background, aside=0)
         if self.looks.data is None or not self.looks.data.test:
             raise InputError(f"{scene.data} holds out no photographs to judge by")
         self._picks: dict[tuple[float | None, bool], Pick] = {}
@@ -99,13 +100,13 @@ class Bench:
     @cached_property
     def views(self) -> Views:
         """What teaches, and what judges on the way."""
-        return self.looks.views(self.source, self._sources, self.threads)
+        return training_views(self.source, self.looks, self.threads)
 
     @cached_property
     def sensitivity(self) -> Sensitivity:
         """Of the whole source, measured from the training views."""
         return measure_views(
-            self.source, self.looks.cameras, self.looks.background, matrices=True, threads=self.threads
+            self.source, self.looks.teaches, self.looks.background, matrices=True, threads=self.threads
         )
 
     def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
@@ -120,15 +121,15 @@ class Bench:
         return self._picks[keep, told]
 
     def _pick(self, keep: float | None, *, told: bool) -> Pick:
-        clock, sources = Clock(), replace(self._sources, keep=keep)
+        clock = Clock()
         with clock.stage("choosing"):
-            chosen = choose_splats(self.source, self.looks, sources, None, self.threads)
+            chosen = choose_splats(self.source, self.looks, keep=keep, threads=self.threads)
         if told:
             return chosen, clock.seconds
         clock = Clock()  # it would not have measured what it is not told
         with clock.stage("choosing"):
             removal = measure_removal(
-                chosen.model, self.looks.cameras, background=self.looks.background, threads=self.threads
+                chosen.model, self.looks.teaches, background=self.looks.background, threads=self.threads
             )
         return replace(chosen, importance=removal.squared_weight), clock.seconds
 
@@ -189,21 +190,18 @@ class Bench:
 
     def judge(self, models: Mapping[str, SplatModel]) -> Scores:
         """Scores on the held-out photographs, by name."""
-        judged = self.looks.judge(self.source, dict(models), self._lpips, self.threads)
+        judged = judge_models(self.source, models, self.looks, self._lpips, self.threads)
         assert judged is not None
         return {name: dict(one) for name, one in judged.scores.items()}
 
     def picture(self, tuned: Tuned, path: Path) -> None:
         """The middle one of the held-out photographs, beside source, file before tuning, and file."""
-        assert self.looks.data is not None
-        test = self.looks.data.test
-        one, rasteriser = test[len(test) // 2], Rasteriser(gradients=False, threads=self.threads)
-        panels = [show_photograph(one, self.looks.background)]
+        judge = self.looks.photograph_judge(threads=self.threads)
+        middle = len(judge.cameras) // 2
+        panels = [judge.look(middle).picture]
         for model in (self.source, decode(tuned.plain.data), decode(tuned.result.data)):
-            seen = rasteriser.forward(
-                model, one.camera, background=self.looks.background, antialiased=model.antialiased
-            )
-            panels.append(seen.rgb.copy())
+            draw = renderer(model, self.looks.background, threads=self.threads)
+            panels.append(draw(judge.cameras[middle]).rgb)
         save_picture(path, side_by_side(*panels))
 
 

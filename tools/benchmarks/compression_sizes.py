@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen, Held
-from csplat_tools.finetune_report import PLY_SPLAT_BYTES
+from csplat_tools.finetune_report import ply_splat_bytes
 from csplat_trainer.finetune.rate import colour_integers_of
 
 __all__ = ["Book", "books_of", "coded_colour_bytes", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]
@@ -43,7 +43,7 @@ def books_of(frozen: Frozen) -> tuple[Book | None, Book | None]:
 
 def ply_bytes(splats: int) -> int:
     """A PLY with the 62 float columns of the INRIA trainer."""
-    return splats * PLY_SPLAT_BYTES
+    return splats * ply_splat_bytes(3)
 
 
 def float_bytes(splats: int, coefficients: int, colours: Book | None, shapes: Book | None) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 from printing import laid_out
 
 from csplat.files import atomic_writer
-from csplat_tools.finetune_report import PLY_SPLAT_BYTES
+from csplat_tools.finetune_report import ply_splat_bytes
 
 __all__ = ["plot_curve", "tables"]
 
@@ -146,9 +146,9 @@ def _control(one: dict[str, Any], facts: dict[str, Any], *, markdown: bool) -> s
     found, scores = one["control"]["main"], one["control"]["main"]["scores"]
     steps = f"{found['steps']} steps on floats"
     lines = [
-        ("source", *_sizes(facts["splats"] * PLY_SPLAT_BYTES, facts), *_scores(scores["source"]), ""),
+        ("source", *_sizes(facts["splats"] * ply_splat_bytes(3), facts), *_scores(scores["source"]), ""),
         (
-            steps, *_sizes(found["splats"] * PLY_SPLAT_BYTES, facts), *_scores(scores["trained on"]),
+            steps, *_sizes(found["splats"] * ply_splat_bytes(3), facts), *_scores(scores["trained on"]),
             f"{found['seconds']:.1f}",
         ),
         (f"{steps}, then a file", *_sizes(found["size_bytes"], facts), *_scores(scores["then a file"]), ""),
@@ -282,7 +282,7 @@ def _lines_of(key: str) -> tuple[str, ...]:
 def _sizes(size_bytes: int, facts: dict[str, Any]) -> tuple[str, str]:
     """Bytes per source splat, and how many times smaller than the PLY of 62 floats."""
     splats = facts["splats"]
-    return f"{size_bytes / splats:.2f}", f"{splats * PLY_SPLAT_BYTES / size_bytes:.1f}"
+    return f"{size_bytes / splats:.2f}", f"{splats * ply_splat_bytes(3) / size_bytes:.1f}"
 
 
 def _scores(one: dict[str, Any]) -> list[str]:

@@ -22,9 +22,9 @@ from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_render.camera import Camera
+from csplat_render.cameras import relative_to
 from csplat_render.lpips import Lpips
 from csplat_render.rasterise import Rasteriser
-from csplat_tools.photographs import relative_to
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.evaluate import evaluate
 from csplat_trainer.loop import train

@@ -39,12 +39,12 @@ from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
+from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.extras import need_renderer
 from csplat_tools.importances import measured_importance
 from csplat_tools.rate.grading import measuring_views
 from csplat_tools.simplify import SimplifyOptions
-from csplat_tools.simplify.judge import Judge
 
 __all__ = ["Kept", "main"]
 

@@ -13,10 +13,10 @@ from distortion_curves import Point, Series, bracket, rate_at
 
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
+from csplat_render.judge import Judge
 from csplat_tools.simplify import SimplifyOptions
 from csplat_tools.simplify.candidate import Candidate
 from csplat_tools.simplify.core import Session, most_gone, prepare
-from csplat_tools.simplify.judge import Judge
 
 __all__ = ["Shrinker"]
 

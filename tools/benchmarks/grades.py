@@ -28,12 +28,12 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera
 from csplat_render.cameras import load_cameras
+from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
-from csplat_tools.compare import BLACK
 from csplat_tools.importances import measured_importance
 from csplat_tools.models import without_bands
 from csplat_tools.rate.grading import measuring_views
-from csplat_tools.simplify.judge import Judge
+from csplat_tools.views import BLACK
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
 _EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files without grades

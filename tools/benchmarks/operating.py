@@ -26,12 +26,12 @@ from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_tools.compare import BLACK, comparison_cameras
+from csplat_render.judge import Judge
 from csplat_tools.models import without_bands
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.targets import RateTarget
-from csplat_tools.simplify.judge import Judge
 from csplat_tools.tradeoff.fetching import fetched_bytes
+from csplat_tools.views import BLACK, comparison_cameras
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k,statue"
 #: Name, options of `csplat encode`; the target, and whether all splats stay.

@@ -29,8 +29,9 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
-from csplat_tools.compare import SourceView, compare_models, render_source
+from csplat_render.judge import Judge
 from csplat_tools.extras import need_renderer
+from csplat_tools.views import comparison_cameras
 
 __all__ = ["decoded_presets"]
 
@@ -80,14 +81,14 @@ def _arguments() -> argparse.Namespace:
 def _measure(scene: Scene, presets: Sequence[str], command: list[str] | None, cache: Path) -> dict[str, Any]:
     source = read_ply(scene.path)
     path = DATA / "psnr_cameras" / f"{scene.name}.json"
-    views = list(render_source(source, load_cameras(path) if path.exists() else None))
-    columns = {name: _quality(source, other, views, size) for name, other, size in decoded_presets(source, presets)}
+    judge = Judge.of_source(source, load_cameras(path) if path.exists() else comparison_cameras(source))
+    columns = {name: _quality(source, other, judge, size) for name, other, size in decoded_presets(source, presets)}
     if command is not None:
         peer, back = spz_and_back(command, scene, cache)
         if peer.size_bytes is None:
             columns["SPZ"] = {"remark": peer.remark}
         else:
-            columns["SPZ"] = _quality(source, read_ply(back), views, peer.size_bytes)
+            columns["SPZ"] = _quality(source, read_ply(back), judge, peer.size_bytes)
     return {
         "name": scene.name,
         "splats": len(source),
@@ -104,8 +105,8 @@ def decoded_presets(source: SplatModel, presets: Sequence[str]) -> Iterator[tupl
         yield preset, decode(data), len(data)
 
 
-def _quality(source: SplatModel, other: SplatModel, views: list[SourceView], size_bytes: int) -> dict[str, Any]:
-    compared = compare_models(source, other, source_views=views).as_json()
+def _quality(source: SplatModel, other: SplatModel, judge: Judge, size_bytes: int) -> dict[str, Any]:
+    compared = judge.scores(other).as_json()
     return {"size_bytes": size_bytes, "bytes_per_splat": size_bytes / len(source), **compared}
 
 

@@ -28,10 +28,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
-from csplat_tools.compare import BLACK, comparison_cameras
+from csplat_render.judge import Judge
 from csplat_tools.rate.control import encode_to_target
 from csplat_tools.rate.targets import RateTarget
-from csplat_tools.simplify.judge import Judge
+from csplat_tools.views import BLACK, comparison_cameras
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k"
 _SIZES = "4,8"

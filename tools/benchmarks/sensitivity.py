@@ -30,9 +30,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
-from csplat_tools.compare import SourceView, compare_models, render_source
+from csplat_render.judge import Judge
 from csplat_tools.extras import need_renderer
-from csplat_tools.importances import Measured, Wanted, measure_scene
+from csplat_tools.importances import Measured, measure_scene
+from csplat_tools.views import BLACK, DataOptions, comparison_cameras, find_view_set
 from csplat_trainer.sensitivity_file import read_sensitivity
 
 _SHARES = (0.0, 0.02, 0.05, 0.1, 0.3)
@@ -56,13 +57,15 @@ def main() -> None:
     for scene in scenes:
         source = read_ply(scene.path)
         start = time.perf_counter()
-        wanted = Wanted(None, args.data, (240, 180), args.views, (0.0, 0.0, 0.0), True, 0, args.threads)
-        measured = measure_scene(source, wanted)
+        data = None if args.data is None else DataOptions(args.data)
+        aside = None if data is None else 0
+        views = find_view_set(source, data=data, background=BLACK, count=args.views, aside=aside)
+        measured = measure_scene(source, views, threads=args.threads)
         seconds = time.perf_counter() - start
         path = DATA / "psnr_cameras" / f"{scene.name}.json"
-        views = list(render_source(source, load_cameras(path) if path.exists() else None))
+        judge = Judge.of_source(source, load_cameras(path) if path.exists() else comparison_cameras(source))
         rows = [
-            _row(name, source, options, importance, views) for name, options, importance in _variants(measured, args)
+            _row(name, source, options, importance, judge) for name, options, importance in _variants(measured, args)
         ]
         facts = {"name": scene.name, "seconds": seconds, **measured.as_json(), "rows": rows}
         results.append(facts)
@@ -117,7 +120,7 @@ def _row(
     source: SplatModel,
     options: EncodeOptions,
     importance: Importance | None,
-    views: list[SourceView],
+    judge: Judge,
 ) -> dict[str, Any]:
     start = time.perf_counter()
     result = encode_with_report(source, options, importance=importance)
@@ -125,7 +128,7 @@ def _row(
     decoded, place = decode(result.data), np.argsort(result.source_index)
 
     def psnr(other: SplatModel) -> float:
-        return float(compare_models(source, other, source_views=views, ssim=False).as_json()["psnr"])
+        return judge.psnr(other)
 
     shN = np.zeros_like(source.shN)
     shN[:, : decoded.shN.shape[1]] = decoded.shN[place]

@@ -16,7 +16,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,7 @@ from csplat.ply import read_ply
 from csplat_render import Camera
 from csplat_render.cameras import direction, intrinsics, load_cameras, look_at
 from csplat_render.conventions import TRANSMITTANCE_MIN
+from csplat_render.judge import Judge, Look, renderer
 from csplat_render.rasterise import Rasteriser
 from csplat_render.refit import ColourOperator
 from csplat_render.removal import measure_removal, removal_exact
@@ -40,9 +41,9 @@ from csplat_render.virtual import FIELD_OF_VIEW, scene_frame, virtual_cameras
 from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import prepare
-from csplat_tools.simplify.judge import Judge, render_pictures
 from csplat_tools.simplify.order import removal_order
-from csplat_tools.simplify.views import VIEW_SIZE, Views, camera_sequence, find_views
+from csplat_tools.simplify.views import Measured, find_views
+from csplat_tools.views import BLACK, VIEW_SIZE, ViewSet, camera_sequence, find_view_set, with_deciders
 
 _SCENES = "plane3,lego60k,fox120k,fox60k_noreg,donut,jacket,statue"
 _METHODS = ("opacity", "opacity-area", "exact", "rounds")
@@ -123,6 +124,11 @@ def _removal(name: str, path: Path, args: argparse.Namespace) -> None:
             kept.measure("removal", f"{percent} far", lambda p=percent: far.one(p, "rounds"))
 
 
+def _rendered(source: SplatModel, cameras: Sequence[Camera]) -> list[Any]:
+    draw = renderer(source, BLACK)
+    return [draw(camera).rgb for camera in cameras]
+
+
 def _far_cameras(source: SplatModel) -> tuple[list[Camera], list[Camera]]:
     """Cameras that see a scene small, twice as far away as those of `psnr`: 46 to decide by, 8 to judge by.
 
@@ -148,13 +154,15 @@ class _Bench:
         self._source, self._judge, self._options, self._cameras = source, judge, options, cameras
 
     @cached_property
-    def _views(self) -> Views:
-        size = VIEW_SIZE if self._cameras is None else (480, 360)
-        return find_views(self._source, self._cameras, 0.5, size=size, most=self._options.views)
+    def _views(self) -> Measured:
+        if self._cameras is None:
+            return find_views(self._source, find_view_set(self._source, count=self._options.views), 0.5)
+        own = with_deciders(ViewSet("far", BLACK, self._cameras, (), ()))
+        return find_views(self._source, own, 0.5, size=(480, 360))
 
     @cached_property
     def _wanted(self) -> list[Any]:
-        return render_pictures(self._source, self._views.used)
+        return _rendered(self._source, self._views.used)
 
     @cached_property
     def _checked(self) -> Judge:
@@ -173,7 +181,7 @@ class _Bench:
         result["psnr"] = self._judge.psnr(model)
         if method != "rounds":
             return result
-        wanted, own = self._wanted, Judge(views.used, self._wanted)
+        wanted, own = self._wanted, Judge(views.used, [Look(picture) for picture in self._wanted])
         for prefix, adjusted in (("fit", False), ("adjusted", True)):
             start = time.perf_counter()
             fitted = fit(model, views.used, wanted, replace(options, adjust=adjusted)).model
@@ -191,10 +199,10 @@ def _files(name: str, path: Path, args: argparse.Namespace) -> None:
 
         def measured(goal: float = goal) -> dict[str, Any]:
             start = time.perf_counter()
-            judged = load_cameras(cameras) if cameras.exists() else None
-            file = encode_simplified(
-                source, target=Target(psnr=goal), options=SimplifyOptions(views=args.views), judged_by=judged
-            )
+            views = find_view_set(source, count=args.views)
+            deciding = load_cameras(cameras) if cameras.exists() else views.judges
+            views = replace(views, decides=deciding, judges=())
+            file = encode_simplified(source, views, target=Target(psnr=goal))
             tried = file.report["tried"]
             return {
                 "tried": tried,
@@ -218,7 +226,7 @@ def _pass(name: str, path: Path, args: argparse.Namespace) -> None:
     def seconds() -> dict[str, Any]:
         rasteriser = Rasteriser(gradients=False)
         best = {"render": np.inf, "pass": np.inf, "step": np.inf}
-        wanted = render_pictures(source, cameras)
+        wanted = _rendered(source, cameras)
         colours = np.concatenate([source.sh0[:, None], source.shN], axis=1)
         operator, gradient = ColourOperator(source, cameras), np.zeros_like(colours)
         operator.error(colours, wanted, gradient)

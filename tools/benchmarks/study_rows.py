@@ -24,6 +24,7 @@ from csplat_tools.strategies import (
     raw_bytes,
     reduce_model,
 )
+from csplat_tools.views import ViewSet, with_deciders
 
 __all__ = [
     "TAUS", "Row", "attribute_bytes", "baseline_bytes", "measure_row", "measure_taus", "rows_of_baseline",
@@ -129,10 +130,12 @@ def measure_row(subject: Subject, row: Row) -> dict[str, Any]:
         decoded file, file_psnr_mean, file_psnr_std; codebooks; seconds of the strategy, of encoding, in all.
     """
     start = time.perf_counter()
-    looks: dict[str, Any] = {"cameras": subject.teachers, "background": subject.views.background}
-    reduced = reduce_model(subject.source, row.reduction, **looks)
+    views = None
+    if subject.teachers is not None:
+        views = with_deciders(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
+    reduced = reduce_model(subject.source, row.reduction, views)
     done = time.perf_counter()
-    data = encode_reduced(subject.source, row.reduction, EncodeOptions(preset=row.preset), **looks).data
+    data = encode_reduced(subject.source, row.reduction, EncodeOptions(preset=row.preset), views=views).data
     encoded = time.perf_counter()
     decoded = decode(data)
     scores = subject.views.score(decoded if row.decoded else reduced.model)

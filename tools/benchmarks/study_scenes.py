@@ -18,8 +18,7 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera
 from csplat_render.cameras import load_cameras
-from csplat_tools.compare import comparison_cameras
-from csplat_tools.photographs import DataViews, relative_to, show_photograph
+from csplat_tools.views import DataOptions, comparison_cameras, find_view_set
 from csplat_trainer.options import TrainOptions
 
 __all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "larger", "open_subject"]
@@ -120,13 +119,12 @@ def open_subject(
     folder.mkdir(parents=True, exist_ok=True)
     ply, training = trained(scene, folder, tell)
     source = read_ply(ply)
-    pictures = DataViews(str(scene.data), "test", scene.size).read()
-    if views and views < len(pictures):
-        pictures = [pictures[number * len(pictures) // views] for number in range(views)]
-    cameras = [relative_to(source.origin, one.camera) for one in pictures]
-    wanted = [show_photograph(one, scene.background) for one in pictures]
-    taken = DataViews(str(scene.data), "train", scene.size).read()
-    teachers = [relative_to(source.origin, one.camera) for one in taken]
+    found = find_view_set(source, data=DataOptions(str(scene.data), scene.size), background=scene.background, aside=0)
+    judge, teachers = found.photograph_judge(), list(found.teaches)
+    if views and views < len(judge.cameras):
+        judge = judge.some([number * len(judge.cameras) // views for number in range(views)])
+    cameras = list(judge.cameras)
+    wanted = [judge.look(number).picture for number in range(len(cameras))]
     by = f"{len(cameras)} photographs of {cameras[0].W}×{cameras[0].H} that were held out"
     return Subject(name, source, ply, training, Views(cameras, wanted, scene.background, lpips), teachers, by)
 

@@ -25,8 +25,8 @@ from scenes import DATA, ROOT, Scene, find_scenes
 from csplat.encoder import PRESETS
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
+from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
-from csplat_tools.compare import compare_models, render_source
 from csplat_tools.console import format_table
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,object_id,statue,donut,jacket,horse,angel,st-peter"
@@ -63,10 +63,10 @@ def _given(scene: Scene) -> Path:
 def _measure(scene: Scene, presets: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:
     source = read_ply(scene.path)
     cameras = [load_cameras(_given(scene)), *(virtual_cameras(source, seed=seed) for seed in seeds)]
-    views = [list(render_source(source, some)) for some in cameras]
+    judges = [Judge.of_source(source, some) for some in cameras]
     kind, results = scene_frame(source).kind, []
     for preset, other, _ in decoded_presets(source, presets):
-        given, *own = (compare_models(source, other, source_views=some, ssim=False).psnr for some in views)
+        given, *own = (judge.psnr(other) for judge in judges)
         results.append(
             {
                 "scene": scene.name,

@@ -5,27 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.model import SplatModel
-from csplat_render import Camera
-from csplat_render.cameras import load_cameras
+from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
+from csplat_render.metrics import Distance, Scores, ViewScore
 from csplat_tools.attributes import AttributeErrors, attribute_errors
-from csplat_tools.compare import BLACK, WHITE, Colour, Comparison, Distance, OnView, compare_models, comparison_cameras
 from csplat_tools.extras import need_pictures, need_renderer
 from csplat_tools.inout import read_array
 from csplat_tools.models import LoadedModel, load_model
-from csplat_tools.photographs import DataViews, PhotographScores, relative_to, show_photograph
 from csplat_tools.pictures import check_folder, panels, picture_names, write_png
-
-if TYPE_CHECKING:
-    from csplat_trainer.pictures import Picture
+from csplat_tools.views import Colour, DataOptions, find_view_set
 
 __all__ = ["USUAL_WEIGHTS", "FileComparison", "compare_files"]
 
@@ -44,21 +38,25 @@ class FileComparison:
         b: what became of it.
         attributes: errors of its splats; `None` where it cannot be found out which splat is which.
         quality: what pictures say.
+        ignored: splats of A that were not drawn because they hold NaN or infinities.
         cameras: where they were taken from: the name of a camera file or of a data set, or `virtual`.
-        photographs: what A's and B's pictures score against the photographs of a data set, as `PhotographScores` says,
-            by the keys `split`, `a` and `b`; `None` where there is no data set.
+        photographs: what A's and B's pictures score against the photographs of a data set, as `Scores` says, by the
+            keys `split`, `a` and `b`; `None` where there is no data set.
         background, mode: of the pictures.
+        notes: what the user should know of the views.
         seconds: reading, matching, rendering and writing.
     """
 
     a: LoadedModel
     b: LoadedModel
     attributes: AttributeErrors | None
-    quality: Comparison
+    quality: Scores
+    ignored: int
     cameras: str
     photographs: dict[str, Any] | None
     background: Colour
     mode: str
+    notes: tuple[str, ...]
     seconds: float
 
     @property
@@ -78,6 +76,11 @@ class FileComparison:
             "mode": self.mode,
             "photographs": self.photographs,
             **self.quality.as_json(),
+            "ignored": {"a": self.ignored, "b": self.quality.ignored},
+            "views": [
+                {name: getattr(one, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
+                for one in self.quality.each
+            ],
             "seconds": round(self.seconds, 3),
         }
 
@@ -87,7 +90,8 @@ def compare_files(
     b: str,
     *,
     cameras: str | None = None,
-    data: DataViews | None = None,
+    data: DataOptions | None = None,
+    split: str = "test",
     source_index: str | None = None,
     lpips: str | None = None,
     pictures: str | None = None,
@@ -103,20 +107,21 @@ def compare_files(
     Args:
         a: the source, PLY or .csplat.
         b: what became of it, PLY or .csplat.
-        cameras: a camera file; the virtual cameras of A if left out.
+        cameras: a camera file, of which those cameras are taken that judge; the virtual cameras of A if left out.
         data: instead: views of a data set, whose photographs judge A and B, too.
+        split: which of its photographs.
         source_index: a .npy file, which splat of A each splat of B is.
         lpips: a file of LPIPS weights, or `auto` for the usual places; it is not computed if left out.
         pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
         amplification: of the difference.
-        background: red, green, blue, 0..1; if left out black, or white with a data set whose pictures have alpha.
+        background: red, green, blue, 0..1; if left out black for virtual cameras, else as `find_view_set` says.
         mode: of the renderer.
         force: existing pictures may be replaced.
         prepare: is called when all that is named has been read and checked, before the first picture.
         progress: is told the stages.
 
     Raises:
-        CsplatError: a file is not valid, or exists; or the renderer is not installed.
+        CsplatError: a file is not valid, or exists; or no photograph judges; or the renderer is not installed.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
@@ -129,87 +134,60 @@ def compare_files(
         raise InputError("wanted cameras of a file or of a data set, not both")
     distance = None if lpips is None else load_lpips(None if lpips == USUAL_WEIGHTS else lpips)
     rows = None if source_index is None else read_array(source_index)
-    given = None if cameras is None else load_cameras(cameras)
-    photographs = None if data is None else data.read()
     source, other = load_model(a), load_model(b)
-    colour = _background(photographs) if background is None else background
-    views = _views(source.model, given, photographs)
-    judges = None if photographs is None else _Judges(photographs, colour, distance)
-    named = "virtual" if cameras is None else Path(cameras).name
-    sheets = None
+    views = find_view_set(source.model, cameras=cameras, data=data, background=background, count=0, split=split)
+    if not views.judges:
+        raise InputError(f"{views.name} has no {split} pictures")
+    by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
+    viewers: list[OnView] = []
     if pictures is not None:
-        sheets = _Sheets(pictures, views, photographs, colour, amplification, force=force)
+        names = picture_names([camera.image for camera in views.judges])
+        viewers.append(_Sheets(pictures, names, by_photographs, amplification, force=force))
     errors = attribute_errors(source, other, rows, progress=progress)
     if prepare is not None:
         prepare()
-    quality = compare_models(
-        source.model,
-        other.model,
-        views,
-        background=colour,
-        mode=mode,
-        lpips=distance,
-        on_view=_all_of([one for one in (judges, sheets) if one is not None]),
-        progress=progress,
-    )
-    judged = None
-    if data is not None and judges is not None:
-        named, judged = Path(data.path).resolve().name, {"split": data.split, **judges.as_json()}
-    seconds = time.perf_counter() - start
-    return FileComparison(source, other, errors, quality, named, judged, colour, mode, seconds)
+    judges = None if by_photographs is None else _Both(by_photographs, distance)
+    viewers += [] if judges is None else [judges]
+    judge = views.judge(source.model, mode=mode, background=background)
+    quality = judge.scores(other.model, lpips=distance, on_view=_all_of(viewers), progress=progress)
+    return FileComparison(
+        source, other, errors, quality, judge.look(0).ignored, views.name,
+        None if judges is None else {"split": split, **judges.as_json()},
+        views.background, mode, views.notes, time.perf_counter() - start,
+    )  # fmt: skip
 
 
-def _background(photographs: Sequence[Picture] | None) -> Colour:
-    """White where pictures have an alpha channel: so are the published tables of such sets."""
-    return WHITE if photographs is not None and any(one.has_alpha for one in photographs) else BLACK
-
-
-def _views(source: SplatModel, given: list[Camera] | None, photographs: Sequence[Picture] | None) -> list[Camera]:
-    if photographs is not None:
-        return [relative_to(source.origin, one.camera) for one in photographs]
-    return comparison_cameras(source) if given is None else given
-
-
-class _Judges:
+class _Both:
     """Scores A's and B's pictures against the photographs."""
 
-    def __init__(self, photographs: Sequence[Picture], background: Colour, distance: Distance | None) -> None:
-        self._both = [PhotographScores(photographs, background, distance) for _ in range(2)]
+    def __init__(self, judge: Judge, distance: Distance | None) -> None:
+        self._judge, self._distance = judge, distance
+        self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        for judge, rendered in zip(self._both, (a, b), strict=True):
-            judge.add(number, rendered)
+        for each, seen in zip(self._each.values(), (a, b), strict=True):
+            each.append(self._judge.score(number, seen, lpips=self._distance))
 
     def as_json(self) -> dict[str, Any]:
-        return {name: judge.as_json() for name, judge in zip("ab", self._both, strict=True)}
+        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
 
 
 class _Sheets:
     """Writes one PNG per view, named as its photograph."""
 
     def __init__(
-        self,
-        folder: str,
-        views: Sequence[Camera],
-        photographs: Sequence[Picture] | None,
-        background: Colour,
-        amplification: float,
-        *,
-        force: bool,
+        self, folder: str, names: Sequence[str], photographs: Judge | None, amplification: float, *, force: bool
     ) -> None:
-        self._files = [f"{name}.png" for name in picture_names([camera.image for camera in views])]
+        self._files = [f"{name}.png" for name in names]
         self._target = check_folder(folder, self._files, force=force)
-        self._photographs, self._background, self._amplification = photographs, background, amplification
+        self._photographs, self._amplification = photographs, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        shown = None if self._photographs is None else show_photograph(self._photographs[number], self._background)
+        shown = None if self._photographs is None else self._photographs.look(number).picture
         write_png(self._target / self._files[number], panels(a, b, self._amplification, shown))
 
 
-def _all_of(viewers: Sequence[OnView]) -> OnView | None:
-    if not viewers:
-        return None
-
+def _all_of(viewers: Sequence[OnView]) -> OnView:
     def show(number: int, a: F32, b: F32) -> None:
         for viewer in viewers:
             viewer(number, a, b)

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from csplat.decoder import read_header
 from csplat.encoder import EncodeResult
 from csplat.model import SplatModel
-from csplat_tools.compare import compare_models, render_source
+from csplat_render.metrics import Distance
 from csplat_tools.console import format_bytes, format_table
 from csplat_tools.layout import describe
-from csplat_tools.photographs import PhotographScores
+from csplat_tools.views import ViewSet
 
-if TYPE_CHECKING:
-    from csplat_trainer.pictures import Picture
-
-__all__ = ["PLY_SPLAT_BYTES", "Judged", "as_report", "format_report", "judge_by_photographs", "judge_by_source"]
-
-F32 = NDArray[np.float32]
-Colour = tuple[float, float, float]
-Distance = Callable[[F32, F32], float]
-
-#: A splat in the PLY of the INRIA trainer: 62 float columns, at SH degree 3.
-PLY_SPLAT_BYTES = 248
+__all__ = ["Judged", "as_report", "format_report", "judge_models", "ply_splat_bytes"]
 
 _SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
 
@@ -47,49 +34,40 @@ class Judged:
     scores: Mapping[str, Mapping[str, float | None]]
 
 
-def judge_by_photographs(
-    pictures: Sequence[Picture],
-    models: Mapping[str, SplatModel],
-    background: Colour,
-    lpips: Distance | None,
-    threads: int | None = None,
-) -> Judged:
-    """Score models against photographs, whose cameras are relative to the models' origin."""
-    from csplat_render.rasterise import Rasteriser
-
-    rasteriser = Rasteriser(gradients=False, threads=threads)
-    scores = {}
-    for name, model in models.items():
-        judge = PhotographScores(pictures, background, lpips)
-        for number, picture in enumerate(pictures):
-            rendered = rasteriser.forward(
-                model, picture.camera, background=background, antialiased=model.antialiased
-            ).rgb
-            judge.add(number, np.clip(rendered, 0.0, 1.0))
-        found = judge.as_json()
-        scores[name] = {score: found[score] for score, _ in _SCORES}
-    return Judged("held-out photographs", len(pictures), scores)
-
-
-def judge_by_source(
+def judge_models(
     source: SplatModel,
     models: Mapping[str, SplatModel],
-    background: Colour,
+    views: ViewSet,
     lpips: Distance | None,
     threads: int | None = None,
-) -> Judged:
-    """Score models against renders of their source, from the cameras of `psnr`; the source itself is left out."""
-    from csplat_render.jit import thread_count
+) -> Judged | None:
+    """Score models on views that nothing was learnt from: by photographs, else by renders of the source.
 
-    with thread_count(threads):
-        views = list(render_source(source, background=background))
-        scores: dict[str, dict[str, float | None]] = {}
-        for name, model in models.items():
-            if model is source:
-                continue
-            found = compare_models(source, model, source_views=views, background=background, lpips=lpips)
+    Args:
+        source: the scene.
+        models: by name; the source itself is left out where its renders judge.
+        views: those that judge are asked; `None` comes back where there are none.
+        lpips: computes it, if wanted.
+        threads: how many; `None` for all.
+    """
+    if not views.judges:
+        return None
+    taken = bool(views.photographs)
+    judge = views.photograph_judge(threads=threads) if taken else views.judge(source, threads=threads)
+    scores: dict[str, dict[str, float | None]] = {}
+    for name, model in models.items():
+        if taken or model is not source:
+            found = judge.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score, _ in _SCORES}
-    return Judged("renders of the source", len(views), scores)
+    return Judged("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
+
+
+def ply_splat_bytes(sh_degree: int) -> int:
+    """What a splat takes in a PLY of the INRIA trainer, whose columns are floats: 248 bytes at SH degree 3.
+
+    Position and normal, opacity, scale and rotation are 14; the rest are colours.
+    """
+    return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
 def as_report(
@@ -121,7 +99,7 @@ def as_report(
         "size_bytes": size,
         "size_bytes_before_tuning": len(plain.data),
         "bytes_per_source_splat": size / count,
-        "ratio": count * PLY_SPLAT_BYTES / size,
+        "ratio": count * ply_splat_bytes(source.sh_degree) / size,
         "bytes_by_attribute": {name: one["size_bytes"] for name, one in described["attributes"].items()},
         "overhead_bytes": sum(described["overhead"].values()),
         "judged_by": None if judged is None else judged.by,
@@ -151,7 +129,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{gone} that pictures need least"] * bool(gone)
     left_out = f" ({' and '.join(words)} are left out)" if words else ""
     size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
-    ratio = f"{report['ratio']:.1f} times smaller than {PLY_SPLAT_BYTES} bytes per splat"
+    ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
     lines = [f"{report['source_splats']} splats{left_out}: {size}, {ratio}"]
     if report["scores"]:
         rows = [

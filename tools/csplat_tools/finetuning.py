@@ -18,9 +18,10 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.console import Report, note, progress_bar, step_progress
 from csplat_tools.convert import SceneFacts
-from csplat_tools.finetune_report import as_report
-from csplat_tools.finetune_sources import Chosen, Looks, Sources, choose_splats
+from csplat_tools.finetune_report import as_report, judge_models
+from csplat_tools.finetune_sources import Chosen, choose_splats, training_views
 from csplat_tools.inout import ply_path, write_array, write_bytes
+from csplat_tools.views import ViewSet
 
 if TYPE_CHECKING:
     from csplat_trainer.finetune import FinetuneOptions, Moment, Views
@@ -29,6 +30,8 @@ __all__ = [
     "BYTE_COST",
     "LEARNING_FACTOR",
     "SHAPE_ENTRIES",
+    "VIEWS",
+    "VIEW_SIZE",
     "Begun",
     "Clock",
     "Files",
@@ -48,6 +51,8 @@ LEARNING_FACTOR = {False: 1.0, True: 0.03}
 BYTE_COST = {False: 1e-4, True: 2e-5}
 #: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
 SHAPE_ENTRIES = 4096
+#: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
+VIEWS, VIEW_SIZE = 480, (320, 240)
 
 
 @dataclass(frozen=True)
@@ -103,9 +108,26 @@ class Clock:
 
 
 def run_finetuning(
-    files: Files, scene: Scene, encoding: EncodeOptions, sources: Sources, options: FinetuneOptions, *, quiet: bool
+    files: Files,
+    scene: Scene,
+    encoding: EncodeOptions,
+    find_views: Callable[[SplatModel], ViewSet],
+    options: FinetuneOptions,
+    *,
+    keep: float | None = None,
+    prune_unseen: bool | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Read, prune, freeze, tune, write, judge.
+
+    Args:
+        files: what is read and written.
+        scene: how the PLY is read.
+        encoding: of the encoder.
+        find_views: says from where a scene is looked at.
+        options: of the tuning.
+        keep, prune_unseen: as for `choose_splats`.
+        quiet: say nothing that is not wrong.
 
     Returns:
         The report, JSON-compatible.
@@ -123,11 +145,17 @@ def run_finetuning(
     distance = None if files.lpips is None else load_lpips(None if files.lpips == "auto" else files.lpips)
     with clock.stage("reading"):
         source = _read(files.source, scene, encoding, quiet=quiet)
-        looks = Looks.read(source, sources, quiet=quiet)
+        views = find_views(source)
+        views.read()
+        for line in () if quiet else views.notes:
+            note(line)
     with thread_count(threads):
         warm_up(None if quiet else note)
         with progress_bar(quiet=quiet) as progress:
-            begun = begin(source, looks, sources, encoding, clock, importance=files.importance, progress=progress)
+            begun = begin(
+                source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=files.importance,
+                progress=progress,
+            )  # fmt: skip
         shown = step_progress("tuning", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
         with shown as show:
             tuned = tune(
@@ -140,7 +168,7 @@ def run_finetuning(
             write_array(files.source_index, result.source_index)
         with clock.stage("judging"):
             models = {"source": source, "before tuning": decode(plain.data), "file": tuned.decoded}
-            judged = looks.judge(source, models, distance, threads)
+            judged = judge_models(source, models, views, distance, threads)
     report = as_report(source, plain, result, judged, tuned.log, clock.seconds, begun.chosen.said)
     if files.log is not None:
         write_log(files.log, {**tuned.log, "encoding": result.report.options, "seconds_by_stage": clock.seconds})
@@ -154,7 +182,7 @@ class Begun:
     """All that is decided before values move.
 
     Attributes:
-        views: that teach, and that judge while values move.
+        views: that teach, and that decide while values move.
         chosen: the splats that the file will hold.
         frozen: the encoder's decisions.
         plain: the file of the same decisions without tuning.
@@ -182,11 +210,12 @@ class Tuned:
 
 def begin(
     source: SplatModel,
-    looks: Looks,
-    sources: Sources,
+    views: ViewSet,
     encoding: EncodeOptions,
     clock: Clock,
     *,
+    keep: float | None = None,
+    prune_unseen: bool | None = None,
     importance: str | None = None,
     progress: Report | None = None,
 ) -> Begun:
@@ -194,18 +223,21 @@ def begin(
 
     Args:
         source: the scene.
-        looks, sources: what the file is to look like.
+        views: what the file is to look like.
         encoding: of the encoder.
         clock: is told the seconds of `choosing` and `encoding`.
-        importance: as of `Files`.
+        keep, prune_unseen, importance: as for `choose_splats`.
         progress: is told the stages.
 
     Raises:
         CsplatError: as `choose_splats` and the encoder.
     """
     with clock.stage("choosing"):
-        views = looks.views(source, sources, encoding.threads)
-        chosen = choose_splats(source, looks, sources, importance, encoding.threads, progress)
+        looked = training_views(source, views, encoding.threads)
+        chosen = choose_splats(
+            source, views, keep=keep, prune_unseen=prune_unseen, importance=importance, threads=encoding.threads,
+            progress=progress,
+        )  # fmt: skip
     with clock.stage("encoding"):
         draft = Draft.of(
             chosen.model, encoding, importance=chosen.importance, origin=Origin(len(source), chosen.rows),
@@ -213,7 +245,7 @@ def begin(
         )  # fmt: skip
         frozen = draft.frozen(source, progress)
         plain = frozen.coded(frozen.start()).write()
-    return Begun(views, chosen, frozen, plain)
+    return Begun(looked, chosen, frozen, plain)
 
 
 def tune(

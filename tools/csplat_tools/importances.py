@@ -14,17 +14,17 @@ from csplat.encoder import Importance, trusted
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.model import SplatModel
+from csplat_render import Camera
 from csplat_render.virtual import scene_frame
 from csplat_tools.inout import read_array
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, read_sensitivity, write_sensitivity
 
 if TYPE_CHECKING:
-    from csplat_render import Camera
+    from csplat_tools.views import ViewSet
     from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = [
     "Measured",
-    "Wanted",
     "measure_scene",
     "measure_views",
     "measured_importance",
@@ -38,30 +38,6 @@ Progress = Callable[[str, float], None]
 _NOTHING = "a scene without splats has no sensitivities"
 _ZIP = b"PK"  # what a .npz begins with
 _GONE = 0.4  # share of the splats for whose removal virtual views have to agree before there are enough
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a command line says.
-
-    Attributes:
-        cameras: a camera file, relative to the scene's origin; or `None`.
-        data: a data set, whose training views are used; or `None`.
-        size: width and height of virtual views.
-        views: virtual views at most.
-        background: red, green, blue behind everything; `None` for black, but white behind photographs with alpha.
-        matrices: measure the matrices of SH coefficients too.
-        seed: of the virtual views. threads: how many; `None` for all.
-    """
-
-    cameras: str | None
-    data: str | None
-    size: tuple[int, int]
-    views: int
-    background: tuple[float, float, float] | None
-    matrices: bool
-    seed: int
-    threads: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,36 +78,44 @@ class Measured:
         }
 
 
-def measure_scene(model: SplatModel, wanted: Wanted, progress: Progress | None = None) -> Measured:
-    """Measure a scene from what views there are.
+def measure_scene(
+    model: SplatModel,
+    views: ViewSet,
+    *,
+    matrices: bool = True,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Measured:
+    """Measure a scene from views that teach: of virtual ones as many as it takes, of others all.
+
+    Args:
+        model: the scene.
+        views: from where it is looked at. Where none teaches, it is measured from those that judge.
+        matrices, threads, progress: as for `measure_views`.
 
     Raises:
-        InputError: there are no splats, or no views, or they cannot be read, or show no splat.
+        InputError: there are no splats, or no views, or they show no splat.
     """
     from csplat_render.removal import measure_removal
-    from csplat_tools.simplify.files import find_sights
     from csplat_tools.simplify.views import find_views
 
     if not len(model):
         raise InputError(_NOTHING)
-    sights = find_sights(model, wanted.cameras, wanted.data, judged=False, background=wanted.background)
-    background = sights.background
-    cameras, check = sights.cameras, []
-    source = "virtual" if cameras is None else "cameras" if wanted.data is None else "training"
-    if cameras is None:
-        views = find_views(
-            model, None, _GONE, size=wanted.size, most=wanted.views, seed=wanted.seed, background=background,
-            threads=wanted.threads, progress=progress,
-        )  # fmt: skip
-        cameras, check = views.used, views.check
-    found = measure_views(
-        model, cameras, background, matrices=wanted.matrices, threads=wanted.threads, progress=progress
+    cameras, check, source = (
+        views.teaches or views.judges,
+        list[Camera](),
+        "training" if views.photographs else "cameras",
     )
+    if views.virtual and views.teaches:
+        size = (views.teaches[0].W, views.teaches[0].H)
+        found = find_views(model, views, _GONE, size=size, threads=threads, progress=progress)
+        cameras, check, source = found.used, found.check, "virtual"
+    measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
-        elsewhere = measure_removal(model, check, background=background, threads=wanted.threads).seen
-        missed = float(np.mean(elsewhere & ~found.seen))
-    return Measured(model, found, source, missed)
+        elsewhere = measure_removal(model, check, background=views.background, threads=threads).seen
+        missed = float(np.mean(elsewhere & ~measured.seen))
+    return Measured(model, measured, source, missed)
 
 
 def measure_views(

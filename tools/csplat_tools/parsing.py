@@ -8,9 +8,8 @@ import re
 import typer
 
 from csplat_render.conventions import MODES
-from csplat_tools.photographs import SPLITS
 
-__all__ = ["parse_colour", "parse_mode", "parse_size", "parse_split"]
+__all__ = ["parse_colour", "parse_decibels", "parse_mode", "parse_size"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -56,12 +55,16 @@ def parse_mode(text: str) -> str:
     return text
 
 
-def parse_split(text: str) -> str:
-    """A part of a data set.
+def parse_decibels(text: str) -> float:
+    """A number of decibels: `0.3`, `0.3dB`, `0.3 dB`.
 
     Raises:
-        typer.BadParameter: there is no such part.
+        typer.BadParameter: it is something else.
     """
-    if text not in SPLITS:
-        raise typer.BadParameter(f"the split is {text!r}, wanted one of {', '.join(SPLITS)}")
-    return text
+    number = text.strip()
+    if number.lower().endswith("db"):
+        number = number[:-2]
+    try:
+        return float(number)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no number of decibels, wanted 0.3 or 0.3dB") from None

@@ -74,12 +74,12 @@ class Reducing:
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
             if not self.distil_sh:
                 return Made(encode_reduced(model, reduction, encoding, progress=progress))
-            from csplat_tools.simplify.files import find_sights
+            from csplat_tools.views import DataOptions, find_view_set
 
-            sights = find_sights(model, self.cameras, self.data, judged=False)
-            result = encode_reduced(
-                model, reduction, encoding, cameras=sights.cameras, background=sights.background, progress=progress
-            )
-            return Made(result)
+            if self.cameras is None and self.data is None:
+                return Made(encode_reduced(model, reduction, encoding, progress=progress))
+            data = None if self.data is None else DataOptions(self.data)
+            views = find_view_set(model, cameras=self.cameras, data=data)
+            return Made(encode_reduced(model, reduction, encoding, views=views, progress=progress))
 
         return encode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera, render
-from csplat_render.cameras import load_cameras
+from csplat_render.cameras import load_cameras, resized
 from csplat_render.virtual import orbit_cameras
 from csplat_tools.extras import need_pictures, need_renderer
 from csplat_tools.film import check_film, write_film
 from csplat_tools.inout import check_output, write_array
-from csplat_tools.photographs import DataViews, relative_to
 from csplat_tools.pictures import check_folder, picture_names, to_bytes, write_png
+from csplat_tools.views import DataOptions, find_view_set
 
-__all__ = ["Rendered", "find_cameras", "render_film", "render_folder", "resized"]
+__all__ = ["Rendered", "find_cameras", "render_film", "render_folder"]
 
 F32 = NDArray[np.float32]
 
@@ -45,8 +45,10 @@ def find_cameras(
     model: SplatModel,
     path: str | None = None,
     orbit_count: int | None = None,
-    data: DataViews | None = None,
+    data: DataOptions | None = None,
     size: tuple[int, int] | None = None,
+    *,
+    split: str = "test",
 ) -> list[Camera]:
     """Get the cameras that a command line names: a file's, those of an orbit, or a data set's.
 
@@ -54,8 +56,9 @@ def find_cameras(
         model: the scene to orbit around; a data set's cameras are brought to its origin.
         path: of a camera file.
         orbit_count: how many cameras on a circle.
-        data: views of a data set, whose size counts, not `size`.
+        data: a data set, whose size counts, not `size`.
         size: width and height of the pictures; the file's own, or 640 by 480, if left out.
+        split: of a data set: which of its cameras.
 
     Raises:
         InputError: not exactly one of the three is given; the file or the set is none; a picture of that size would be
@@ -67,23 +70,12 @@ def find_cameras(
         cameras = load_cameras(path)
         return cameras if size is None else [resized(camera, *size) for camera in cameras]
     if data is not None:
-        return [relative_to(model.origin, picture.camera) for picture in data.read()]
+        cameras = list(find_view_set(model, data=data, count=0, split=split).judges)
+        if not cameras:
+            raise InputError(f"{data.path} has no {split} pictures")
+        return cameras
     assert orbit_count is not None
     return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE))
-
-
-def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Let a camera take the same picture in another size.
-
-    Raises:
-        InputError: the picture's shape would change by more than the rounding of a pixel.
-    """
-    across, down = width / camera.W, height / camera.H
-    if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
-        raise InputError(
-            f"a camera takes pictures of {camera.W}x{camera.H} pixels: at {width}x{height} they would be distorted"
-        )
-    return replace(camera, K=np.diag([across, down, 1.0]) @ camera.K, W=width, H=height)
 
 
 def render_folder(

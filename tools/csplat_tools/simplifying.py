@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import typer
 
@@ -11,6 +11,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
+from csplat_tools.parsing import parse_decibels
 from csplat_tools.rate.targets import parse_size_bytes
 
 __all__ = ["DEFAULT_VIEWS", "Simplifying"]
@@ -41,23 +42,20 @@ class Simplifying:
         """
         prepare_renderer(quiet=quiet, simplify=True)
         from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
-        from csplat_tools.simplify.files import find_sights, parse_target
+        from csplat_tools.views import DataOptions, find_view_set
 
         try:
-            loss = None if self.max_loss is None else parse_target(self.max_loss)
+            loss = None if self.max_loss is None else parse_decibels(self.max_loss)
             size = None if self.target_size is None else parse_size_bytes(self.target_size)
             target = Target(self.keep, self.target_psnr, loss, size)
-            options = SimplifyOptions(views=self.views, threads=self.threads)
+            options = SimplifyOptions(threads=self.threads)
         except InputError as error:
             raise typer.BadParameter(str(error)) from None
 
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
-            sights = find_sights(model, self.cameras, self.data, judged=target.max_loss is not None)
-            file = encode_simplified(
-                model, sights.cameras, target=target, encoding=encoding,
-                options=replace(options, background=sights.background),
-                photographs=sights.photographs, progress=progress,
-            )  # fmt: skip
+            data = None if self.data is None else DataOptions(self.data)
+            views = find_view_set(model, cameras=self.cameras, data=data, count=self.views)
+            file = encode_simplified(model, views, target=target, encoding=encoding, options=options, progress=progress)
             return Made(file.result, "simplified", file.report)
 
         return encode

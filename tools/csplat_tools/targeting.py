@@ -76,12 +76,14 @@ class Targeting:
                 bounded = meet_bounds(model, encoding, bounds, importance=weights, progress=progress).as_result()
                 return Made(bounded.result, "target", bounded.report)
             from csplat_tools.rate.control import encode_to_target
-            from csplat_tools.simplify.files import find_sights
+            from csplat_tools.views import DataOptions, find_view_set
 
-            sights = find_sights(model, self.cameras, self.data, judged=False)
+            data = None if self.data is None else DataOptions(self.data)
+            around = find_view_set(model, cameras=self.cameras, data=data, aside=0, count=0)
+            given = None if self.cameras is None and data is None else around.teaches or around.judges
             done = encode_to_target(
-                model, RateTarget(size, self.psnr, bounds), encoding, cameras=sights.cameras,
-                background=sights.background, prune=self.prune, views=self.views,
+                model, RateTarget(size, self.psnr, bounds), encoding, cameras=given,
+                background=around.background, prune=self.prune, views=self.views,
                 importance=weights, progress=progress,
             )  # fmt: skip
             return Made(done.result, "target", done.report)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat_render.camera import DEFAULT_NEAR, Camera
 
-__all__ = ["intrinsics", "load_cameras", "look_at", "orbit", "save_cameras"]
+__all__ = ["intrinsics", "load_cameras", "look_at", "orbit", "relative_to", "resized", "save_cameras"]
 
 F64 = NDArray[np.float64]
 
@@ -58,6 +59,35 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
     """Write a camera file that `load_cameras` reads back without loss."""
     text = ",\n".join(json.dumps(camera.to_json(), allow_nan=False) for camera in cameras)
     Path(path).write_text(f"[\n{text}\n]\n", "utf-8")
+
+
+def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
+    """The same camera for a scene whose coordinates are relative to an origin.
+
+    Args:
+        origin: [3], in the camera's coordinates.
+        camera: where the photograph was taken.
+    """
+    shift = np.asarray(origin, np.float64)
+    if not shift.any():
+        return camera
+    viewmat = camera.viewmat.copy()
+    viewmat[:3, 3] += viewmat[:3, :3] @ shift
+    return replace(camera, viewmat=viewmat)
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Let a camera take the same picture in another size.
+
+    Raises:
+        InputError: the picture's shape would change by more than the rounding of a pixel.
+    """
+    across, down = width / camera.W, height / camera.H
+    if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
+        raise InputError(
+            f"a camera takes pictures of {camera.W}x{camera.H} pixels: at {width}x{height} they would be distorted"
+        )
+    return replace(camera, K=np.diag([across, down, 1.0]) @ camera.K, W=width, H=height)
 
 
 def intrinsics(width: int, height: int, field_of_view: float) -> F64:

@@ -18,16 +18,30 @@ Published tables of Blender scenes are made on a white background, those of phot
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["COVERED_ALPHA", "PSNR_CAP", "Scorer", "Scores", "psnr", "psnr_of_mse", "squared_error", "ssim"]
+__all__ = [
+    "COVERED_ALPHA",
+    "PSNR_CAP",
+    "Distance",
+    "Scores",
+    "ViewScore",
+    "pooled",
+    "psnr",
+    "psnr_of_mse",
+    "score_view",
+    "squared_error",
+    "ssim",
+]
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 #: Decibels that stand for "no difference".
@@ -37,93 +51,143 @@ PSNR_CAP = 99.0
 COVERED_ALPHA = 0.5
 
 
+#: A distance of two pictures, [H, W, 3] in 0..1: what was wanted and what is seen.
+Distance = Callable[[F32, F32], float]
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """How alike two pictures of one view are.
+
+    Attributes:
+        image: name of the camera's photograph, if it has one.
+        pixels: of the picture.
+        mse: mean squared error over pixels and channels.
+        psnr: the same in dB.
+        covered_mse: over covered pixels only; `None` where cover is not known or 0.
+        cover: share of the pixels that are covered; `None` where not known.
+        ssim, lpips: `None` where they were not asked for.
+    """
+
+    image: str | None
+    pixels: int
+    mse: float
+    psnr: float
+    covered_mse: float | None = None
+    cover: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+
+
 @dataclass(frozen=True)
 class Scores:
     """How alike two sets of pictures are.
 
     Attributes:
-        views: how many pairs.
+        each: the views, one by one.
         psnr: dB, of the error pooled over all views.
         psnr_mean: dB, mean of the views'.
         psnr_worst: dB, the lowest of the views'.
         worst_view: which one that was, from 0.
-        ssim: mean of the views'.
+        ssim, lpips: means of the views'; `None` where they were not asked for.
         psnr_covered: dB, pooled over covered pixels only; `None` where cover is not known or 0.
         cover: share of the pixels that are covered, over all views; `None` where not known.
+        ignored: splats of the scene that were not drawn because they hold NaN or infinities.
     """
 
-    views: int
+    each: tuple[ViewScore, ...]
     psnr: float
     psnr_mean: float
     psnr_worst: float
     worst_view: int
-    ssim: float
-    psnr_covered: float | None = None
-    cover: float | None = None
+    ssim: float | None
+    lpips: float | None
+    psnr_covered: float | None
+    cover: float | None
+    ignored: int = 0
 
-    def to_json(self) -> dict[str, Any]:
-        """The scores as a JSON object."""
-        return asdict(self)
-
-
-class Scorer:
-    """Collects pairs of pictures, one view after the other, and scores them all."""
-
-    def __init__(self) -> None:
-        self._errors: list[float] = []  # sums of squares
-        self._counts: list[int] = []  # values, three for a pixel
-        self._ssims: list[float] = []
-        self._covered_error = 0.0
-        self._covered_count = 0
-        self._cover_known = True
-
-    def add(self, reference: NDArray[Any], image: NDArray[Any], alpha: NDArray[Any] | None = None) -> float:
-        """Add a view.
-
-        Args:
-            reference: [H, W, 3], floating.
-            image: [H, W, 3], floating.
-            alpha: [H, W], of the reference; `None`: not known.
-
-        Returns:
-            This view's PSNR, dB.
-        """
-        error = squared_error(reference, image)
-        self._errors.append(float(np.sum(error)))
-        self._counts.append(error.size)
-        self._ssims.append(ssim(reference, image))
-        if alpha is None:
-            self._cover_known = False
-        else:
-            if alpha.shape != error.shape[:2]:
-                raise InputError(f"alpha has shape {list(alpha.shape)}, wanted {list(error.shape[:2])}")
-            covered = alpha >= COVERED_ALPHA
-            self._covered_error += float(np.sum(error[covered]))
-            self._covered_count += 3 * int(np.count_nonzero(covered))
-        return psnr_of_mse(self._errors[-1] / self._counts[-1])
-
-    def scores(self) -> Scores:
-        """Score everything added so far.
+    @classmethod
+    def of(cls, each: Sequence[ViewScore], ignored: int = 0) -> Scores:
+        """Pool the scores of views.
 
         Raises:
-            InputError: nothing was.
+            InputError: there are none.
         """
-        if not self._errors:
+        if not each:
             raise InputError("no pictures to compare")
-        each = [psnr_of_mse(error / count) for error, count in zip(self._errors, self._counts, strict=True)]
-        known = self._cover_known
-        return Scores(
-            views=len(each),
-            psnr=psnr_of_mse(math.fsum(self._errors) / sum(self._counts)),
-            psnr_mean=math.fsum(each) / len(each),
-            psnr_worst=min(each),
-            worst_view=int(np.argmin(each)),
-            ssim=math.fsum(self._ssims) / len(each),
-            psnr_covered=psnr_of_mse(self._covered_error / self._covered_count)
-            if known and self._covered_count
-            else None,
-            cover=self._covered_count / sum(self._counts) if known else None,
+        pixels = [one.pixels for one in each]
+        covers = [one.cover for one in each if one.cover is not None]
+        known = len(covers) == len(each)
+        covered = [share * count for share, count in zip(covers, pixels, strict=True)] if known else []
+        missed = math.fsum(count * (one.covered_mse or 0.0) for count, one in zip(covered, each, strict=known))
+        worst = min(range(len(each)), key=lambda number: each[number].psnr)
+        return cls(
+            each=tuple(each),
+            psnr=psnr_of_mse(pooled([one.mse for one in each], pixels)),
+            psnr_mean=math.fsum(one.psnr for one in each) / len(each),
+            psnr_worst=each[worst].psnr,
+            worst_view=worst,
+            ssim=_mean([one.ssim for one in each]),
+            lpips=_mean([one.lpips for one in each]),
+            psnr_covered=psnr_of_mse(missed / math.fsum(covered)) if any(covered) else None,
+            cover=math.fsum(covered) / sum(pixels) if known else None,
+            ignored=ignored,
         )
+
+    def as_json(self) -> dict[str, Any]:
+        """What is said of all views together, and how many they are, JSON-compatible."""
+        names = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "psnr_covered", "cover")
+        return {"views": len(self.each), **{name: getattr(self, name) for name in names}}
+
+
+def score_view(
+    wanted: NDArray[Any],
+    seen: NDArray[Any],
+    covered: NDArray[np.bool_] | None = None,
+    *,
+    image: str | None = None,
+    with_ssim: bool = True,
+    lpips: Distance | None = None,
+) -> ViewScore:
+    """Score a picture.
+
+    Args:
+        wanted: [H, W, 3], floating.
+        seen: [H, W, 3], floating.
+        covered: [H, W], which pixels of what is wanted are covered; `None`: not known.
+        image: name of the photograph.
+        with_ssim: whether to compute it; it takes about as long as rendering.
+        lpips: computes it, if wanted.
+
+    Raises:
+        InputError: the pictures cannot be compared.
+    """
+    squares = squared_error(wanted, seen)
+    mse = float(np.mean(squares))
+    if covered is not None and covered.shape != squares.shape[:2]:
+        raise InputError(f"the cover has shape {list(covered.shape)}, wanted {list(squares.shape[:2])}")
+    inside = None if covered is None else squares[covered]
+    return ViewScore(
+        image=image,
+        pixels=squares.shape[0] * squares.shape[1],
+        mse=mse,
+        psnr=psnr_of_mse(mse),
+        covered_mse=float(np.mean(inside)) if inside is not None and len(inside) else None,
+        cover=None if covered is None else float(np.mean(covered)),
+        ssim=ssim(wanted, seen) if with_ssim else None,
+        lpips=None if lpips is None else lpips(np.clip(wanted, 0.0, 1.0), np.clip(seen, 0.0, 1.0)),
+    )
+
+
+def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
+    """The mean squared error over all pixels, of those by view.
+
+    Args:
+        errors: [V] mean squared error by view.
+        pixels: [V] of each view.
+    """
+    counts = np.asarray(pixels, np.float64)
+    return float(np.sum(np.asarray(errors, np.float64) * counts) / np.sum(counts))
 
 
 def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
@@ -150,6 +214,12 @@ def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
     from csplat_render.similarity import mean_ssim  # numba takes a second to import
 
     return mean_ssim(*_clipped(reference, image))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean of what is known; `None` where nothing is."""
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
 
 
 def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:

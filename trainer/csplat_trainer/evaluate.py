@@ -1,28 +1,49 @@
-"""How good a scene is on pictures that it was not trained on."""
+"""How good a scene is on photographs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from csplat_render.camera import Camera
-from csplat_render.lpips import Lpips
-from csplat_render.metrics import Scorer
+from csplat_render.judge import Judge, Look
+from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
 from csplat_trainer.pictures import Picture, compose
 
-__all__ = ["evaluate"]
+__all__ = ["evaluate", "photograph_judge"]
 
 F32 = NDArray[np.float32]
+
+
+def photograph_judge(
+    pictures: Sequence[Picture],
+    background: ArrayLike,
+    *,
+    mode: str = "standard",
+    threads: int | None = None,
+    origin: Sequence[float] | None = None,
+) -> Judge:
+    """Judge by photographs; each is composed when its turn comes.
+
+    Args:
+        pictures: at least one.
+        background: red, green, blue, behind renders and behind photographs that have an alpha channel.
+        mode, threads, origin: as of `Judge`.
+    """
+    colour = np.asarray(background, np.float32)
+    cameras = [picture.camera for picture in pictures]
+    return Judge(cameras, [partial(_look, one, colour) for one in pictures], colour, mode, threads, origin)
 
 
 def evaluate(
     render: Callable[[Camera], F32],
     pictures: Sequence[Picture],
     background: F32,
-    lpips: Lpips | None = None,
+    lpips: Distance | None = None,
 ) -> dict[str, Any]:
     """Compare renders with photographs.
 
@@ -30,17 +51,17 @@ def evaluate(
         render: makes the picture of a camera, [H, W, 3].
         pictures: at least one.
         background: [3], behind photographs that have an alpha channel; `render` uses the same.
-        lpips: weights of the perceptual distance, or `None`.
+        lpips: the perceptual distance, or `None`.
 
     Returns:
-        The fields of `csplat_render.metrics.Scores`, and `lpips`: the mean over the pictures, or `None`.
+        What `csplat_render.metrics.Scores` says of all pictures together.
     """
-    scorer, distances = Scorer(), []
-    for picture in pictures:
-        photograph = compose(picture, background, np.empty((picture.camera.H, picture.camera.W, 3), np.float32))
-        rendered = render(picture.camera)
-        alpha = picture.pixels[..., 3] / 255.0 if picture.has_alpha else None
-        scorer.add(photograph, rendered, alpha)
-        if lpips is not None:
-            distances.append(lpips(photograph, rendered))
-    return {**scorer.scores().to_json(), "lpips": float(np.mean(distances)) if distances else None}
+    judge = photograph_judge(pictures, background)
+    each = [judge.score(number, render(camera), lpips=lpips) for number, camera in enumerate(judge.cameras)]
+    return Scores.of(each).as_json()
+
+
+def _look(picture: Picture, background: F32) -> Look:
+    shown = compose(picture, background, np.empty((picture.camera.H, picture.camera.W, 3), np.float32))
+    covered = picture.pixels[..., 3] >= COVERED_ALPHA * 255.0 if picture.has_alpha else None
+    return Look(shown, covered)

@@ -9,12 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from csplat_tools.attributes import AttributeErrors
-from csplat_tools.compare import Comparison
+from csplat_tools.commands.data_options import Images, Size, Split, TestEvery, data_options
 from csplat_tools.compare_files import FileComparison, compare_files
 from csplat_tools.console import format_table, guarded, note, progress_bar, say, say_json
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.parsing import parse_colour, parse_mode, parse_size, parse_split
-from csplat_tools.photographs import SPLITS, DataViews
+from csplat_tools.parsing import parse_colour, parse_mode
 
 __all__ = ["compare"]
 
@@ -25,31 +24,21 @@ _PAIRING = {
 }
 
 
-_DATA = "Views of a data set"
-
-
 @guarded
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
     cameras: Annotated[
-        str | None, typer.Option(metavar="FILE.json", help="Cameras, instead of eight virtual ones around A.")
+        str | None,
+        typer.Option(metavar="FILE.json", help="Cameras, instead of virtual ones; of 40 or more those that judge."),
     ] = None,
     data: Annotated[
         str | None, typer.Option(metavar="DATA", help="Or where a data set's pictures were taken; they judge A and B.")
     ] = None,
-    split: Annotated[
-        str, typer.Option(metavar="|".join(SPLITS), rich_help_panel=_DATA, help="Which of its pictures.")
-    ] = "test",
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", rich_help_panel=_DATA, help="Scale its pictures to this size.")
-    ] = None,
-    test_every: Annotated[
-        int, typer.Option(metavar="N", rich_help_panel=_DATA, help="Every Nth picture was held out; see `train`.")
-    ] = 8,
-    images: Annotated[
-        str | None, typer.Option(metavar="NAME", rich_help_panel=_DATA, help="COLMAP: folder of pictures, images_4.")
-    ] = None,
+    split: Split = "test",
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
     source_index: Annotated[
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
     ] = None,
@@ -63,7 +52,7 @@ def compare(
     ] = None,
     background: Annotated[
         str | None,
-        typer.Option(metavar="R,G,B", help="Behind the scene: black, but white behind pictures with alpha."),
+        typer.Option(metavar="R,G,B", help="Behind the scene: black, but with --data as in training."),
     ] = None,
     mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
     force: Annotated[bool, typer.Option("--force", help="Replace existing pictures.")] = False,
@@ -87,17 +76,16 @@ def compare(
     """
     if cameras is not None and data is not None:
         raise typer.BadParameter("wanted one of --cameras and --data")
-    if data is None and (size is not None or images is not None):
-        raise typer.BadParameter("--size and --images are for the pictures of --data")
     colour = None if background is None else parse_colour(background)
-    chosen, pixels = parse_mode(mode), None if size is None else parse_size(size)
-    shots = None if data is None else DataViews(data, parse_split(split), pixels, images, test_every)
+    chosen = parse_mode(mode)
+    shots = data_options(data, size, images, test_every, split=split)
     with progress_bar(quiet=quiet) as progress:
         compared = compare_files(
             a,
             b,
             cameras=cameras,
             data=shots,
+            split=split,
             source_index=source_index,
             lpips=lpips,
             pictures=pictures,
@@ -108,12 +96,14 @@ def compare(
             prepare=partial(prepare_renderer, quiet=quiet, ssim=True, lpips=lpips is not None),
             progress=progress,
         )
+    for line in () if quiet else compared.notes:
+        note(line)
     if as_json:
         say_json(compared.as_json())
     else:
         say(_format(compared, Path(a).name, Path(b).name))
     if pictures is not None and not quiet:
-        note(f"{len(compared.quality.views)} files in {pictures}")
+        note(f"{len(compared.quality.each)} files in {pictures}")
 
 
 def _format(compared: FileComparison, a: str, b: str) -> str:
@@ -161,9 +151,10 @@ def _quality(compared: FileComparison) -> str:
         rows.append(("ssim", f"{quality.ssim:.5f}"))
     if quality.lpips is not None:
         rows.append(("lpips", f"{quality.lpips:.5f}"))
-    rows.append(("cover", f"{100.0 * quality.cover:.1f} %"))
+    if quality.cover is not None:
+        rows.append(("cover", f"{100.0 * quality.cover:.1f} %"))
     lines = [format_table(("pictures", _cameras(compared)), rows)]
-    lines += _ignored(quality)
+    lines += _ignored(compared)
     if compared.a.model.antialiased != compared.b.model.antialiased:
         lines.append(f"only {'A' if compared.a.model.antialiased else 'B'} is antialiased, and was rendered so")
     return "\n".join(lines)
@@ -180,13 +171,13 @@ def _photographs(scores: dict[str, Any]) -> str:
 
 
 def _cameras(compared: FileComparison) -> str:
-    views = len(compared.quality.views)
+    views = len(compared.quality.each)
     return f"{views} virtual views" if compared.cameras == "virtual" else f"{views} views of {compared.cameras}"
 
 
-def _ignored(quality: Comparison) -> list[str]:
+def _ignored(compared: FileComparison) -> list[str]:
     return [
         f"{count} splats of {name} hold NaN or infinities and are not drawn"
-        for name, count in zip("AB", quality.ignored_counts, strict=True)
+        for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)
         if count
     ]

@@ -104,9 +104,10 @@ def _picture_judge() -> tuple[PictureJudge | None, str]:
         prepare_renderer(quiet=False)
     except InputError as error:
         return None, str(error)
-    from csplat_tools.compare import compare_models
+    from csplat_render.judge import Judge
+    from csplat_tools.views import comparison_cameras
 
     def psnr(source: SplatModel, decoded: SplatModel) -> float:
-        return compare_models(source, decoded, ssim=False).psnr
+        return Judge.of_source(source, comparison_cameras(source)).psnr(decoded)
 
     return psnr, ""

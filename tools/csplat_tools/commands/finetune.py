@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +11,22 @@ import typer
 
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
+from csplat_tools.commands.data_options import Images, Near, Size, TestEvery, data_options
 from csplat_tools.commands.encoder_knobs import with_encoder_knobs
 from csplat_tools.console import guarded, note, say_json
 from csplat_tools.convert import SceneFacts
 from csplat_tools.extras import need_trainer
 from csplat_tools.inout import STANDARD_STREAM, check_output, check_outputs
 from csplat_tools.parsing import parse_colour, parse_size
+from csplat_tools.views import find_view_set
 
 __all__ = ["finetune"]
 
 _LIKE = "What the file is to look like (one of --data and --self)"
 _FILES = "Files on the way"
 _HOW = "How"
+_RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
+_MOST_ASIDE = 16  # but no more than these
 
 
 @guarded
@@ -39,30 +44,27 @@ def finetune(
     itself: Annotated[
         bool, typer.Option("--self", rich_help_panel=_LIKE, help="The scene's own renders, from all around.")
     ] = False,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="Scale the photographs to this size.")
-    ] = None,
-    images: Annotated[
-        str | None, typer.Option(metavar="NAME", rich_help_panel=_LIKE, help="COLMAP: folder of pictures, images_4.")
-    ] = None,
-    test_every: Annotated[
-        int, typer.Option(metavar="N", rich_help_panel=_LIKE, help="Hold out every Nth photograph; see `train`.")
-    ] = 8,
-    near: Annotated[
-        float | None, typer.Option(metavar="UNITS", rich_help_panel=_LIKE, help="Near plane of the photographs.")
-    ] = None,
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
+    near: Near = None,
     cameras: Annotated[
-        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_LIKE, help="With --self: your own cameras.")
+        str | None,
+        typer.Option(
+            metavar="FILE.json", rich_help_panel=_LIKE, help="With --self: they judge; 40 or more teach, too."
+        ),
     ] = None,
     views: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views.")
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views that teach.")
     ] = 480,
     view_size: Annotated[
         str, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="With --self: of the virtual views.")
     ] = "320x240",
     background: Annotated[
         str | None,
-        typer.Option(metavar="R,G,B", rich_help_panel=_LIKE, help="As in training; black, but white behind alpha."),
+        typer.Option(
+            metavar="R,G,B", rich_help_panel=_LIKE, help="Behind the scene: black, but with --data as in training."
+        ),
     ] = None,
     aside: Annotated[
         int,
@@ -70,7 +72,7 @@ def finetune(
             metavar="N",
             min=0,
             rich_help_panel=_LIKE,
-            help="Views that judge and do not teach; 0: with --data some that teach judge, with --self one in eight.",
+            help="Views that decide which step was best, and do not teach; 0: with --data some that teach decide.",
         ),
     ] = 0,
     keep: Annotated[
@@ -154,7 +156,6 @@ def finetune(
     """
     need_trainer()
     from csplat_tools.finetune_report import format_report
-    from csplat_tools.finetune_sources import Sources
     from csplat_tools.finetuning import BYTE_COST, LEARNING_FACTOR, SHAPE_ENTRIES, Files, Scene, run_finetuning
     from csplat_trainer.finetune.options import FinetuneOptions
 
@@ -164,8 +165,8 @@ def finetune(
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     if data is not None and cameras is not None:
         raise typer.BadParameter("--cameras goes with --self")
-    if itself and (size, images, near) != (None, None, None):
-        raise typer.BadParameter("--size, --images and --near are for the photographs of --data")
+    photographs = data_options(data, size, images, test_every, near)
+    colour = None if background is None else parse_colour(background)
     try:
         options = FinetuneOptions(
             iterations=iterations,
@@ -189,26 +190,23 @@ def finetune(
     check_outputs(outputs, force=force, inputs=(*inputs, resume))
     if again:
         check_output(str(checkpoint), force=True, inputs=tuple(path for path in inputs if path is not None))
-    sources = Sources(
-        data,
-        None if size is None else parse_size(size),
-        images,
-        test_every,
-        near,
-        cameras,
-        views,
-        parse_size(view_size),
-        None if background is None else parse_colour(background),
-        aside,
-        keep,
-        prune_unseen,
-    )
+    find = partial(
+        find_view_set, cameras=cameras, data=photographs, background=colour, count=views, size=parse_size(view_size),
+        aside=aside or _usually_aside(data, cameras, views),
+    )  # fmt: skip
     files = Files(source, output, importance, source_index, log, report, checkpoint, checkpoint_every, resume, lpips)
     scene = Scene(facts, strict)
     if encoding.shape_codebook_size is None:
         encoding = replace(encoding, shape_codebook_size=SHAPE_ENTRIES)
-    found = run_finetuning(files, scene, encoding, sources, options, quiet=quiet)
+    found = run_finetuning(files, scene, encoding, find, options, keep=keep, prune_unseen=prune_unseen, quiet=quiet)
     if as_text:
         say_json(found)
     elif not quiet:
         note(format_report(found))
+
+
+def _usually_aside(data: str | None, cameras: str | None, views: int) -> int | None:
+    """How many views decide which step was best: of photographs some that teach do, of few virtual views few."""
+    if data is not None:
+        return 0
+    return min(_MOST_ASIDE, views // _RENDERS_ASIDE) if cameras is None else None

@@ -7,17 +7,15 @@ from typing import Annotated
 
 import typer
 
+from csplat_tools.commands.data_options import Images, Split, TestEvery, data_options
 from csplat_tools.console import guarded, note, progress_bar
 from csplat_tools.extras import need_renderer, prepare_renderer
 from csplat_tools.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.models import load_model, without_bands
-from csplat_tools.parsing import parse_colour, parse_mode, parse_size, parse_split
-from csplat_tools.photographs import SPLITS, DataViews
+from csplat_tools.parsing import parse_colour, parse_mode, parse_size
 from csplat_tools.rendering import find_cameras, render_film, render_folder
 
 __all__ = ["render"]
-
-_DATA = "Views of a data set"
 
 
 @guarded
@@ -35,15 +33,9 @@ def render(
     data: Annotated[
         str | None, typer.Option(metavar="DATA", help="Instead: where the pictures of a data set were taken.")
     ] = None,
-    split: Annotated[
-        str, typer.Option(metavar="|".join(SPLITS), rich_help_panel=_DATA, help="Which of its pictures.")
-    ] = "test",
-    test_every: Annotated[
-        int, typer.Option(metavar="N", rich_help_panel=_DATA, help="Every Nth picture was held out; see `train`.")
-    ] = 8,
-    images: Annotated[
-        str | None, typer.Option(metavar="NAME", rich_help_panel=_DATA, help="COLMAP: folder of pictures, images_4.")
-    ] = None,
+    split: Split = "test",
+    images: Images = None,
+    test_every: TestEvery = None,
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the pictures: the cameras' own, or 640x480.")
     ] = None,
@@ -84,11 +76,11 @@ def render(
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
     pixels = None if size is None else parse_size(size)
     colour, chosen = parse_colour(background), parse_mode(mode)
-    shots = None if data is None else DataViews(data, parse_split(split), pixels, images, test_every)
+    shots = data_options(data, None if data is None else size, images, test_every, split=split)
     need_renderer()
     loaded = load_model(source)
     model = loaded.model if sh_degree is None else without_bands(loaded.model, sh_degree)
-    views = find_cameras(model, cameras, orbit, shots, pixels)
+    views = find_cameras(model, cameras, orbit, shots, pixels, split=split)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
     with progress_bar(quiet=quiet) as progress:
         rendered = write(

@@ -6,12 +6,14 @@ from typing import Annotated
 
 import typer
 
+from csplat_tools.commands.data_options import Images, Size, TestEvery, data_options
 from csplat_tools.console import format_table, guarded, note, progress_bar, say_json
 from csplat_tools.extras import prepare_renderer
-from csplat_tools.importances import Measured, Wanted, measure_scene
+from csplat_tools.importances import Measured, measure_scene
 from csplat_tools.inout import STANDARD_STREAM, check_output
 from csplat_tools.models import load_model
 from csplat_tools.parsing import parse_colour, parse_size
+from csplat_tools.views import find_view_set
 
 __all__ = ["sensitivity"]
 
@@ -27,8 +29,14 @@ def sensitivity(
     data: Annotated[
         str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views.")
     ] = None,
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
     cameras: Annotated[
-        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own; else virtual ones.")
+        str | None,
+        typer.Option(
+            metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own, without those that judge of 40 or more."
+        ),
     ] = None,
     views: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
@@ -39,7 +47,7 @@ def sensitivity(
     background: Annotated[
         str | None,
         typer.Option(
-            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene, as in training; black, white behind alpha."
+            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, but with --data as in training."
         ),
     ] = None,
     matrices: Annotated[
@@ -68,12 +76,19 @@ def sensitivity(
     if data is not None and cameras is not None:
         raise typer.BadParameter("--data and --cameras both say where to look from: give one of them")
     colour = None if background is None else parse_colour(background)
-    wanted = Wanted(cameras, data, parse_size(view_size), views, colour, matrices, seed, threads)
+    photographs = data_options(data, size, images, test_every)
+    pixels = parse_size(view_size)
     check_output(output, force=force, inputs=tuple(path for path in (source, cameras) if path is not None))
     prepare_renderer(quiet=quiet, simplify=data is None and cameras is None)  # virtual views are looked for
     model = load_model(source).model
+    around = find_view_set(
+        model, cameras=cameras, data=photographs, background=colour, count=views if cameras is None else 0, size=pixels,
+        seed=seed, aside=None if data is None else 0,
+    )  # fmt: skip
+    for line in () if quiet else around.notes:
+        note(line)
     with progress_bar(quiet=quiet) as progress:
-        measured = measure_scene(model, wanted, progress)
+        measured = measure_scene(model, around, matrices=matrices, threads=threads, progress=progress)
     measured.write(output)
     if as_json:
         say_json(measured.as_json())

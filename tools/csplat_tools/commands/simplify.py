@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
 
 from csplat.errors import InputError
+from csplat_tools.commands.data_options import Images, Size, TestEvery, data_options
 from csplat_tools.console import format_table, guarded, note, progress_bar, say_json
 from csplat_tools.extras import prepare_renderer
 from csplat_tools.inout import STANDARD_STREAM, check_outputs, write_array, write_bytes, write_model
 from csplat_tools.models import load_model
-from csplat_tools.parsing import parse_colour, parse_size
+from csplat_tools.parsing import parse_colour, parse_decibels, parse_size
+from csplat_tools.views import find_view_set
 
 __all__ = ["simplify"]
 
@@ -31,20 +32,31 @@ def simplify(
     ] = None,
     max_loss: Annotated[
         str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="How far PSNR against photographs may fall."),
+        typer.Option(
+            metavar="DB", rich_help_panel=_TARGET, help="How far PSNR against photographs may fall; with --data."
+        ),
     ] = None,
     target_psnr: Annotated[
-        float | None, typer.Option(metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders.")
+        float | None,
+        typer.Option(
+            metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders, where it is decided."
+        ),
     ] = None,
     cameras: Annotated[
-        str | None, typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own cameras.")
+        str | None,
+        typer.Option(
+            metavar="FILE.json", rich_help_panel=_VIEWS, help="They judge; of 40 or more, most teach and decide."
+        ),
     ] = None,
     data: Annotated[
         str | None,
         typer.Option(
-            metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views; its test pictures judge."
+            metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views; held-out photographs judge."
         ),
     ] = None,
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
     views: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
     ] = 160,
@@ -54,13 +66,9 @@ def simplify(
     background: Annotated[
         str | None,
         typer.Option(
-            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene, as in training; black, white behind alpha."
+            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, but with --data as in training."
         ),
     ] = None,
-    photo_psnr: Annotated[
-        float,
-        typer.Option(metavar="DB", rich_help_panel=_VIEWS, help="What the source reaches, for --max-loss alone."),
-    ] = 30.0,
     method: Annotated[
         str,
         typer.Option(metavar="rounds|exact|opacity|opacity-area", rich_help_panel=_HOW, help="What splats go by."),
@@ -98,8 +106,9 @@ def simplify(
     What the removal of each splat would change is measured exactly, in many
     small views from all around, again and again as splats go. Then colours,
     opacities and scales of the others are fitted to what the source looks
-    like. No photographs are needed; with --data, the test pictures judge a
-    --max-loss. Needs the packages of the render extra.
+    like. How much may go is decided in views that teach nothing, and neither
+    of them judge. No photographs are needed but for --max-loss. Needs the
+    packages of the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -109,11 +118,10 @@ def simplify(
     prepare_renderer(quiet=quiet, simplify=True)
     from csplat_tools.simplify import SimplifyOptions, Target
     from csplat_tools.simplify import simplify as simplified
-    from csplat_tools.simplify.files import find_sights, parse_target
 
     colour = None if background is None else parse_colour(background)
     try:
-        target = Target(keep, target_psnr, None if max_loss is None else parse_target(max_loss))
+        target = Target(keep, target_psnr, None if max_loss is None else parse_decibels(max_loss))
         options = SimplifyOptions(
             method=method,
             rounds=rounds,
@@ -121,26 +129,28 @@ def simplify(
             adjust=adjust,
             bands=bands,
             keep_unseen=not drop_unseen,
-            views=views,
             view_size=parse_size(view_size),
-            photo_psnr=photo_psnr,
             seed=seed,
             threads=threads,
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
+    if max_loss is not None and data is None:
+        raise typer.BadParameter("--max-loss wants --data: photographs say what is lost")
+    photographs = data_options(data, size, images, test_every)
     if as_json and output == STANDARD_STREAM:
         raise typer.BadParameter("--json and - both want standard output")
     if STANDARD_STREAM in (report, source_index):
         raise typer.BadParameter("--report and --source-index want names of files")
     check_outputs((output, report, source_index), force=force, inputs=(source, cameras))
     model = load_model(source).model
-    sights = find_sights(model, cameras, data, judged=max_loss is not None, background=colour)
-    options = replace(options, background=sights.background)
+    around = find_view_set(
+        model, cameras=cameras, data=photographs, background=colour, count=views, size=options.view_size, seed=seed
+    )
+    for line in () if quiet else around.notes:
+        note(line)
     with progress_bar(quiet=quiet) as progress:
-        result = simplified(
-            model, sights.cameras, target=target, options=options, photographs=sights.photographs, progress=progress
-        )
+        result = simplified(model, around, target=target, options=options, progress=progress)
     write_model(output, result.model, absolute=False)
     if source_index is not None:
         write_array(source_index, result.source_index)
@@ -165,8 +175,14 @@ def _tell(report: dict[str, Any]) -> None:
     )
     rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
     rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))
+    if "decided_psnr" in report:
+        rows.append(("the views that decide", f"{report['decided_psnr']:.2f}"))
     if "psnr" in report:
-        rows.append(("the target's views", f"{report['psnr']:.2f}"))
+        rows.append((f"the {report['judged_by']['views']} views that judge", f"{report['psnr']:.2f}"))
+    if "photographs" in report:
+        scores = report["photographs"]
+        rows.append(("held-out photographs, source", f"{scores['source']:.2f}"))
+        rows.append(("held-out photographs", f"{scores['psnr']:.2f}"))
     note(format_table(("PSNR", "dB"), rows))
     if report["zero_bands"]:
         shares = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]

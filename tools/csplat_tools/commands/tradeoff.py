@@ -12,11 +12,11 @@ import typer
 
 from csplat.encoder import PRESETS
 from csplat.errors import InputError
+from csplat_tools.commands.data_options import Images, Size, TestEvery, data_options
 from csplat_tools.console import guarded, note, say
 from csplat_tools.extras import need_pictures, need_plots, prepare_renderer
 from csplat_tools.inout import STANDARD_STREAM, check_outputs, write_bytes
-from csplat_tools.parsing import parse_mode, parse_size
-from csplat_tools.photographs import DataViews
+from csplat_tools.parsing import parse_mode
 from csplat_tools.tradeoff.options import FAMILIES, USUAL, Wanted, parse_numbers, parse_sizes, parse_words
 
 __all__ = ["tradeoff"]
@@ -70,21 +70,15 @@ def tradeoff(
     ] = ",".join(Wanted.modes),
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="FILE.json", rich_help_panel=_JUDGES, help="Cameras, instead of eight virtual ones."),
+        typer.Option(metavar="FILE.json", rich_help_panel=_JUDGES, help="Cameras that judge; of 40 or more some."),
     ] = None,
     data: Annotated[
         str | None,
         typer.Option(metavar="DATA", rich_help_panel=_JUDGES, help="Posed photographs: those held out judge."),
     ] = None,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", rich_help_panel=_JUDGES, help="Scale the photographs to this size.")
-    ] = None,
-    images: Annotated[
-        str | None, typer.Option(metavar="NAME", rich_help_panel=_JUDGES, help="COLMAP: folder of pictures, images_4.")
-    ] = None,
-    test_every: Annotated[
-        int, typer.Option(metavar="N", rich_help_panel=_JUDGES, help="Every Nth photograph was held out; see `train`.")
-    ] = 8,
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
     lpips: Annotated[
         str | None,
         typer.Option(
@@ -118,12 +112,9 @@ def tradeoff(
     wanted = _wanted(what, with_finetune, preset, lists, iterations, modes, threads)
     if cameras is not None and data is not None:
         raise typer.BadParameter("wanted one of --cameras and --data")
-    if data is None and (size is not None or images is not None):
-        raise typer.BadParameter("--size and --images are for the pictures of --data")
     if STANDARD_STREAM in (output, plots):
         raise typer.BadParameter("-o and --plots want names; --json alone may be -")
-    pixels = None if size is None else parse_size(size)
-    shots = None if data is None else DataViews(data, "test", pixels, images, test_every)
+    shots = data_options(data, size, images, test_every)
     inputs = (source, cameras, None if lpips == "auto" else lpips)
     for path in inputs:
         if path not in (None, STANDARD_STREAM):
@@ -136,14 +127,16 @@ def tradeoff(
     need_pictures()
     from csplat_tools.tradeoff.outputs import check_plots, write_page, write_plots
     from csplat_tools.tradeoff.running import measure_tradeoff
-    from csplat_tools.tradeoff.setting import Inputs, read_setting
+    from csplat_tools.tradeoff.setting import read_setting
     from csplat_tools.tradeoff.tables import format_tradeoff
 
     check_plots(plots, force=force)
-    setting = read_setting(Inputs(source, shots, cameras, lpips), deciding=slow)
+    setting = read_setting(source, cameras=cameras, data=shots, lpips=lpips)
     for finding in setting.findings:
         if not quiet or finding.kind == "repair":
             note(str(finding))
+    for line in () if quiet else setting.views.notes:
+        note(line)
     measured = measure_tradeoff(setting, wanted, quiet=quiet)
     if as_json is not None:
         write_bytes(as_json, json.dumps(measured.as_json(), indent=1, allow_nan=False).encode() + b"\n")

@@ -19,8 +19,8 @@ from csplat.encoder import EncodeOptions, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.compare import comparison_cameras
 from csplat_tools.rate.bounds import meet_bounds
 from csplat_tools.rate.choosing import Chooser, Goal
 from csplat_tools.rate.exchange import BYTES_PER_DB
@@ -30,8 +30,8 @@ from csplat_tools.rate.search import Window, meet
 from csplat_tools.rate.summary import summary
 from csplat_tools.rate.targets import RateResult, RateTarget
 from csplat_tools.rate.trials import Choice, Part, Trial, Trials
-from csplat_tools.simplify.judge import Judge
 from csplat_tools.simplify.options import SimplifyOptions
+from csplat_tools.views import ViewSet, comparison_cameras, find_view_set, with_deciders
 
 __all__ = ["encode_to_target"]
 
@@ -111,8 +111,10 @@ def encode_to_target(
             return bounded.as_result()
         encoding, files = bounded.encoding, bounded.encodes
     judging = comparison_cameras(source) if cameras is None else evenly(cameras, _MOST_CAMERAS)
-    judge = Judge.of_source(source, judging, background, encoding.threads)
-    if cameras is not None and all(np.ptp(wanted, axis=(0, 1)).max() == 0.0 for wanted in judge.wanted):
+    judge = Judge.of_source(source, judging, background, threads=encoding.threads)
+    if cameras is not None and all(
+        np.ptp(judge.look(number).picture, axis=(0, 1)).max() == 0.0 for number in range(len(judging))
+    ):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
     deciding = None if cameras is None or len(cameras) < _ENOUGH_CAMERAS else list(cameras)
     inside = deciding is None and scene_frame(source).kind == "surrounding"
@@ -122,8 +124,11 @@ def encode_to_target(
     )
     pruner = None
     if blocked is None and prune is not False and not unsure:
-        options = SimplifyOptions(views=views, background=background, threads=encoding.threads)
-        pruner = Pruner(source, deciding, options, progress)
+        if deciding is None:
+            around = find_view_set(source, background=background, count=views)
+        else:
+            around = with_deciders(ViewSet("cameras", background, deciding, (), ()))
+        pruner = Pruner(source, around, SimplifyOptions(background=background, threads=encoding.threads), progress)
     trials = Trials(source, encoding, judge, importance, progress, graded.importance)
     search = _Search(source, encoding, trials, Chooser(trials, source, encoding), pruner)
     found = search.at_psnr(target.psnr) if target.psnr is not None else search.at_size(target.size_bytes or 0)

@@ -14,8 +14,8 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_tools.importances import measured_importance
-from csplat_tools.simplify.views import VIEW_SIZE, camera_sequence
 from csplat_tools.simplifying import DEFAULT_VIEWS
+from csplat_tools.views import VIEW_SIZE, camera_sequence
 
 __all__ = ["Graded", "evenly", "graded_by", "measuring_views"]
 

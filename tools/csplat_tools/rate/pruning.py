@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat_render import Camera
 from csplat_tools.rate.exchange import LEAST_QUANTISED, error_at_size, error_of_psnr, log_bytes_at_error
 from csplat_tools.rate.trials import Part
 from csplat_tools.simplify.options import SimplifyOptions
 from csplat_tools.simplify.order import Order, removal_order
-from csplat_tools.simplify.views import Views, find_views
+from csplat_tools.simplify.views import Measured, find_views
+from csplat_tools.views import ViewSet
 
 __all__ = ["Pruner"]
 
@@ -39,13 +39,13 @@ class Pruner:
     def __init__(
         self,
         source: SplatModel,
-        cameras: list[Camera] | None,
+        around: ViewSet,
         options: SimplifyOptions,
         progress: Callable[[str, float], None] | None,
     ) -> None:
-        self._source, self._cameras, self._progress = source, cameras, progress
+        self._source, self._around, self._progress = source, around, progress
         self._options = replace(options, rounds=_ROUNDS)
-        self._views: Views | None = None
+        self._views: Measured | None = None
         self._order: Order | None = None
         self._left = 0
         self.renders = 0
@@ -111,14 +111,14 @@ class Pruner:
         views, order = self._prepared(left)
         return self._without(views, order, min(len(self._source) - left, len(order.rows)))
 
-    def _prepared(self, wanted: int) -> tuple[Views, Order]:
+    def _prepared(self, wanted: int) -> tuple[Measured, Order]:
         """Views and an order that leaves fewer splats than are wanted: they may turn out to be too many."""
         left = max(1, round(_LEAST_LEFT * wanted))
         options = self._options
         if self._views is None:
             self._views = find_views(
-                self._source, self._cameras, 1.0 - left / len(self._source), size=options.view_size, most=options.views,
-                seed=options.seed, background=options.background, threads=options.threads, progress=self._progress,
+                self._source, self._around, 1.0 - left / len(self._source), size=options.view_size,
+                threads=options.threads, progress=self._progress,
             )  # fmt: skip
             self.renders += len(self._views.used) + len(self._views.check)
         if self._order is None or left < self._left:
@@ -128,7 +128,7 @@ class Pruner:
             self.renders += len(self._views.used) * max(0, len(self._order.rounds) - 1)
         return self._views, self._order
 
-    def _without(self, views: Views, order: Order, gone: int) -> Part:
+    def _without(self, views: Measured, order: Order, gone: int) -> Part:
         rows = order.kept(len(self._source), gone)
         said = {"splats": len(self._source), "gone": gone, "views": len(views.used)}
         return Part(self._source.select(rows), rows, said)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
 from csplat.model import SplatModel
+from csplat_render.judge import Judge
 from csplat_render.metrics import psnr_of_mse
-from csplat_tools.simplify.judge import Judge
 
 __all__ = ["Choice", "Part", "Trial", "Trials", "spread_of"]
 
@@ -179,7 +179,7 @@ class Trials:
         place = next(i for i, one in enumerate(self.made) if one.result is trial.result)
         if not math.isnan(self.made[place].psnr):
             return self.made[place]
-        errors = self.judge.view_errors(decode(trial.result.data))
+        errors = self.judge.errors(decode(trial.result.data))
         self.renders += len(errors)
         seen = replace(trial, psnr=psnr_of_mse(self.judge.pooled(errors)), errors=errors)
         self._offset = psnr_of_mse(self.judge.some(self._few).pooled(errors[self._few])) - seen.psnr
@@ -188,7 +188,7 @@ class Trials:
 
     def seen(self, model: SplatModel) -> float:
         """PSNR of some splats, not coded, from all views."""
-        errors = self.judge.view_errors(model)
+        errors = self.judge.errors(model)
         self.renders += len(errors)
         return psnr_of_mse(self.judge.pooled(errors))
 
@@ -196,7 +196,7 @@ class Trials:
         """PSNR of some splats from a few views, corrected by how these differed from all for the last file."""
         few = self.judge.some(self._few)
         self.renders += len(self._few)
-        return psnr_of_mse(few.pooled(few.view_errors(model))) - self._offset
+        return psnr_of_mse(few.pooled(few.errors(model))) - self._offset
 
 
 def spread_of(errors: F64) -> float:

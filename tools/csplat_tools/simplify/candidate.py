@@ -9,10 +9,10 @@ from typing import Any
 from csplat.decoder import decode
 from csplat.encoder import Draft, EncodeOptions, EncodeResult, Importance, Origin, most_grades
 from csplat.model import SplatModel
+from csplat_render.judge import Judge
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import Session
-from csplat_tools.simplify.judge import Judge
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 

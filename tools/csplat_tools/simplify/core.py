@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
+from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.virtual import scene_frame, virtual_cameras
+from csplat_render.virtual import scene_frame
 from csplat_tools.simplify.colours import Fitted, fit
-from csplat_tools.simplify.judge import Judge, loss_as_psnr, render_pictures
 from csplat_tools.simplify.options import SimplifyOptions, Target
 from csplat_tools.simplify.order import Order, removal_order
-from csplat_tools.simplify.views import Views, find_views
+from csplat_tools.simplify.views import Measured, find_views
+from csplat_tools.views import ViewSet, find_view_set
 
-__all__ = ["Session", "Simplified", "find_judge", "most_gone", "prepare", "simplify"]
+__all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "simplify"]
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
@@ -31,7 +31,6 @@ Progress = Callable[[str, float], None]
 
 _TRIES = 3  # fits on the way to a target PSNR
 _BANDS_WORTH = 1.0  # dB that absent SH bands may cost; a fit that loses more has failed
-_PSNR_VIEWS = (8, 640, 480)  # those of `psnr`
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +59,20 @@ class Session:
     Attributes:
         source: the scene.
         options: how to go about it.
-        views: cameras that decide, and others.
-        wanted: what the source looks like from the cameras that decide.
+        around: from where it is looked at.
+        views: those that teach, and others.
+        wanted: what the source looks like from the views that teach.
         order: of removal.
         checked: judges by views that were not used.
         seconds: by stage.
-        inside: virtual views of surroundings decide, which do not stand where cameras do: they may say what is left
+        inside: virtual views of surroundings teach, which do not stand where cameras do: they may say what is left
             out, but not how precise the rest has to be.
     """
 
     source: SplatModel
     options: SimplifyOptions
-    views: Views
+    around: ViewSet
+    views: Measured
     wanted: list[F32]
     order: Order
     checked: Judge
@@ -93,105 +94,107 @@ class Session:
 
 def prepare(
     source: SplatModel,
-    cameras: Sequence[Camera] | None,
+    views: ViewSet | None,
     left: int | None,
     options: SimplifyOptions,
     progress: Progress | None = None,
 ) -> Session:
-    """Choose views, render the source, find the order of removal.
+    """Render the source, find the order of removal.
 
     Args:
         source: the scene.
-        cameras: the user's own, or None for virtual ones.
+        views: from where it is looked at; None for virtual views.
         left: splats that are to stay; None if it is not known yet.
         options: how to go about it.
         progress: is told how much is done.
     """
     seconds = {}
     start = time.perf_counter()
-    views = find_views(
-        source, cameras, 0.5 if left is None else 1.0 - left / len(source), size=options.view_size, most=options.views,
-        seed=options.seed, background=options.background, threads=options.threads, progress=progress,
-    )  # fmt: skip
-    wanted = render_pictures(source, views.used, background=options.background, threads=options.threads)
-    checked = Judge.of_source(source, views.check, options.background, options.threads)
+    around = views or find_view_set(
+        source, background=options.background, count=options.views, size=options.view_size, seed=options.seed
+    )
+    options = replace(options, background=around.background)
+    gone = 0.5 if left is None else 1.0 - left / len(source)
+    found = find_views(source, around, gone, size=options.view_size, threads=options.threads, progress=progress)
+    draw = renderer(source, around.background, threads=options.threads)
+    wanted = [draw(camera).rgb for camera in found.used]
+    checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    order = removal_order(source, views, options, left, progress)
+    order = removal_order(source, found, options, left, progress)
     seconds["rounds"] = time.perf_counter() - start
-    inside = cameras is None and scene_frame(source).kind == "surrounding"
-    return Session(source, options, views, wanted, order, checked, seconds, inside)
+    inside = around.virtual and scene_frame(source).kind == "surrounding"
+    return Session(source, options, around, found, wanted, order, checked, seconds, inside)
 
 
 def simplify(
     source: SplatModel,
-    cameras: Sequence[Camera] | None = None,
+    views: ViewSet | None = None,
     *,
     target: Target,
     options: SimplifyOptions | None = None,
-    photographs: tuple[Sequence[Camera], Sequence[F32]] | None = None,
     progress: Progress | None = None,
 ) -> Simplified:
     """Remove splats until a target is met, fit the colours of the others, drop SH bands.
 
     Args:
         source: the scene.
-        cameras: views that matter, relative to the scene's origin; every eighth is kept aside to check by. None for
-            virtual ones, as many as it takes.
+        views: what stays is fitted in those that teach; those that decide say how much may go. None for virtual ones,
+            as many as it takes.
         target: how many splats stay, or how good the result is to be.
         options: how to go about it.
-        photographs: cameras and what was photographed there, [H, W, 3] in 0..1, for a largest loss of PSNR.
         progress: is told the stages.
 
     Returns:
         The smaller scene; its splats are in the source's order.
 
     Raises:
-        InputError: a scene without splats, fewer than two cameras, or a target that even the source misses.
+        InputError: a scene without splats, views that do not teach or decide, or a target that even the source misses.
     """
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
+    if target.max_loss is not None and (views is None or not views.photographs):
+        raise InputError("a loss against photographs wants photographs: name a data set")
     left = None if target.keep is None else target.count(len(source))
-    session = prepare(source, cameras, left, options, progress)
+    session = prepare(source, views, left, options, progress)
     start = time.perf_counter()
     if left is not None:
         gone = min(len(source) - left, len(session.order.rows))
         result = _finished(session, gone, None, progress)
     else:
-        judge, goal = find_judge(source, cameras, target, options, session, photographs)
-        result = _search(session, judge, goal, progress)
+        result = _search(session, *find_decider(session, target), progress)
     session.seconds["fit"] = time.perf_counter() - start
-    return replace(result, report=_report(session, result, target))
+    return replace(result, report={**_report(session, result, target), **_judged(session, result.model)})
 
 
-def find_judge(
-    source: SplatModel,
-    cameras: Sequence[Camera] | None,
-    target: Target,
-    options: SimplifyOptions,
-    session: Session,
-    photographs: tuple[Sequence[Camera], Sequence[F32]] | None,
-) -> tuple[Judge, float]:
-    """Who judges a simplified scene, and the PSNR that is to be reached, 99 where none is asked for.
+def find_decider(session: Session, target: Target) -> tuple[Judge, float]:
+    """Who decides how much may go, and the PSNR that is to be reached, 99 where none is asked for.
 
     Args:
-        source: the scene.
-        cameras: the user's own, or None.
+        session: the views that decide are none of those that judge.
         target: what is asked for.
-        options: background, what the source is taken to reach against photographs.
-        session: views that were kept aside judge where the user's own cameras are used.
-        photographs: as for `simplify`.
     """
-    if target.max_loss is not None and photographs is not None:
-        judge = Judge(*photographs, background=options.background, threads=options.threads)
-        return judge, judge.psnr(source) - target.max_loss
-    goal = PSNR_CAP if target.psnr is None else target.psnr
+    around, threads = session.around, session.options.threads
     if target.max_loss is not None:
-        goal = loss_as_psnr(target.max_loss, options.photo_psnr)
-    if cameras is not None:
-        return session.checked, goal
-    return Judge.of_source(source, virtual_cameras(source, *_PSNR_VIEWS), options.background, options.threads), goal
+        decider = around.photograph_decider(threads=threads)
+        return decider, decider.psnr(session.source) - target.max_loss
+    return around.decider(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
+
+
+def _judged(session: Session, model: SplatModel) -> dict[str, Any]:
+    """What the views that judge say of the result; nothing where none do."""
+    around, threads = session.around, session.options.threads
+    if not around.judges:
+        return {}
+    said: dict[str, Any] = {
+        "psnr": around.judge(session.source, threads=threads).psnr(model),
+        "judged_by": {"cameras": around.name, "views": len(around.judges)},
+    }
+    if around.photographs:
+        judge = around.photograph_judge(threads=threads)
+        said["photographs"] = {"source": judge.psnr(session.source), "psnr": judge.psnr(model)}
+    return said
 
 
 def _finished(session: Session, gone: int, judge: Judge | None, progress: Progress | None) -> Simplified:
@@ -211,7 +214,7 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
         model, stays = pruned, None  # overfitted: what was not looked at is worse than before
         report["check_psnr"], report["refit_refused"] = report["check_psnr_pruned"], True
     if judge is not None:
-        report["psnr_pruned"], report["psnr"] = judge.psnr(pruned), judge.psnr(model)
+        report["decided_psnr_pruned"], report["decided_psnr"] = judge.psnr(pruned), judge.psnr(model)
     return Simplified(model, rows, threshold, stays, report)
 
 
@@ -224,14 +227,14 @@ def _search(session: Session, judge: Judge, goal: float, progress: Progress | No
     for _ in range(_TRIES):
         gone = most_gone(session, judge, goal - gain, lowest)
         result = _finished(session, gone, judge, progress)
-        reached = result.report["psnr"]
+        reached = result.report["decided_psnr"]
         if reached >= goal:
             if best is None or len(result.model) < len(best.model):
                 best = result
             lowest = gone
         if gone == 0 or abs(reached - goal) < 0.05:
             break
-        gain = reached - result.report["psnr_pruned"] - (0.0 if reached >= goal else goal - reached)
+        gain = reached - result.report["decided_psnr_pruned"] - (0.0 if reached >= goal else goal - reached)
     if best is not None:
         return best
     return _unchanged(session, judge)
@@ -252,7 +255,8 @@ def most_gone(session: Session, judge: Judge, goal: float, lowest: int = 0) -> i
 def _unchanged(session: Session, judge: Judge) -> Simplified:
     source = session.source
     score = session.checked.psnr(source)
-    report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score, "fit_errors": [], "psnr": judge.psnr(source)}
+    report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score, "fit_errors": []}
+    report["decided_psnr"] = judge.psnr(source)
     return Simplified(source, np.arange(len(source)), 0.0, None, report)
 
 

@@ -18,13 +18,13 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render import Camera
+from csplat_render.judge import Judge
 from csplat_tools.rate.search import Window, meet
 from csplat_tools.simplify.candidate import Candidate, SimplifiedFile
-from csplat_tools.simplify.core import Session, find_judge, most_gone, prepare
-from csplat_tools.simplify.judge import Judge, loss_as_psnr
+from csplat_tools.simplify.core import Session, find_decider, most_gone, prepare
 from csplat_tools.simplify.options import SimplifyOptions, Target
 from csplat_tools.simplify.sizing import count_at_psnr, first_count, next_count
+from csplat_tools.views import ViewSet
 
 __all__ = ["SimplifiedFile", "encode_simplified"]
 
@@ -48,28 +48,24 @@ _FEWER = 0.7  # of the splats, where a size holds none of their files
 
 def encode_simplified(
     source: SplatModel,
-    cameras: Sequence[Camera] | None = None,
+    views: ViewSet | None = None,
     *,
     target: Target,
     encoding: EncodeOptions | None = None,
     options: SimplifyOptions | None = None,
-    photographs: tuple[Sequence[Camera], Sequence[F32]] | None = None,
-    judged_by: Sequence[Camera] | None = None,
     progress: Progress | None = None,
 ) -> SimplifiedFile:
     """Simplify a scene and encode it.
 
     Args:
         source: the scene.
-        cameras: as for `simplify`.
+        views: as for `simplify`.
         target: `keep`: the encoder's own options decide the rest. `psnr` and `max_loss`: of the file against the
             source or the photographs; number of splats and precision are chosen together, and `attribute_psnr` is not
             looked at; the smallest of several files is returned, that of the whole scene among them. `size_bytes`:
             the best of several files within it.
         encoding: of the encoder.
         options: of the simplification.
-        photographs: as for `simplify`.
-        judged_by: cameras from which a PSNR against the source is taken, instead of those of `simplify`.
         progress: is told the stages.
 
     Raises:
@@ -79,10 +75,10 @@ def encode_simplified(
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
     left = None if target.keep is None else target.count(len(source))
-    session = prepare(source, cameras, left, options, progress)
-    judge, goal = find_judge(source, cameras, target, options, session, photographs)
-    if judged_by is not None:
-        judge = Judge.of_source(source, judged_by, options.background, options.threads)
+    if target.max_loss is not None and (views is None or not views.photographs):
+        raise InputError("a loss against photographs wants photographs: name a data set")
+    session = prepare(source, views, left, options, progress)
+    judge, goal = find_decider(session, target)
     if left is not None:
         gone = min(len(source) - left, len(session.order.rows))
         return Candidate(session, gone, judge, progress).encoded(encoding, encoding.attribute_psnr)
@@ -94,9 +90,11 @@ def encode_simplified(
         codings = ["codebook", "scalar"]  # which of them is smaller depends on the PSNR, too
     choices = [replace(encoding, sh_coding=coding) for coding in codings]
     by_source, allowed, slope = judge, goal, 1.0
-    if target.max_loss is not None and photographs is not None:
-        # Photographs are missed by far more than what may be lost: room is measured by the source's renders.
-        by_source, allowed = session.checked, loss_as_psnr(target.max_loss, goal + target.max_loss)
+    if target.max_loss is not None:
+        # Photographs are missed by far more than what may be lost: room is measured by the source's renders. The
+        # source's own error is taken as independent of what is lost, so that the two squared errors add up.
+        by_source = session.checked
+        allowed = goal + target.max_loss - 10.0 * math.log10(10.0 ** (target.max_loss / 10.0) - 1.0)
         slope = 1.0 - 10.0 ** (-target.max_loss / 10.0)  # the share of the error that a file's own makes up
     quality = min(max(allowed + _LOSS[has_sh], _QUALITIES[0]), _QUALITIES[1])
     search = _Search(goal, quality, slope)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from csplat.errors import InputError
-from csplat_tools.simplify.views import VIEW_SIZE
+from csplat_tools.views import VIEW_SIZE
 
 __all__ = ["METHODS", "SimplifyOptions", "Target"]
 
@@ -20,8 +20,8 @@ class Target:
 
     Attributes:
         keep: share of the splats that stay, above 0, at most 1.
-        psnr: dB of the result against the source's renders.
-        max_loss: dB that PSNR against photographs may fall.
+        psnr: dB of the result against the source's renders, in the views that decide.
+        max_loss: dB that PSNR against photographs may fall, in the views that decide.
         size_bytes: of the file at most, when one is written.
 
     Raises:
@@ -64,12 +64,10 @@ class SimplifyOptions:
         passes: how often that looks at each view.
         bands: set SH bands to zero that are worth less than their bits.
         keep_unseen: splats that no view shows stay.
-        views: virtual views at most.
-        view_size: of the pictures that decide, width and height in pixels.
-        background: red, green, blue behind everything.
-        photo_psnr: what the source is taken to reach against photographs, dB, where a loss is the target and no
-            photographs are given.
-        seed: of the virtual views.
+        view_size: of the pictures that teach, width and height in pixels.
+        views: virtual views at most, where no views are given.
+        background: red, green, blue behind those; of views that are given theirs counts.
+        seed: of those, and of the order in which views are looked at.
         threads: how many; None for all. The result does not depend on it.
 
     Raises:
@@ -84,10 +82,9 @@ class SimplifyOptions:
     passes: int = 2
     bands: bool = True
     keep_unseen: bool = True
-    views: int = 160
     view_size: tuple[int, int] = VIEW_SIZE
+    views: int = 160
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    photo_psnr: float = 30.0
     seed: int = 0
     threads: int | None = None
 
@@ -97,7 +94,5 @@ class SimplifyOptions:
         for name in ("rounds", "steps", "passes", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
-        if not 0.0 < self.photo_psnr <= 99.0:
-            raise InputError(f"photo_psnr is {self.photo_psnr:g} dB, wanted above 0, at most 99")
         if min(self.view_size) < 1:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")

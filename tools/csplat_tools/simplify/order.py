@@ -12,7 +12,7 @@ from csplat.model import SplatModel
 from csplat_render.cloud import surface_areas
 from csplat_render.removal import measure_removal
 from csplat_tools.simplify.options import SimplifyOptions
-from csplat_tools.simplify.views import Views, removal_keys
+from csplat_tools.simplify.views import Measured, removal_keys
 
 __all__ = ["Order", "Round", "removal_order"]
 
@@ -61,7 +61,7 @@ class Order:
 
 def removal_order(
     model: SplatModel,
-    views: Views,
+    views: Measured,
     options: SimplifyOptions,
     left: int | None,
     progress: Callable[[str, float], None] | None = None,

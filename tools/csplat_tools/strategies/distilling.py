@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.judge import Judge, renderer
 from csplat_render.refit import fit_colours
 from csplat_tools.models import without_bands
-from csplat_tools.simplify.judge import Judge, render_pictures
-from csplat_tools.simplify.views import camera_sequence, reduced, split_views
+from csplat_tools.views import ViewSet, reduced
 
 __all__ = ["Teacher"]
 
@@ -51,31 +51,28 @@ class Teacher:
     def of_source(
         cls,
         source: SplatModel,
-        cameras: Sequence[Camera] | None,
+        views: ViewSet,
         *,
-        views: int,
-        seed: int = 0,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         threads: int | None = None,
     ) -> Teacher:
         """Look at a source.
 
         Args:
             source: the scene.
-            cameras: views that matter, relative to the scene's origin; None for virtual ones. Every eighth is kept
-                aside to check by. Pictures are made smaller where they are large.
-            views: how many virtual ones, at least 2.
-            seed: of the virtual ones.
-            background: behind everything.
+            views: colours are fitted in those that teach, and checked in those that decide. Pictures are made smaller
+                where they are large.
             threads: how many.
 
         Raises:
-            InputError: there are fewer than two views.
+            InputError: no view teaches, or none decides.
         """
-        every = camera_sequence(source, views, seed=seed) if cameras is None else reduced(cameras)
-        used, aside = split_views(every)
-        wanted = render_pictures(source, used, background=background, threads=threads)
-        return cls(used, wanted, Judge.of_source(source, aside, background, threads), background, threads)
+        if not views.teaches:
+            raise InputError("no view is left to learn colours from")
+        used, aside = reduced(views.teaches), reduced(views.decides)
+        draw = renderer(source, views.background, threads=threads)
+        wanted = [draw(camera).rgb for camera in used]
+        check = Judge.of_source(source, aside, views.background, threads=threads)
+        return cls(used, wanted, check, views.background, threads)
 
     def taught(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
         """The scene with bands up to a degree, its colours such that it looks like the source as nearly as they can.

@@ -6,7 +6,7 @@ scene states are those against the source, which the encoder has not seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,11 +18,10 @@ from csplat.model import SplatModel
 from csplat_tools.strategies.reduction import Reduction, find_teacher, reduced_by, target_degree
 
 if TYPE_CHECKING:
-    from csplat_render import Camera
+    from csplat_tools.views import ViewSet
 
 __all__ = ["encode_reduced"]
 
-Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
 
 _KEY = "reduced"
@@ -33,8 +32,7 @@ def encode_reduced(
     reduction: Reduction,
     encoding: EncodeOptions | None = None,
     *,
-    cameras: Sequence[Camera] | None = None,
-    background: Colour = (0.0, 0.0, 0.0),
+    views: ViewSet | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Prune, take SH bands away, cluster, encode.
@@ -43,8 +41,7 @@ def encode_reduced(
         source: the scene.
         reduction: what is done to it. Its `sh_degree`, where it is None, is that of `encoding`.
         encoding: of the encoder.
-        cameras: views to distil by, relative to the scene's origin; None for virtual ones.
-        background: behind everything, in those views.
+        views: those that teach and those that check what is distilled; None for virtual ones.
         progress: is told the stages.
 
     Returns:
@@ -59,7 +56,7 @@ def encode_reduced(
         reduction = replace(reduction, sh_degree=encoding.sh_degree)
     degree = target_degree(source, reduction)
     encoding = replace(encoding, sh_degree=degree)
-    teacher = find_teacher(source, reduction, cameras, background)
+    teacher = find_teacher(source, reduction, views)
     clusters = reduction.kmeans is not None
     reduced = reduced_by(source, reduction, teacher if clusters else None, progress)
     said, origin = dict(reduced.said), Origin(len(source), reduced.source_index, refitted=teacher is not None)

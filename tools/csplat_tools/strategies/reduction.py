@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,14 +17,15 @@ from csplat_tools.strategies.pruning import check_threshold, prune_opacity
 from csplat_tools.strategies.sizes import attribute_floats, raw_bytes
 
 if TYPE_CHECKING:
-    from csplat_render import Camera
     from csplat_tools.strategies.distilling import Teacher
+    from csplat_tools.views import ViewSet
 
 __all__ = ["Reduced", "Reduction", "find_teacher", "reduce_model", "reduced_by", "target_degree"]
 
 I64 = NDArray[np.int64]
-Colour = tuple[float, float, float]
 Progress = Callable[[str, float], None]
+
+_ASIDE = 8  # one of so many virtual views checks
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,8 @@ class Reduced:
 def reduce_model(
     source: SplatModel,
     reduction: Reduction,
-    cameras: Sequence[Camera] | None = None,
+    views: ViewSet | None = None,
     *,
-    background: Colour = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> Reduced:
     """Prune, take SH bands away, cluster.
@@ -100,14 +100,13 @@ def reduce_model(
     Args:
         source: the scene.
         reduction: what is to be done.
-        cameras: views to distil by, relative to the scene's origin; None for virtual ones.
-        background: behind everything, in those views.
+        views: those that teach and those that check what is distilled; None for virtual ones.
         progress: is told how much is done.
 
     Raises:
         InputError: nothing would be left; or there is nothing to distil, or too few views to do it by.
     """
-    teacher = find_teacher(source, reduction, cameras, background)
+    teacher = find_teacher(source, reduction, views)
     return reduced_by(source, reduction, teacher, progress)
 
 
@@ -137,9 +136,7 @@ def target_degree(source: SplatModel, reduction: Reduction) -> int:
     return source.sh_degree if reduction.sh_degree is None else min(reduction.sh_degree, source.sh_degree)
 
 
-def find_teacher(
-    source: SplatModel, reduction: Reduction, cameras: Sequence[Camera] | None, background: Colour
-) -> Teacher | None:
+def find_teacher(source: SplatModel, reduction: Reduction, views: ViewSet | None) -> Teacher | None:
     """Who teaches the lower degree; None where nothing is distilled.
 
     Raises:
@@ -154,6 +151,9 @@ def find_teacher(
         )
     from csplat_tools.strategies.distilling import Teacher  # wants numba; the other strategies do not
 
-    return Teacher.of_source(
-        source, cameras, views=reduction.views, seed=reduction.seed, background=background, threads=reduction.threads
-    )
+    if views is None:
+        from csplat_tools.views import find_view_set
+
+        aside = max(1, reduction.views // _ASIDE)
+        views = find_view_set(source, count=reduction.views - aside, aside=aside, seed=reduction.seed)
+    return Teacher.of_source(source, views, threads=reduction.threads)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
-from csplat_render import Camera, render
-from csplat_render.metrics import psnr_of_mse, squared_error
-from csplat_render.rasterise import Rasteriser
-from csplat_tools.compare import Comparison, SourceView, compare_models, render_source
+from csplat_render.cameras import relative_to
+from csplat_render.judge import renderer
+from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_tools.console import Report
 from csplat_tools.layout import describe
-from csplat_tools.photographs import PhotographScores, relative_to
 from csplat_tools.tradeoff.fetching import fetched_bytes
 from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
 from csplat_tools.tradeoff.setting import Setting
@@ -35,8 +33,6 @@ F32 = NDArray[np.float32]
 DECODE_RUNS = 3
 #: Views at most from which rendering is timed.
 TIMED_VIEWS = 8
-
-_KEPT_BYTES = 1 << 30  # of the source's pictures; where they are more, they are rendered anew for each file
 
 
 @dataclass
@@ -64,7 +60,7 @@ class StageClock:
 
 
 class Measurer:
-    """Measures files of one scene. Owns what the source looks like.
+    """Measures files of one scene, all by the same judge. Owns what the source looks like.
 
     Args:
         setting: the scene and its views.
@@ -78,14 +74,13 @@ class Measurer:
 
     def __init__(self, setting: Setting, modes: Sequence[str], threads: int | None) -> None:
         self._setting, self._modes, self._threads = setting, modes, threads
-        cameras, count = setting.cameras, min(TIMED_VIEWS, len(setting.cameras))
-        places = np.linspace(0, len(cameras) - 1, count).round().astype(int)
-        size = sum(camera.W * camera.H * 3 * 4 for camera in cameras)
-        self._views = list(self._rendered(cameras)) if size <= _KEPT_BYTES else None
-        chosen = [cameras[place] for place in places]
-        self._timed = list(self._rendered(chosen)) if self._views is None else [self._views[place] for place in places]
+        views = setting.views
+        self._judge = views.judge(setting.source, threads=threads)
+        self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
+        places = np.linspace(0, len(views.judges) - 1, min(TIMED_VIEWS, len(views.judges))).round().astype(int)
+        self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
         self.source_modes = {mode: self._mode_time(setting.source, mode) for mode in modes}
-        self.source_photographs = self._photograph_scores()
+        self.source_photographs = self._source_scores()
 
     def measure(self, candidate: Candidate, progress: Report) -> Point:
         """Make a file and measure it.
@@ -155,60 +150,42 @@ class Measurer:
             seconds.append(time.perf_counter() - start)
         return models[0], statistics.median(seconds)
 
-    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Comparison, dict[str, Any] | None]:
+    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Scores, dict[str, Any] | None]:
         """Against the source's renders; without a `WorstView` neither by LPIPS nor by photographs."""
-        setting, judge = self._setting, None if worst is None else self._judge()
+        distance = None if worst is None else self._setting.distance
+        each = list[ViewScore]()
 
         def look(number: int, source: F32, other: F32) -> None:
             if worst is not None:
                 worst.look(number, source, other)
-            if judge is not None:
-                judge.add(number, other)
+                if self._photographs is not None:
+                    each.append(self._photographs.score(number, other, lpips=distance))
 
-        quality = compare_models(
-            setting.source, decoded, setting.cameras, source_views=self._views, background=setting.background,
-            lpips=None if worst is None else setting.distance, on_view=look,
-        )  # fmt: skip
-        return quality, None if judge is None else judge.as_json()
+        quality = self._judge.scores(decoded, lpips=distance, on_view=look)
+        return quality, Scores.of(each).as_json() if each else None
 
-    def _judge(self) -> PhotographScores | None:
-        setting = self._setting
-        if setting.photographs is None:
-            return None
-        return PhotographScores(setting.photographs, setting.background, setting.distance)
-
-    def _photograph_scores(self) -> dict[str, Any] | None:
-        judge = self._judge()
+    def _source_scores(self) -> dict[str, Any] | None:
+        judge, distance = self._photographs, self._setting.distance
         if judge is None:
             return None
-        for number, view in enumerate(self._views or self._rendered(self._setting.cameras)):
-            judge.add(number, view.picture)
-        return judge.as_json()
-
-    def _rendered(self, cameras: Sequence[Camera]) -> Iterator[SourceView]:
-        return render_source(self._setting.source, cameras, background=self._setting.background)
+        each = [
+            judge.score(number, self._judge.look(number).picture, lpips=distance)
+            for number in range(len(judge.cameras))
+        ]
+        return Scores.of(each).as_json()
 
     def _mode_time(self, model: SplatModel, mode: str) -> ModeTime:
         """Render the timed views, after one that is not timed: it allocates."""
         shift = np.subtract(model.origin, self._setting.source.origin)
-        cameras = [relative_to(shift, view.camera) for view in self._timed]
-        draw = self._renderer(model, mode)
+        views = [(relative_to(shift, camera), wanted) for camera, wanted in self._timed]
+        draw = renderer(model, self._judge.background, mode=mode, threads=self._threads)
         if mode != "exact":  # it takes seconds a picture, and keeps nothing from one to the next
-            draw(cameras[0])
+            draw(views[0][0])
         seconds, error, count = [], 0.0, 0
-        for view, camera in zip(self._timed, cameras, strict=True):
+        for camera, wanted in views:
             start = time.perf_counter()
-            picture = draw(camera)
+            picture = draw(camera).rgb
             seconds.append(time.perf_counter() - start)
-            squares = squared_error(view.picture, np.clip(picture, 0.0, 1.0).astype(np.float32, copy=False))
+            squares = squared_error(wanted, picture)
             error, count = error + float(np.sum(squares)), count + squares.size
         return ModeTime(1000.0 * statistics.median(seconds), psnr_of_mse(error / count))
-
-    def _renderer(self, model: SplatModel, mode: str) -> Callable[[Camera], NDArray[Any]]:
-        background = self._setting.background
-        if mode == "exact":
-            return lambda camera: render(model, camera, background=background, mode=mode).rgb
-        rasteriser = Rasteriser(mode, gradients=False, threads=self._threads)
-        return lambda camera: (
-            rasteriser.forward(model, camera, background=background, antialiased=model.antialiased).rgb
-        )

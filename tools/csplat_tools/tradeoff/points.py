@@ -53,7 +53,7 @@ class Partial:
     Attributes:
         sh_degree: the highest band.
         size_bytes: header, index, and the layers up to this band with their codebooks.
-        psnr, psnr_worst, ssim: as of `Comparison`.
+        psnr, psnr_worst, ssim: as of `Scores`.
         decode_seconds: median of some runs.
         render_milliseconds: of mode `standard`, median over views.
     """
@@ -125,8 +125,8 @@ class Point:
         size_bytes: of the file. digest: SHA-256 that it states, in hexadecimal digits.
         splats, sh_degree: of the file.
         source_splats, source_bytes: of the scene, and of its PLY.
-        psnr, psnr_mean, psnr_worst, worst_view, ssim, lpips: against the source's renders, as of `Comparison`.
-        photographs: scores against held-out photographs as of `PhotographScores`, where there are some.
+        psnr, psnr_mean, psnr_worst, worst_view, ssim, lpips: against the source's renders, as of `Scores`.
+        photographs: scores against held-out photographs as of `Scores`, where there are some.
         encode_seconds: everything from the splats to the bytes. stages: what stages took of that, as far as known.
         decode_seconds: from the bytes to the splats, median of some runs.
         modes: the renderer's, by name.

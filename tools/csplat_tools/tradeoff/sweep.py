@@ -119,7 +119,7 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Re
     return _made(
         encode_reduced(
             setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
-            cameras=setting.deciding, background=setting.background, progress=progress,
+            views=setting.views, progress=progress,
         )
     )  # fmt: skip
 
@@ -137,11 +137,10 @@ def _reach(
 
     target = RateTarget(size_bytes=size_bytes, psnr=psnr)
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
-    # Which splats go is decided from the same views as the quality: from those of photographs that judge nothing.
-    cameras = setting.own_cameras if setting.deciding is None else setting.deciding
     found = encode_to_target(
-        setting.source, target, options, cameras=cameras, background=setting.background, progress=progress
-    )
+        setting.source, target, options, cameras=setting.views.decides, background=setting.views.background,
+        progress=progress,
+    )  # fmt: skip
     return _made(found.result, rate=found.report)
 
 
@@ -150,10 +149,10 @@ def _simplify(setting: Setting, wanted: Wanted, keep: float, progress: Report) -
 
     found = encode_simplified(
         setting.source,
-        setting.deciding,
+        setting.views,
         target=Target(keep=keep),
         encoding=EncodeOptions(preset=wanted.preset, threads=wanted.threads),
-        options=SimplifyOptions(background=setting.background, threads=wanted.threads),
+        options=SimplifyOptions(threads=wanted.threads),
         progress=progress,
     )
     return _made(found.result, simplify={"keep": keep, **found.report})

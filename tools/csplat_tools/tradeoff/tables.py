@@ -56,7 +56,7 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
     ]  # fmt: skip
     if tradeoff.setting.distance is not None:
         columns.append(Column("lpips", "Perceptual distance (Alex), mean over the views.", lambda one: one.lpips, 4))
-    if tradeoff.setting.photographs is not None:
+    if tradeoff.setting.views.photographs:
         columns.append(Column("photos", "dB against held-out photographs.", lambda one: one.photograph_psnr, 2))
     columns += [
         Column("splats", "Splats of the file.", lambda one: one.splats, 0),
@@ -112,10 +112,10 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
 def views_line(tradeoff: Tradeoff) -> str:
     """From where the pictures are."""
     setting = tradeoff.setting
-    sizes = sorted({(camera.W, camera.H) for camera in setting.cameras})
+    sizes = sorted({(camera.W, camera.H) for camera in setting.views.judges})
     size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
-    where = "virtual views" if setting.cameras_name == "virtual" else f"views of {setting.cameras_name}"
-    return f"judged from {len(setting.cameras)} {where}, {size}"
+    where = "virtual views" if setting.views.name == "virtual" else f"views of {setting.views.name}"
+    return f"judged from {len(setting.views.judges)} {where}, {size}"
 
 
 def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:

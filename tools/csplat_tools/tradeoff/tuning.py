@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from csplat.encoder import EncodeOptions
 from csplat_tools.console import Report
-from csplat_tools.finetune_sources import Looks, Sources
-from csplat_tools.finetuning import BYTE_COST, LEARNING_FACTOR, SHAPE_ENTRIES, Clock, begin, tune
+from csplat_tools.finetuning import BYTE_COST, LEARNING_FACTOR, SHAPE_ENTRIES, VIEW_SIZE, VIEWS, Clock, begin, tune
 from csplat_tools.tradeoff.options import Wanted
 from csplat_tools.tradeoff.points import Made
 from csplat_tools.tradeoff.setting import Setting
+from csplat_tools.views import ViewSet, find_view_set
 from csplat_trainer.finetune import FinetuneOptions, Moment
 
 __all__ = ["tune_file"]
@@ -26,16 +28,11 @@ def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Re
     Raises:
         CsplatError: as `csplat_tools.finetuning.begin` and `tune`.
     """
-    itself = setting.data is None
+    itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
-    sources = Sources(background=setting.background, keep=keep)
-    if setting.data is not None:
-        data = setting.data
-        sources = Sources(data.path, data.size, data.images, data.test_every, background=setting.background, keep=keep)
     options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
     clock = Clock()
-    looks = Looks.read(setting.source, sources, quiet=True)
-    begun = begin(setting.source, looks, sources, encoding, clock, progress=progress)
+    begun = begin(setting.source, _tuning_views(setting), encoding, clock, keep=keep, progress=progress)
 
     def show(now: Moment) -> None:
         progress("tuning", now.iteration / now.iterations)
@@ -43,3 +40,16 @@ def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Re
     tuned = tune(begun, options.scaled(LEARNING_FACTOR[itself]), clock, threads=wanted.threads, show=show)
     said = {"steps": tuned.log["steps"], "best_step": tuned.log["best_iteration"], "keep": keep, **begun.chosen.said}
     return Made(tuned.result.data, {"encoding": tuned.result.report.options, "finetune": said}, clock.seconds)
+
+
+def _tuning_views(setting: Setting) -> ViewSet:
+    """Those of `csplat finetune`: of photographs, all teach that do not judge; of virtual views, there are more."""
+    views = setting.views
+    if views.photographs:
+        judging = {id(camera) for camera in views.judges}
+        teaches = [one.camera for one in views.photographs if id(one.camera) not in judging]
+        return replace(views, teaches=teaches, decides=())
+    if views.virtual:
+        more = find_view_set(setting.source, background=views.background, count=VIEWS, size=VIEW_SIZE)
+        return replace(views, teaches=more.teaches, decides=more.decides)
+    return views

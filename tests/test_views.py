@@ -1,0 +1,233 @@
+"""Views that teach, decide and judge: none has two roles, and whoever judges says the same of the same scene."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from captures import H, W, cameras, photograph, shell
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from csplat.errors import InputError
+from csplat.ply import read_ply
+from csplat.training import TRAINING, TrainedOn
+from csplat_render.cameras import resized, save_cameras
+from csplat_render.judge import renderer
+from csplat_tools.app import app
+from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
+from csplat_tools.views.viewset import pose
+from csplat_trainer.evaluate import evaluate
+
+KINDS = ("rgb", "rgba", "colmap")
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    """The same sixteen photographs: transforms.json without and with alpha, and COLMAP."""
+    rgb = photograph(shell(3), tmp_path_factory.mktemp("rgb"))
+    folders = {"rgb": rgb}
+    for kind in KINDS[1:]:
+        folders[kind] = rgb.parent / kind
+        shutil.copytree(rgb, folders[kind], dirs_exist_ok=True)
+    for path in (folders["rgba"] / "images").iterdir():
+        with Image.open(path) as picture:
+            picture.convert("RGBA").save(path)
+    (folders["colmap"] / "transforms.json").unlink()
+    (folders["colmap"] / "sparse" / "0").mkdir(parents=True)
+    K, lines = cameras(1)[0].K, []
+    for number, camera in enumerate(cameras(16)):
+        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
+        values = " ".join(str(value) for value in (w, x, y, z, *camera.viewmat[:3, 3]))
+        lines.append(f"{number + 1} {values} 1 view{number:02}.png\n\n")
+    model = folders["colmap"] / "sparse" / "0"
+    (model / "images.txt").write_text("".join(lines))
+    (model / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {K[0, 0]} {K[1, 1]} {W / 2} {H / 2}\n")
+    return folders
+
+
+@pytest.fixture(scope="module")
+def scene(sets):
+    return read_ply(sets["rgb"] / "scene.ply")
+
+
+def poses(views):
+    return [{pose(camera) for camera in role} for role in (views.teaches, views.decides, views.judges)]
+
+
+def numbers(seen_from):
+    return [int(camera.image[-6:-4]) for camera in seen_from]
+
+
+# roles
+
+
+@pytest.mark.parametrize("size", [None, (24, 20)])
+@pytest.mark.parametrize("every", [5, 10])
+@pytest.mark.parametrize("kind", KINDS)
+def test_photographs_have_one_role_each(sets, scene, kind, every, size):
+    views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
+    assert list(range(0, 16, every)) == numbers(views.judges)
+    roles = poses(views)
+    assert sum(map(len, roles)) == len(set.union(*roles)) == 16
+    assert views.teaches
+    assert views.decides
+    assert {size or (W, H)} == {(camera.W, camera.H) for camera in views.judges}
+    assert BLACK == views.background
+    assert not views.virtual
+    assert numbers(views.judges) == numbers(views.photograph_judge().cameras)
+
+
+@pytest.mark.parametrize(
+    ("count", "judging", "virtual"), [(3, 3, True), (39, 39, True), (40, 10, False), (120, 24, False)]
+)
+def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, judging, virtual):
+    save_cameras(tmp_path / "cameras.json", cameras(count))
+    views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
+    assert (judging, virtual) == (len(views.judges), views.virtual)
+    assert (20, 16) == (len(views.teaches), len(views.decides)) or not virtual
+    roles = poses(views)
+    assert sum(map(len, roles)) == len(set.union(*roles))
+    assert virtual or count == sum(map(len, roles))
+
+
+def test_virtual_views_judge_on_black_whatever_is_behind_the_others(scene):
+    views = find_view_set(scene, count=5, aside=2, background=WHITE)
+    assert (5, 2, 8) == tuple(map(len, poses(views)))
+    assert BLACK == views.judge(scene).background
+    assert WHITE == views.decider(scene).background
+
+
+def test_as_many_decide_as_are_asked_for(sets, scene):
+    data = DataOptions(str(sets["rgb"]))
+    assert 0 == len(find_view_set(scene, data=data, aside=0).decides)
+    views = find_view_set(scene, data=data, aside=4)
+    assert (10, 4, 2) == tuple(map(len, poses(views)))
+    with pytest.raises(InputError, match="leave none to learn from"):
+        find_view_set(scene, data=data, aside=14)
+
+
+def test_the_training_judges_alone(sets, scene):
+    views = find_view_set(scene, data=DataOptions(str(sets["rgb"])), split="train")
+    assert (0, 0, 14) == tuple(map(len, poses(views)))
+
+
+def test_a_view_of_two_roles_is_refused_in_any_size(scene):
+    one, other = cameras(2)
+    ViewSet("own", BLACK, [one], [], [other], origin=scene.origin)
+    with pytest.raises(InputError, match="own: a view both teaches and judges"):
+        ViewSet("own", BLACK, [one], [], [other, resized(one, 2 * W, 2 * H)])
+
+
+# what the scene says
+
+
+def test_the_scene_says_how_its_photographs_are_taken(sets, scene):
+    said = TrainedOn((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
+    trained = replace(scene, metadata={**scene.metadata, TRAINING: said.as_json()})
+    views = find_view_set(trained, data=DataOptions(str(sets["rgba"])))
+    assert [0, 5, 10, 15] == numbers(views.judges)
+    assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.judges[0].W, views.judges[0].near)
+    assert not any("trained" in line for line in views.notes)
+    asked = DataOptions(str(sets["rgba"]), test_every=10)
+    views = find_view_set(trained, data=asked, background=WHITE)
+    assert [0, 10] == numbers(views.judges)
+    assert [
+        "test_every is 10, but the scene was trained with 5",
+        "background is white, but the scene was trained on 0,1,0",
+    ] == [line for line in views.notes if "trained" in line]
+
+
+def test_a_scene_that_says_nothing_is_noted_once(sets, scene):
+    for kind in ("rgb", "rgba"):
+        views = find_view_set(scene, data=DataOptions(str(sets[kind])))
+        assert BLACK == views.background
+        assert 1 == sum("does not say" in line for line in views.notes)
+    assert () == find_view_set(scene, count=2).notes
+
+
+# commands
+
+
+def invoke(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The view sets that a command makes."""
+    known, check = [], ViewSet.__post_init__
+
+    def keep(views):
+        check(views)
+        known.append(views)
+
+    monkeypatch.setattr(ViewSet, "__post_init__", keep)
+    return known
+
+
+def command_words(name, folder, out):
+    ply = folder / "scene.ply"
+    return {
+        "compare": ("compare", ply, ply),
+        "simplify": ("simplify", ply, out / "half.ply", "--keep", "0.5", "--rounds", "1", "--no-adjust"),
+        "max-loss": ("simplify", ply, out / "less.ply", "--max-loss", "1", "--rounds", "1", "--no-refit"),
+        "sensitivity": ("sensitivity", ply, out / "s.npz", "--no-matrices"),
+        "finetune": (
+            "finetune", ply, "-o", out / "s.csplat", "--iterations", "2", "--sh-coding", "none", "--keep", "0.7"
+        ),
+        "tradeoff": ("tradeoff", ply, "--what", "targets,simplify", "--psnr", "30", "--keep", "0.5"),
+    }[name]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["compare", "simplify", "max-loss", "sensitivity", "finetune", "tradeoff"])
+def test_no_command_decides_by_what_judges(sets, made, tmp_path, name):
+    invoke(*command_words(name, sets["rgb"], tmp_path), "--data", sets["rgb"], "--test-every", "5")
+    of_data = [views for views in made if views.photographs]
+    assert of_data
+    for views in made:
+        roles = poses(views)
+        assert sum(map(len, roles)) == len(set.union(*roles))
+        for camera in (*views.teaches, *views.decides):
+            assert camera.image is None or int(camera.image[-6:-4]) % 5
+    assert all(numbers(views.judges) in ([0, 5, 10, 15], []) for views in of_data)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whoever_judges_says_the_same_of_the_same_scene(sets, tmp_path, kind):
+    ply, own = sets[kind] / "scene.ply", ("--data", sets[kind], "--test-every", "5", "--size", "24x20")
+    found = {}
+    compared = json.loads(invoke("compare", ply, ply, *own, "--json").stdout)
+    found["compare"] = compared["photographs"]["a"]["psnr"]
+    words = ("simplify", ply, tmp_path / "all.ply", "--keep", "0.9", "--no-refit", "--rounds", "1", "--json")
+    simplified = json.loads(invoke(*words, *own).stdout)["photographs"]
+    found["simplify"] = simplified["source"]
+    words = ("finetune", ply, "-o", tmp_path / "s.csplat", "--iterations", "1", "--sh-coding", "none", "--say-json")
+    found["finetune"] = json.loads(invoke(*words, *own).stdout)["scores"]["source"]["psnr"]
+    swept = json.loads(invoke("tradeoff", ply, "--what", "presets", "--json", "-", *own).stdout)
+    found["tradeoff"] = swept["source"]["photographs"]["psnr"]
+    model = read_ply(ply)
+    views = find_view_set(model, data=DataOptions(str(sets[kind]), (24, 20), test_every=5))
+    draw = renderer(model, views.background)
+    photographs, behind = views.pictures(views.judges), np.array(views.background, np.float32)
+    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, photographs, behind)["psnr"]
+    assert max(found.values()) - min(found.values()) < 0.01, found
+    again = json.loads(invoke("compare", ply, tmp_path / "all.ply", *own, "--json").stdout)["photographs"]
+    assert simplified["psnr"] == pytest.approx(again["b"]["psnr"], abs=0.01)
+
+
+def test_another_origin_judges_alike(sets, scene):
+    moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
+    judges = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).photograph_judge() for one in (scene, moved)]
+    assert judges[0].psnr(scene) == pytest.approx(judges[1].psnr(moved), abs=0.01)
+    assert judges[0].psnr(scene) == pytest.approx(judges[0].psnr(moved), abs=0.01)

@@ -1,0 +1,245 @@
+"""`find_view_set`: the one place where it is said which views teach, which decide and which judge.
+
+| views | teach | decide | judge |
+|---|---|---|---|
+| virtual | `count` small ones, all around | 16 spread among those | the eight of `psnr` |
+| camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
+| camera file, fewer | virtual ones | virtual ones | all |
+| data set | training photographs | every 8th of those | held-out photographs |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.training import TrainedOn
+from csplat_render import Camera
+from csplat_render.cameras import load_cameras, relative_to
+from csplat_render.virtual import virtual_cameras
+from csplat_tools.extras import need_photographs
+from csplat_tools.views.placing import VIEW_SIZE, camera_sequence
+from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
+
+if TYPE_CHECKING:
+    from csplat_trainer.pictures import Picture
+
+__all__ = ["SPLITS", "DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
+
+#: Parts of a data set: the photographs that were held out of training, and the others.
+SPLITS = ("test", "train")
+
+_JUDGING = (8, 640, 480)  # the views of `psnr`
+_ENOUGH = 40  # cameras of a file that they may teach and judge
+_JUDGE_EVERY, _MOST_JUDGES = 4, 24
+_DECIDE_EVERY = 8
+_VIRTUAL_ASIDE = 16
+_TEST_EVERY = 8
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """A data set, as a command line names it. What is `None` the scene says, or else it is as usual.
+
+    Attributes:
+        path: the set's folder, or its transforms.json.
+        size: width and height to bring photographs to; usually as they are.
+        images: COLMAP sets: which folder of pictures; usually the reader chooses.
+        test_every: every so-manieth is held out where the set does not say so; usually 8.
+        near: near plane of the cameras, scene units; usually one that suits the set.
+    """
+
+    path: str
+    size: tuple[int, int] | None = None
+    images: str | None = None
+    test_every: int | None = None
+    near: float | None = None
+
+
+def comparison_cameras(source: SplatModel) -> list[Camera]:
+    """The cameras of `psnr`: virtual ones, chosen from the source alone."""
+    return virtual_cameras(source, *_JUDGING, seed=0)
+
+
+def find_view_set(
+    source: SplatModel,
+    *,
+    cameras: str | None = None,
+    data: DataOptions | None = None,
+    background: Colour | None = None,
+    count: int = 160,
+    size: tuple[int, int] = VIEW_SIZE,
+    seed: int = 0,
+    aside: int | None = None,
+    split: str = "test",
+) -> ViewSet:
+    """Read or place views, and give each its role; see the table above.
+
+    Args:
+        source: the scene.
+        cameras: a camera file, relative to the scene's origin.
+        data: instead: a data set.
+        background: behind everything; `None`: what the scene says it was trained in front of, else black.
+        count: virtual views that teach; 0: no virtual ones teach or decide.
+        size, seed: of virtual views.
+        aside: how many views decide; `None`: as many as the table says.
+        split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
+
+    Raises:
+        InputError: both are given, or one cannot be read, or has not as many views.
+        OSError: a file cannot be read.
+    """
+    if cameras is not None and data is not None:
+        raise InputError("wanted cameras of a file or of a data set, not both")
+    if split not in SPLITS:
+        raise InputError(f"the split is {split!r}, wanted one of {', '.join(SPLITS)}")
+    if data is not None:
+        return _of_data(source, data, background, aside, split)
+    if cameras is None:
+        teaches, decides = _virtual(source, count, size, seed, aside)
+        judges = comparison_cameras(source)
+        return ViewSet(VIRTUAL, background or BLACK, teaches, decides, judges, virtual=True, origin=source.origin)
+    return _of_file(source, cameras, background, (count, size, seed), aside)
+
+
+def with_deciders(views: ViewSet) -> ViewSet:
+    """The same views; where none decides, every eighth of those that teach does."""
+    if views.decides:
+        return views
+    decides, teaches = _apart(views.teaches, None)
+    return replace(views, teaches=teaches, decides=decides)
+
+
+def _of_file(
+    source: SplatModel,
+    path: str,
+    background: Colour | None,
+    virtual: tuple[int, tuple[int, int], int],
+    aside: int | None,
+) -> ViewSet:
+    given = list({pose(camera): camera for camera in load_cameras(path)}.values())
+    said = TrainedOn.of(source.metadata)
+    colour, notes = _colour(background, said)
+    few = len(given) < _ENOUGH
+    if few:
+        judging = {pose(camera) for camera in given}
+        judges = given
+        teaches, decides = (_without(judging, part) for part in _virtual(source, *virtual, aside))
+    else:
+        every = range(0, len(given), _JUDGE_EVERY)
+        places = {every[place] for place in _evenly(len(every), _MOST_JUDGES)}
+        judges, rest = _parted(given, places)
+        decides, teaches = _apart(rest, aside)
+    return ViewSet(
+        Path(path).name, colour, teaches, decides, judges, virtual=few, origin=source.origin, notes=tuple(notes)
+    )
+
+
+def _of_data(
+    source: SplatModel, data: DataOptions, background: Colour | None, aside: int | None, split: str
+) -> ViewSet:
+    need_photographs()
+    from csplat_trainer.data import load
+
+    said = TrainedOn.of(source.metadata)
+    wanted, notes = _settled(data, said)
+    every = _TEST_EVERY if wanted.test_every is None else wanted.test_every
+    found = load(wanted.path, wanted.size, images=wanted.images, test_every=every, near=wanted.near)
+    train, test = (_moved(part, source) for part in (found.train, found.test))
+    colour, more = _colour(background, said, photographs=True)
+    if split == "train":
+        train, test = [], train
+    judging = {pose(one.camera) for one in test}
+    apart = _without(judging, [one.camera for one in train])
+    if len(apart) < len(train):
+        more.append(f"{len(train) - len(apart)} training photographs stand where others judge, and are left out")
+    decides, teaches = _apart(apart, aside)
+    return ViewSet(
+        Path(data.path).resolve().name, colour, teaches, decides, [one.camera for one in test], [*train, *test],
+        origin=source.origin, notes=(*found.report, *notes, *more),
+    )  # fmt: skip
+
+
+def _settled(data: DataOptions, said: TrainedOn | None) -> tuple[DataOptions, list[str]]:
+    """What the user asks for, else what the scene says; and where they contradict each other."""
+    values: dict[str, Any] = {}
+    notes = []
+    for name in (field.name for field in fields(data) if field.name != "path"):
+        asked, known = getattr(data, name), getattr(said, name, None)
+        values[name] = known if asked is None else asked
+        if None not in (asked, known) and asked != known:
+            notes.append(f"{name} is {asked}, but the scene was trained with {known}")
+    return replace(data, **values), notes
+
+
+def _colour(
+    background: Colour | None, said: TrainedOn | None, *, photographs: bool = False
+) -> tuple[Colour, list[str]]:
+    """What is behind everything, and what is to be said of it, which matters most where photographs are compared."""
+    if background is not None:
+        if said is not None and said.background != background:
+            return background, [
+                f"background is {_named(background)}, but the scene was trained on {_named(said.background)}"
+            ]
+        return background, []
+    if said is not None:
+        return said.background, []
+    note = "the scene does not say in front of what it was trained: black is behind it, --background changes that"
+    return BLACK, [note] if photographs else []
+
+
+def _named(colour: Colour) -> str:
+    return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
+
+
+def _moved(pictures: Sequence[Picture], source: SplatModel) -> list[Picture]:
+    return [replace(one, camera=relative_to(source.origin, one.camera)) for one in pictures]
+
+
+def _virtual(
+    source: SplatModel, count: int, size: tuple[int, int], seed: int, aside: int | None
+) -> tuple[list[Camera], list[Camera]]:
+    """Views that teach and views that decide."""
+    if count < 1:
+        return [], []
+    kept = _VIRTUAL_ASIDE if aside is None else aside
+    every = camera_sequence(source, count + kept, size, seed=seed)
+    # Evenly from the whole sequence: its beginning is not spread as evenly as all of it.
+    places = np.linspace(0, len(every) - 1, kept + 2).astype(int)[1:-1].tolist()
+    decides, teaches = _parted(every, places)
+    return teaches, decides
+
+
+def _apart(cameras: Sequence[Camera], aside: int | None) -> tuple[list[Camera], list[Camera]]:
+    """Some cameras that decide, spread among all, and the others that do not stand where those do."""
+    count = len(cameras)
+    if aside is None:
+        every = min(_DECIDE_EVERY, count)
+        places: Collection[int] = range(every // 2, count, every) if count > 1 else ()
+    elif aside and aside >= count:
+        raise InputError(f"{aside} of {count} views to decide by leave none to learn from")
+    else:
+        places = [(2 * number + 1) * count // (2 * aside) for number in range(aside)]
+    decides, others = _parted(cameras, places)
+    return decides, _without({pose(camera) for camera in decides}, others)
+
+
+def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
+    chosen = set(places)
+    return [cameras[i] for i in sorted(chosen)], [one for i, one in enumerate(cameras) if i not in chosen]
+
+
+def _without(judging: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
+    """Those that stand where none judges."""
+    return [one for one in cameras if pose(one) not in judging]
+
+
+def _evenly(count: int, most: int) -> list[int]:
+    """At most so many of so many places, spread evenly."""
+    return [round(place) for place in np.linspace(0, count - 1, min(count, most))]

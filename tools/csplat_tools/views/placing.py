@@ -1,0 +1,113 @@
+"""Virtual cameras to decide by: many, small, spread evenly at any count; and a user's own, made as small.
+
+Many small pictures overfit less than few large ones of as many pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_render import Camera
+from csplat_render.cameras import direction, intrinsics, look_at
+from csplat_render.cloud import detail, sample_cloud
+from csplat_render.virtual import FIELD_OF_VIEW, Frame, scene_frame
+
+__all__ = ["VIEW_SIZE", "camera_sequence", "reduced"]
+
+F64 = NDArray[np.float64]
+
+#: Width and height of the pictures that decide, in pixels.
+VIEW_SIZE = (240, 180)
+
+_POINTS = 20_000
+_OBJECT_DISTANCE = (0.95, 1.6)  # extents from the centre
+_OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations: objects are looked at from below, too
+_OBJECT_OFFSET = 0.2  # how far beside the centre a camera looks, extents
+_AROUND_DISTANCE = (0.35, 1.45)
+_AROUND_HEIGHT = (-0.12, 0.7)
+_AROUND_OFFSET = 0.35
+_OUTWARDS = 5  # one view of so many looks away from the middle of surroundings
+_HIDING = 0.4  # extents; as for virtual cameras: what is nearer only hides
+_GOOD_DETAIL = 0.4  # of the best view's; views of walls from behind say nothing
+_CANDIDATES = 3  # for each view in surroundings
+_STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
+
+
+def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
+    """Virtual cameras around a scene, spread evenly at any count: the first ones of a longer list are the same.
+
+    Args:
+        model: the scene; its own cameras are not looked at.
+        count: how many.
+        size: width and height of the pictures, pixels.
+        seed: where the sequence begins.
+
+    Returns:
+        `count` cameras, by a low-discrepancy sequence over directions, distances and what they look at. In
+        surroundings those that show little detail are left out.
+    """
+    frame = scene_frame(model)
+    K = intrinsics(*size, FIELD_OF_VIEW)
+    if frame.kind == "object" or not len(model):
+        return [_around_object(frame, point, K, size) for point in _sequence(count, seed)]
+    points = _sequence(_CANDIDATES * count, seed)
+    cameras = [_in_surroundings(frame, number, point, K, size) for number, point in enumerate(points)]
+    cloud = sample_cloud(model, _POINTS, np.random.default_rng(seed))
+    details = np.array([detail(cloud, camera, _HIDING * frame.extent) for camera in cameras])
+    inwards = np.arange(len(cameras)) % _OUTWARDS != 0
+    best = np.where(inwards, details[inwards].max(), details[~inwards].max())
+    good = np.flatnonzero(details >= _GOOD_DETAIL * best)
+    rest = np.setdiff1d(np.argsort(-details, kind="stable"), good, assume_unique=True)
+    return [cameras[i] for i in [*good, *rest][:count]]
+
+
+def reduced(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:
+    """The same views in pictures of about as many pixels as `size` has, if they have more."""
+    smaller = []
+    for camera in cameras:
+        factor = (size[0] * size[1] / (camera.W * camera.H)) ** 0.5
+        if factor >= 1.0:
+            smaller.append(camera)
+            continue
+        width, height = max(1, round(camera.W * factor)), max(1, round(camera.H * factor))
+        K = np.diag([width / camera.W, height / camera.H, 1.0]) @ camera.K
+        smaller.append(replace(camera, K=K, W=width, H=height))
+    return smaller
+
+
+def _sequence(count: int, seed: int) -> F64:
+    """[count, 6] points in the unit cube; the first three coordinates evenly spread, the others random."""
+    rng = np.random.default_rng(seed)
+    start = rng.random(len(_STEPS))
+    even = np.mod(start + np.arange(1, count + 1)[:, None] * np.array(_STEPS), 1.0)
+    return np.concatenate([even, rng.random((count, 3))], axis=1)
+
+
+def _between(bounds: tuple[float, float], at: float) -> float:
+    return bounds[0] + (bounds[1] - bounds[0]) * at
+
+
+def _around_object(frame: Frame, point: F64, K: F64, size: tuple[int, int]) -> Camera:
+    height = _between(_OBJECT_HEIGHT, point[1])
+    along = direction(frame.up, 360.0 * point[0], math.degrees(math.asin(height)))
+    eye = frame.centre + frame.extent * _between(_OBJECT_DISTANCE, point[2]) * along
+    target = frame.centre + frame.extent * _OBJECT_OFFSET * (2.0 * point[3:] - 1.0)
+    return look_at(eye, target, frame.up, K, *size, frame.near)
+
+
+def _in_surroundings(frame: Frame, number: int, point: F64, K: F64, size: tuple[int, int]) -> Camera:
+    along = direction(frame.up, 360.0 * point[0], math.degrees(math.asin(_between(_AROUND_HEIGHT, point[1]))))
+    offset = _AROUND_OFFSET * (2.0 * point[3:] - 1.0)
+    if number % _OUTWARDS == 0:
+        eye = frame.centre + frame.extent * offset
+        target = eye + along
+    else:
+        eye = frame.centre + frame.extent * _between(_AROUND_DISTANCE, point[2]) * along
+        target = frame.centre + frame.extent * offset
+    return look_at(eye, target, frame.up, K, *size, frame.near)

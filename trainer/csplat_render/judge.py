@@ -1,0 +1,198 @@
+"""`Judge`: the one way to say how good a scene looks, against a source's renders or against photographs.
+
+Whoever judges holds views, and what each ought to look like. What PSNR means stands in `metrics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render import metrics
+from csplat_render.arrays import RenderResult
+from csplat_render.camera import Camera
+from csplat_render.cameras import relative_to
+
+__all__ = ["Judge", "Look", "OnView", "renderer"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+#: Is shown each view: its number, what is wanted and what is seen, [H, W, 3] in 0..1.
+OnView = Callable[[int, F32, F32], None]
+
+_KEPT_BYTES = 1 << 30  # of a source's pictures; where they are more, they are rendered anew for each scene
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a view ought to look like.
+
+    Attributes:
+        picture: [H, W, 3] floats.
+        covered: [H, W], which pixels show more than the background; `None`: not known.
+        ignored: splats that it does not show because they hold NaN or infinities.
+    """
+
+    picture: F32
+    covered: NDArray[np.bool_] | None = None
+    ignored: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Views and what they ought to look like.
+
+    Attributes:
+        cameras: the views, at least one.
+        looks: what each is to look like, or what makes that when its turn comes.
+        background: red, green, blue behind everything.
+        mode: of the renderer.
+        threads: how many; `None` for all. No score depends on it.
+        origin: what the cameras are relative to; `None`: the origin of whatever is judged.
+
+    Raises:
+        InputError: there is no view, or not one look for each.
+    """
+
+    cameras: Sequence[Camera]
+    looks: Sequence[Look | Callable[[], Look]]
+    background: ArrayLike = (0.0, 0.0, 0.0)
+    mode: str = "standard"
+    threads: int | None = None
+    origin: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise InputError("there is no camera to judge from")
+        if len(self.cameras) != len(self.looks):
+            raise InputError(f"{len(self.cameras)} cameras and {len(self.looks)} pictures do not belong together")
+
+    @classmethod
+    def of_source(
+        cls,
+        source: SplatModel,
+        cameras: Sequence[Camera],
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        mode: str = "standard",
+        threads: int | None = None,
+    ) -> Judge:
+        """Judge by what the source looks like.
+
+        Args:
+            source: the scene that others are compared with.
+            cameras: where to stand, relative to the source's origin.
+            background, mode, threads: see above.
+        """
+        draw = renderer(source, background, mode=mode, threads=threads)
+        looks: list[Look | Callable[[], Look]] = [partial(_rendered, draw, camera) for camera in cameras]
+        if sum(12 * camera.W * camera.H for camera in cameras) <= _KEPT_BYTES:
+            looks = [_rendered(draw, camera) for camera in cameras]
+        return cls(cameras, looks, background, mode, threads, source.origin)
+
+    def look(self, number: int) -> Look:
+        """What a view ought to look like."""
+        look = self.looks[number]
+        return look if isinstance(look, Look) else look()
+
+    def errors(self, model: SplatModel) -> F64:
+        """[V] mean squared error by view."""
+        draw = self._renderer(model)
+        squares = [
+            metrics.squared_error(self.look(number).picture, draw(camera).rgb)
+            for number, camera in enumerate(self.cameras)
+        ]
+        return np.array([np.mean(one) for one in squares])
+
+    def pooled(self, errors: F64) -> float:
+        """The mean squared error over all pixels, of those by view."""
+        return metrics.pooled(errors, [camera.W * camera.H for camera in self.cameras])
+
+    def psnr(self, model: SplatModel) -> float:
+        """PSNR of the error pooled over views, pixels and channels, dB."""
+        return metrics.psnr_of_mse(self.pooled(self.errors(model)))
+
+    def some(self, places: Sequence[int]) -> Judge:
+        """A judge by some of the views."""
+        return replace(self, cameras=[self.cameras[i] for i in places], looks=[self.looks[i] for i in places])
+
+    def score(
+        self, number: int, seen: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
+    ) -> metrics.ViewScore:
+        """Score what is seen in a view, [H, W, 3], whoever made it."""
+        look = self.look(number)
+        image = self.cameras[number].image
+        return metrics.score_view(look.picture, seen, look.covered, image=image, with_ssim=ssim, lpips=lpips)
+
+    def scores(
+        self,
+        model: SplatModel,
+        *,
+        ssim: bool = True,
+        lpips: metrics.Distance | None = None,
+        on_view: OnView | None = None,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> metrics.Scores:
+        """Score a scene in everything.
+
+        Args:
+            model: the scene. Its origin may be another one than that of the cameras.
+            ssim: whether to compute it; it takes about as long as rendering.
+            lpips: computes it, if wanted.
+            on_view: is shown the pictures.
+            progress: is told how much is done.
+        """
+        draw, each, ignored = self._renderer(model), [], 0
+        for number, camera in enumerate(self.cameras):
+            if progress is not None:
+                progress("comparing", number / len(self.cameras))
+            look, result = self.look(number), draw(camera)
+            ignored = max(ignored, result.ignored)
+            one = metrics.score_view(
+                look.picture, result.rgb, look.covered, image=camera.image, with_ssim=ssim, lpips=lpips
+            )
+            each.append(one)
+            if on_view is not None:
+                on_view(number, np.clip(look.picture, 0.0, 1.0), np.clip(result.rgb, 0.0, 1.0))
+        if progress is not None:
+            progress("comparing", 1.0)
+        return metrics.Scores.of(each, ignored)
+
+    def _renderer(self, model: SplatModel) -> Callable[[Camera], RenderResult]:
+        draw = renderer(model, self.background, mode=self.mode, threads=self.threads)
+        if self.origin is None:
+            return draw
+        shift = np.subtract(model.origin, self.origin)
+        return lambda camera: draw(relative_to(shift, camera))
+
+
+def renderer(
+    model: SplatModel, background: ArrayLike, *, mode: str = "standard", threads: int | None = None
+) -> Callable[[Camera], RenderResult]:
+    """What draws a scene from camera after camera, and keeps its memory in between.
+
+    Args:
+        model: the scene. The cameras are relative to its origin.
+        background: red, green, blue behind everything.
+        mode: `exact`, `standard` or `fast`.
+        threads: how many; `None` for all.
+    """
+    # numba takes a second to import: those who want the classes alone do not wait for it.
+    from csplat_render.rasterise import Rasteriser
+    from csplat_render.twin import render_exact
+
+    if mode == "exact":
+        return lambda camera: render_exact(model, camera, background=background, antialiased=model.antialiased)
+    rasteriser = Rasteriser(mode, gradients=False, threads=threads)
+    return lambda camera: rasteriser.forward(model, camera, background=background, antialiased=model.antialiased)
+
+
+def _rendered(draw: Callable[[Camera], RenderResult], camera: Camera) -> Look:
+    result = draw(camera)
+    return Look(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)
