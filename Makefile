@@ -51,10 +51,9 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/python tools/benchmarks/viewer.py
 	$(BIN)/python tools/benchmarks/simplify.py pass
 	$(BIN)/python tools/benchmarks/simplify.py removal --gone 20,40,60,80
-	$(BIN)/python tools/benchmarks/simplify.py files --psnr 40
 	$(BIN)/python tools/benchmarks/sensitivity.py
 	$(BIN)/python tools/benchmarks/compression.py
-	$(BIN)/python tools/benchmarks/rate.py
+	$(BIN)/python tools/benchmarks/targets.py --sizes 4,8
 	$(BIN)/python tools/benchmarks/grades.py
 	$(BIN)/python tools/benchmarks/distortion.py plain
 	$(BIN)/python tools/benchmarks/operating.py

@@ -1,10 +1,12 @@
 """A small scene, and photographs of it, for tests of what learns from photographs. Wants the extra [render]."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from csplat import write_ply
 from csplat.model import SplatModel, normalise_quats
@@ -55,4 +57,36 @@ def photograph(scene, folder):
     hidden = scene.select(np.concatenate([[0], np.arange(300)]))
     hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), scene.means]))
     write_ply(folder / "scene.ply", hidden)
+    return folder
+
+
+def as_colmap(folder):
+    """Say with COLMAP's files instead where the photographs of such a folder were taken."""
+    (folder / "transforms.json").unlink()
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    K, lines = cameras(1)[0].K, []
+    for number, camera in enumerate(cameras(16)):
+        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
+        values = " ".join(str(value) for value in (w, x, y, z, *camera.viewmat[:3, 3]))
+        lines.append(f"{number + 1} {values} 1 view{number:02}.png\n\n")
+    (model / "images.txt").write_text("".join(lines))
+    (model / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {K[0, 0]} {K[1, 1]} {W / 2} {H / 2}\n")
+    return folder
+
+
+def photograph_object(scene, folder):
+    """Write Blender's layout: sixteen transparent pictures, of which those for training and for tests are named."""
+    for part, seen_from in (("train", cameras(16)[1:13]), ("test", [*cameras(16)[:1], *cameras(16)[13:]])):
+        (folder / part).mkdir()
+        frames = []
+        for number, camera in enumerate(seen_from):
+            seen = render(scene, camera)
+            straight = np.clip(seen.rgb / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
+            pixels = np.concatenate([straight, seen.alpha[..., None]], axis=2)
+            Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / part / f"r_{number}.png")
+            pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+            frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": pose.tolist()})
+        angle = 2.0 * math.atan(W / 2 / cameras(1)[0].K[0, 0])
+        (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return folder

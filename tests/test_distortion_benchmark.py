@@ -4,7 +4,6 @@ import json
 import math
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -16,9 +15,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "bench
 # They lie in the folder that is named above, and need what is looked for there.
 import distortion
 import distortion_plot
-import distortion_simplified
 import distortion_tables
 from distortion_curves import Point, Rate, bracket, front, psnr_at, rate_at
+from kept import Kept
+
+from csplat_tools.optimise.report import Optimised, Report
 
 SCALAR = (Point(38.0, 1000), Point(42.0, 4000))
 CODEBOOK = (Point(39.0, 1500), Point(41.0, 6000))
@@ -117,12 +118,18 @@ def test_gives_up_a_first_point_only_where_the_goal_is_out_of_reach():
     assert bracket([Point(44.0, 1000, 49.0)], 45.0, encoder, start=50.0, limits=(20.0, 110.0), ceiling=1040.0)
 
 
+def file_of(size_bytes):
+    """A simplified file of 40 dB, as it is kept."""
+    chosen = {"psnr": 40.0, "size_bytes": size_bytes, "splats": 60, "sh_coding": "scalar"}
+    return {"goal": 40.0, **chosen, "encodes": 7, "seconds": 5.0}
+
+
 def results():
     plain = {"balanced, codebook": [Point(38.0, 1000).as_json(), Point(42.0, 4000).as_json()]}
     peers = {"SPZ": Point(40.0, 4000).as_json(), "SOG": {"remark": "stopped"}}
     files = {
-        "+0": {"goal": 40.0, "points": {"60 scalar": [Point(40.0, 1900).as_json()]}, "seconds": 5.0},
-        "+20": {"goal": 60.0, "points": {}, "seconds": 1.0},
+        "+0": file_of(1900),
+        "+20": {"goal": 60.0, "remark": "out of reach", "seconds": 1.0},
     }
     whole = {"splats": 100, "sh_degree": 3, "plain": plain, "peers": peers}
     simplified = {**whole, "simplified": files}
@@ -145,8 +152,8 @@ def test_the_table_divides_by_the_peer_and_says_which_aims_are_met():
 
 def test_tables_state_what_was_simplified_and_what_was_not_reached():
     lines = [line.split() for line in distortion_tables.tables({"plane3": results()["plane3"]}).splitlines()]
-    assert ["plane3", "40.0", "19.00", "scalar", "60", "20.00", "0.950", "1", "5"] in lines
-    assert ["plane3", "60.0", "-", "-", "0", "-", "-", "0", "1"] in lines
+    assert ["plane3", "40.0", "19.00", "scalar", "60", "20.00", "0.950", "7", "5"] in lines
+    assert ["plane3", "60.0", "-", "-", "-", "-", "-", "-", "1"] in lines
 
 
 def test_tables_state_the_psnr_at_the_bytes_that_are_aimed_at():
@@ -157,8 +164,7 @@ def test_tables_state_the_psnr_at_the_bytes_that_are_aimed_at():
 
 def test_whole_files_count_where_simplified_ones_are_larger():
     values = results()["plane3"].values
-    worse = {"+0": {"goal": 40.0, "points": {"60 scalar": [Point(40.0, 2500).as_json()]}, "seconds": 5.0}}
-    one = distortion_tables.Measured({**values, "simplified": worse})
+    one = distortion_tables.Measured({**values, "simplified": {"+0": file_of(2500)}})
     assert "balanced, codebook" == one.simplified_rate(40.0).how
     assert one.simplified_rate(40.1) is None  # nothing was simplified to that
 
@@ -183,83 +189,36 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
         calls.append(1)
         return len(calls)
 
-    assert 1 == distortion.Kept(path).measure("kind", "key", call)
-    assert 1 == distortion.Kept(path).measure("kind", "key", call)
+    assert 1 == Kept(path).measure("kind", "key", call)
+    assert 1 == Kept(path).measure("kind", "key", call)
     assert {"kind": {"key": 1}} == json.loads(path.read_text())
-    assert 2 == distortion.Kept(path, again=True).measure("kind", "key", call)
-
-
-class Pretended:
-    """A scene of 1,000 splats that keeps `60 dB - gone / 20`, more by a fit; quality and coding cost what they say."""
-
-    sh_degree = 3
-
-    def __init__(self, monkeypatch, best, gain=0.0):
-        self.best, self.gain, self.encoded = best, gain, []
-        monkeypatch.setattr(distortion_simplified, "prepare", lambda *_: self)
-        monkeypatch.setattr(distortion_simplified, "most_gone", lambda *args: round(20 * (60.0 - args[2])))
-        monkeypatch.setattr(distortion_simplified, "Candidate", lambda *args: self.candidate(args[1]))
-        judge = SimpleNamespace(psnr=lambda room: room)
-        self.shrinker = distortion_simplified.Shrinker("pretended", self, judge, None)
-
-    def __len__(self):
-        return 1000
-
-    def candidate(self, gone):
-        def encoded(options, quality):
-            left = 1000 - gone
-            self.encoded.append((left, options.sh_coding, quality))
-            size = left * math.exp(0.08 * quality) * (1.0 if options.sh_coding == "scalar" else 1.5)
-            size *= 1.0 + abs(left - self.best) / 200  # fewer want more precision
-            report = {"splats": left, "psnr": quality - 8.0}
-            return SimpleNamespace(result=SimpleNamespace(data=bytes(int(size))), report=report)
-
-        return SimpleNamespace(encoded=encoded, fitted=60.0 - gone / 20 + self.gain)
-
-
-def test_keeps_more_splats_where_the_first_number_was_too_few(monkeypatch):
-    found = Pretended(monkeypatch, best=660).shrinker.around(40.0, 9.0, {})
-    assert ["620 scalar", "620 codebook", "660 scalar"] == list(found["points"])
-    one = distortion_tables.Measured({"splats": 1000, "plain": {}, "simplified": {"+0": found}})
-    assert "660 scalar for 40.0" == one.simplified_rate(40.0).how
-
-
-@pytest.mark.parametrize(("best", "third"), [(520, []), (660, ["660 scalar"])])
-def test_keeps_fewer_splats_where_a_fit_left_room_and_then_more_if_that_was_wrong(monkeypatch, best, third):
-    found = Pretended(monkeypatch, best, gain=8.0).shrinker.around(40.0, 9.0, {})
-    assert ["620 scalar", "620 codebook", "520 scalar", *third] == list(found["points"])
-
-
-def test_pursues_nothing_that_is_larger_than_the_whole_scene(monkeypatch):
-    scene = Pretended(monkeypatch, best=660)
-    scene.shrinker.around(40.0, 7.0, {"whole": [Point(40.0, 20_000)]})  # 22,000 bytes at 39 dB already
-    assert len(scene.encoded) == len({(left, coding) for left, coding, _ in scene.encoded})
-
-
-def test_simplifies_nothing_where_every_splat_is_needed(monkeypatch):
-    scene = Pretended(monkeypatch, best=1000)
-    found = scene.shrinker.around(59.0, 9.0, {})
-    assert {} == found["points"]
-    assert [] == scene.encoded
+    assert 2 == Kept(path, again=True).measure("kind", "key", call)
 
 
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
     """The scene that ships, beside a peer that was judged before."""
-    known, simplified = tmp_path / "sample.json", {"points": {"9 scalar": [Point(36.0, 30_000).as_json()]}}
+    known = tmp_path / "sample.json"
     known.write_text(json.dumps({"peers": {"SPZ": Point(36.0, 60_000).as_json()}}))
     monkeypatch.setattr(distortion, "find_splat_transform", lambda _: (["none"], "judged before"))
     monkeypatch.setattr(distortion, "_GRID", (-3.0,))
-    shrunk = {**simplified, "goal": 36.0, "seconds": 1.0}
-    monkeypatch.setattr(distortion, "Shrinker", lambda *_: SimpleNamespace(around=lambda *_: shrunk))
+    chosen = {"psnr": 36.1, "size_bytes": 30_000, "splats": 900, "sh_coding": "scalar"}
+    searches = []
+
+    def optimise(source, target, views):
+        searches.append((target.psnr, len(views.teaches), len(views.judges)))
+        return Optimised(None, Report(target.as_json(), 30_000, 900, len(source), 7, 5.0, chosen=chosen))
+
+    monkeypatch.setattr(distortion, "optimise", optimise)
 
     def run(what):
-        args = ["--scenes", "sample", "--cache", str(tmp_path / "scenes"), "--out", str(tmp_path)]
+        args = ["--views", "20", "--scenes", "sample", "--cache", str(tmp_path / "scenes"), "--out", str(tmp_path)]
         monkeypatch.setattr(sys, "argv", ["distortion.py", what, *args])
         distortion.main()
         return capsys.readouterr()
 
     assert "sample balanced" in run("plain").err
     assert "0.500" in run("simplified").out
+    assert [(36.0, 20, 8)] == searches
     one = distortion_tables.Measured(json.loads(known.read_text()))
     assert rate_at(one.plain(), 36.0).measured is None  # enclosed
     before = known.read_text()

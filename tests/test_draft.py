@@ -12,6 +12,7 @@ from csplat.decoder import decode_scene, read_options, read_stated_errors
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
+from csplat_tools.proof import prove
 
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -99,6 +100,35 @@ def test_an_origin_of_other_splats_is_refused(make_model):
         Draft.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
 
 
+def test_the_geometry_of_a_refitted_file_is_proved(make_model):
+    source, rows = make_model(400, 3), np.arange(100, 300)
+    draft = Draft.of(source.select(rows), origin=Origin(len(source), rows))
+    result = draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN).coded().write()
+    scene = decode_scene(result.data)
+    whole = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
+    assert whole.holds
+    assert whole.rms_proved
+    assert ["means", "covariance", "opacities"] == [measure.name for measure in whole.measures]
+    assert "fitted anew" in whole.notes[-1]
+    assert prove(source, scene.model, scene.header, scene.stated_errors).holds
+    moved = replace(source, means=source.means + np.float32(0.1))
+    assert not prove(moved, scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    other = prove(source.select(slice(0, 399)), scene.model, scene.header, scene.stated_errors)
+    assert "source of 400 splats" in other.failures[0]
+
+
+def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
+    source, rows = make_model(400, 3), np.arange(100, 300)
+    adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
+    result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
+    scene = decode_scene(result.data)
+    assert ["means"] == [record.measure for record in scene.stated_errors.records]
+    assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(source, scene.model, scene.header, scene.stated_errors).holds
+    moved = replace(source, means=source.means + np.float32(0.1))
+    assert not prove(moved, scene.model, scene.header, scene.stated_errors).holds
+
+
 def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
     source = make_model(150, 1)
     drawn = replace(source, means=source.means + np.float32(0.25))
@@ -122,6 +152,41 @@ def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
     one, other = decode(plain.data), decode(thawed.data)
     for name in ("means", "opacities", *COLOURS):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+# absent bands
+
+
+def sparse_model(source, share):
+    """Bands 2 and 3 of some splats are zero."""
+    shN = 0.1 * source.shN
+    shN[np.random.default_rng(0).random(len(source)) < share, 3:] = 0.0
+    return replace(source, shN=shN.astype(np.float32))
+
+
+@pytest.mark.parametrize("options", [{}, {"tile_splats": 50}, {"profile": "archive"}, {"adaptive": 0.5}])
+def test_absent_bands_are_decoded_as_zeros_and_the_others_as_without(make_model, options):
+    model = sparse_model(make_model(400, 3), 0.9)
+    result = encode_with_report(model, EncodeOptions(sh_coding="scalar", **options), importance=np.ones(400))
+    scene = decode_scene(result.data)
+    expected = model.shN[result.source_index]
+    np.testing.assert_allclose(expected, scene.model.shN, atol=0.2)
+    absent = ~expected[:, 3:].any(axis=(1, 2))
+    assert not scene.model.shN[absent, 3:].any()
+    assert scene.header.codebooks
+
+
+def test_absent_bands_cost_next_to_nothing(make_model):
+    big, sizes, scalar = make_model(20_000, 3), {}, EncodeOptions(sh_coding="scalar")
+    for share in (0.0, 0.95, 1.0):
+        sizes[share] = len(encode(sparse_model(big, share), scalar))
+    full = sizes[0.0] - sizes[1.0]
+    # A twentieth of the values, and two index streams of at most three tenths of a bit and some.
+    assert sizes[0.95] - sizes[1.0] < 0.05 * full + 2 * 20_000 * 0.5 / 8
+
+
+def test_scenes_without_absent_bands_have_no_codebook_for_them(make_model):
+    assert not decode_scene(encode(make_model(400, 3), EncodeOptions(sh_coding="scalar"))).header.codebooks
 
 
 def test_those_who_use_the_encoder_import_none_of_its_modules():

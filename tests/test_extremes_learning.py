@@ -10,6 +10,7 @@ pytest.importorskip("numba", reason="learning needs numba: pip install 'csplat[r
 pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
 
 # Importing it needs what is looked for above.
+from captures import views_of
 from extremes_learnt import (
     BLACK,
     COARSE,
@@ -30,8 +31,11 @@ from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual import virtual_cameras
+from csplat_tools.optimise import target as optimising
+from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.proof import prove
-from csplat_tools.simplify import Target, encode_simplified, simplify
+from csplat_tools.simplify import Target, simplify
+from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
 from csplat_trainer.finetune import finetune, renders_of, split_views
 from csplat_trainer.loop import train
@@ -70,7 +74,8 @@ def test_half_the_splats_keep_what_the_guide_says(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_simplified_file_states_what_holds(name):
     source = learnt_from(name)
-    result = encode_simplified(source, target=Target(keep=0.5), options=replace(FEW, adjust=False)).result
+    views, options = find_view_set(source, count=10, size=(60, 45)), replace(FEW, adjust=False)
+    result = optimise(source, optimising.Target(keep=0.5), views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     proof = prove(source, decoded, read_header(result.data), read_stated_errors(result.data), result.source_index)
@@ -83,8 +88,8 @@ def test_a_simplified_file_states_what_holds(name):
 )
 def test_a_target_psnr_is_reached(name, most):
     source = learnt_from(name)
-    found = simplify(source, virtual_cameras(source, 16, 60, 45), target=Target(psnr=33.0), options=FEW)
-    assert found.report["psnr"] >= 33.0
+    found = simplify(source, views_of(virtual_cameras(source, 16, 60, 45)), target=Target(psnr=33.0), options=FEW)
+    assert found.report["decided_psnr"] >= 33.0
     assert len(found.model) <= most * len(source)
 
 

@@ -602,7 +602,7 @@ def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_p
 
 
 def test_cameras_that_see_nothing_are_refused(source, tmp_path):
-    away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(3)]
+    away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
     save_cameras(tmp_path / "away.json", away)
     write_ply(tmp_path / "scene.ply", source)
     result = invoke(

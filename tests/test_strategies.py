@@ -25,6 +25,7 @@ from csplat_tools.strategies import (
     prune_opacity,
     reduce_model,
 )
+from csplat_tools.targeting import Looking
 
 
 @pytest.fixture
@@ -278,7 +279,7 @@ def test_a_distilled_degree_looks_more_like_the_source(shell):
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
     assert scene.stated_errors.refitted
     said = scene.options["reduced"]
-    assert ("distilled", 140) == (said["sh"], said["views"])
+    assert ("distilled", 156) == (said["sh"], said["views"])
     assert said["check_psnr"] == pytest.approx(psnr(shell, distilled.data), abs=3.0)
     assert psnr(shell, distilled.data) > psnr(shell, truncated.data) + 1.0
 
@@ -335,8 +336,9 @@ def test_impossible_reductions_are_refused(make_model):
 
 
 def reducing(**words):
-    nothing = dict.fromkeys(("prune_opacity", "kmeans", "residual_stages", "cameras", "data", "sh_degree", "threads"))
-    return Reducing(**{**nothing, "distil_sh": False, "views": 160, "seed": 0, **words})
+    nothing = dict.fromkeys(("prune_opacity", "kmeans", "residual_stages", "sh_degree", "threads"))
+    looking = Looking(words.pop("cameras", None), None, None, 160)
+    return Reducing(**{**nothing, "distil_sh": False, "looking": looking, "seed": 0, **words})
 
 
 def test_what_is_asked_is_done(source, shell):
@@ -366,7 +368,6 @@ def test_a_camera_file_decides(shell, tmp_path):
     ("words", "message"),
     [
         ({"distil_sh": True}, "--distil-sh wants --sh-degree"),
-        ({"prune_opacity": 0.1, "data": "photographs"}, "say nothing without --distil-sh"),
         ({"prune_opacity": 2.0}, "the opacity to prune by is 2"),
         ({"kmeans": "means"}, "'means' is no number"),
         ({"kmeans": "4", "residual_stages": 9}, "in 9 stages"),

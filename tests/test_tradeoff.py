@@ -120,7 +120,7 @@ def test_targets_are_reached(swept):
     _, _, report = swept
     points = {one["name"]: one for one in report["points"]}
     assert points["target 9.0 kB"]["size_bytes"] <= 9000
-    assert {"goal", "chosen"} <= set(points["target 30 dB"]["settings"]["rate"])
+    assert {"goal", "chosen"} <= set(points["target 30 dB"]["settings"]["target"])
 
 
 def test_simplified_and_tuned_files_hold_what_was_asked_for(swept):

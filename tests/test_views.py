@@ -13,9 +13,8 @@ pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[r
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
 # Importing them needs what is looked for above.
-from captures import H, W, cameras, photograph, shell
+from captures import H, W, as_colmap, cameras, photograph, shell
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from csplat.errors import InputError
 from csplat.ply import read_ply
@@ -41,16 +40,7 @@ def sets(tmp_path_factory):
     for path in (folders["rgba"] / "images").iterdir():
         with Image.open(path) as picture:
             picture.convert("RGBA").save(path)
-    (folders["colmap"] / "transforms.json").unlink()
-    (folders["colmap"] / "sparse" / "0").mkdir(parents=True)
-    K, lines = cameras(1)[0].K, []
-    for number, camera in enumerate(cameras(16)):
-        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
-        values = " ".join(str(value) for value in (w, x, y, z, *camera.viewmat[:3, 3]))
-        lines.append(f"{number + 1} {values} 1 view{number:02}.png\n\n")
-    model = folders["colmap"] / "sparse" / "0"
-    (model / "images.txt").write_text("".join(lines))
-    (model / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {K[0, 0]} {K[1, 1]} {W / 2} {H / 2}\n")
+    as_colmap(folders["colmap"])
     return folders
 
 
@@ -93,7 +83,7 @@ def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, j
     save_cameras(tmp_path / "cameras.json", cameras(count))
     views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
     assert (judging, virtual) == (len(views.judges), views.virtual)
-    assert (20, 16) == (len(views.teaches), len(views.decides)) or not virtual
+    assert (36, 12) == (len(views.teaches), len(views.decides)) or not virtual
     roles = poses(views)
     assert sum(map(len, roles)) == len(set.union(*roles))
     assert virtual or count == sum(map(len, roles))
@@ -101,7 +91,7 @@ def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, j
 
 def test_virtual_views_judge_on_black_whatever_is_behind_the_others(scene):
     views = find_view_set(scene, count=5, aside=2, background=WHITE)
-    assert (5, 2, 8) == tuple(map(len, poses(views)))
+    assert (21, 2, 8) == tuple(map(len, poses(views)))
     assert BLACK == views.judge(scene).background
     assert WHITE == views.decider(scene).background
 

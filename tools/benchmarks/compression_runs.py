@@ -88,7 +88,7 @@ class Bench:
         self.source = read_ply(ply)
         data = DataOptions(str(scene.data), scene.size)
         self.looks = find_view_set(self.source, data=data, background=scene.background, aside=0)
-        if self.looks.data is None or not self.looks.data.test:
+        if not (self.looks.photographs and self.looks.judges):
             raise InputError(f"{scene.data} holds out no photographs to judge by")
         self._picks: dict[tuple[float | None, bool], Pick] = {}
 

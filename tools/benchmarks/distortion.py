@@ -18,7 +18,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,8 +26,8 @@ from typing import Any
 
 from distortion_curves import Point, bracket, rate_at
 from distortion_plot import plot
-from distortion_simplified import Shrinker
 from distortion_tables import GRADED, Measured, tables
+from kept import Kept
 from machine import describe_machine
 from peers import Peer, find_splat_transform, run_timed, transform
 from scenes import DATA, ROOT, Scene, find_scenes
@@ -35,7 +35,6 @@ from scenes import DATA, ROOT, Scene, find_scenes
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
@@ -43,10 +42,12 @@ from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.extras import need_renderer
 from csplat_tools.importances import measured_importance
-from csplat_tools.rate.grading import measuring_views
-from csplat_tools.simplify import SimplifyOptions
+from csplat_tools.optimise.optimiser import optimise
+from csplat_tools.optimise.sensitivity import measuring_views
+from csplat_tools.optimise.target import Target
+from csplat_tools.views import BLACK, find_view_set
 
-__all__ = ["Kept", "main"]
+__all__ = ["main"]
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
@@ -111,29 +112,6 @@ def _measure_scenes(args: argparse.Namespace) -> None:
         _simplified(bench, [float(text) for text in args.offsets.split(",")], args.views)
 
 
-class Kept:
-    """What is known of a scene, on disk after each measurement. Owns the file."""
-
-    def __init__(self, path: Path, *, again: bool = False) -> None:
-        self.path = path
-        self.values: dict[str, Any] = json.loads(path.read_text()) if path.exists() and not again else {}
-
-    def measure(self, kind: str, key: str, call: Callable[[], Any]) -> Any:
-        """Return what is known, or find it out and keep it."""
-        known = self.values.setdefault(kind, {})
-        if key not in known:
-            start = time.perf_counter()
-            known[key] = call()
-            self.write()
-            print(f"{self.path.stem} {kind} {key}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-        return known[key]
-
-    def write(self) -> None:
-        """Replace the file."""
-        with atomic_writer(self.path) as stream:
-            stream.write((json.dumps(self.values, indent=1) + "\n").encode())
-
-
 @dataclass(frozen=True, eq=False)
 class _Bench:
     """A scene, what is known of it, and who judges."""
@@ -147,17 +125,14 @@ class _Bench:
     def importance(self) -> Importance | None:
         """What training cameras say, or virtual views of an object; None inside of surroundings without cameras."""
         beside = self.scene.path.with_suffix(".cameras.json")
-        if beside.exists():
-            given = load_cameras(beside)
-        elif scene_frame(self.source).kind == "object":
-            given = None
-        else:
+        given = str(beside) if beside.exists() else None
+        if given is None and scene_frame(self.source).kind != "object":
             return None
         start = time.perf_counter()
-        cameras = measuring_views(self.source, given)
-        found = measured_importance(self.source, cameras, (0.0, 0.0, 0.0), threads=None)
+        cameras = measuring_views(self.source, find_view_set(self.source, cameras=given, background=BLACK))
+        found = measured_importance(self.source, cameras, BLACK, threads=None)
         seconds = time.perf_counter() - start
-        self.kept.values["graded by"] = {"cameras": len(cameras), "given": beside.exists(), "seconds": seconds}
+        self.kept.values["graded by"] = {"cameras": len(cameras), "given": given is not None, "seconds": seconds}
         return found
 
     @classmethod
@@ -166,7 +141,7 @@ class _Bench:
         path = DATA / "psnr_cameras" / f"{scene.name}.json"
         cameras = load_cameras(path) if path.exists() else virtual_cameras(source)
         kept.values["cameras"] = path.name if path.exists() else "virtual"
-        return cls(scene, source, Judge.of_source(source, cameras, (0.0, 0.0, 0.0)), kept)
+        return cls(scene, source, Judge.of_source(source, cameras, BLACK), kept)
 
     def goals(self) -> dict[str, float]:
         """PSNR of each peer that came through, dB."""
@@ -255,15 +230,25 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
 
 
 def _simplified(bench: _Bench, offsets: Sequence[float], views: int) -> None:
-    """Files of fewer splats around PSNRs beside that of SPZ."""
+    """The smallest files that reach PSNRs beside that of SPZ, where splats may go."""
     spz = bench.goals().get("SPZ")
     if spz is None:
         return
-    shrinker = Shrinker(bench.scene.name, bench.source, bench.judge, SimplifyOptions(views=views))
-    plain = Measured(bench.kept.values).plain()
     for offset in offsets:
         goal = spz + offset
-        bench.kept.measure("simplified", f"{offset:+g}", lambda goal=goal: shrinker.around(goal, bench.loss(), plain))
+        bench.kept.measure("simplified", f"{offset:+g}", lambda goal=goal: _reached(bench, goal, views))
+
+
+def _reached(bench: _Bench, goal: float, views: int) -> dict[str, Any]:
+    """The file of a PSNR by the cameras that judge all files here; virtual views teach and decide."""
+    around = replace(find_view_set(bench.source, count=views), judges=bench.judge.cameras)
+    start = time.perf_counter()
+    try:
+        report = optimise(bench.source, Target(psnr=goal), around).report
+    except InputError as error:
+        return {"goal": goal, "remark": str(error), "seconds": time.perf_counter() - start}
+    file = {name: report.chosen[name] for name in ("psnr", "size_bytes", "splats", "sh_coding")}
+    return {"goal": goal, **file, "encodes": report.encodes, "seconds": report.seconds}
 
 
 if __name__ == "__main__":

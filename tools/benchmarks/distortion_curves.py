@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-__all__ = ["Point", "Rate", "Series", "bracket", "front", "psnr_at", "rate_at"]
+__all__ = ["Point", "Rate", "Series", "bracket", "bytes_between", "front", "psnr_at", "rate_at"]
 
 _WINDOW = 2.0  # dB on either side of a goal in which a point has to lie for a straight line to be trusted
 _BESIDE = 0.4  # dB beside a goal at which a point is aimed
@@ -72,16 +72,26 @@ def rate_at(series: Series, psnr: float) -> Rate | None:
     found: list[Rate] = []
     for how, points in series.items():
         found += [Rate(one.size_bytes, how, one.psnr) for one in points if one.psnr >= psnr]
-        between = _between(points, psnr)
+        between = bytes_between(points, psnr)
         if between is not None:
             found.append(Rate(between, how))
     return min(found, key=lambda rate: rate.size_bytes, default=None)
 
 
-def _between(points: Sequence[Point], psnr: float) -> float | None:
+def bytes_between(points: Sequence[Point], psnr: float, gap: float = _GAP) -> float | None:
+    """Bytes at a PSNR, log(bytes) being straight between the points on either side.
+
+    Args:
+        points: files of one kind.
+        psnr: dB.
+        gap: between the two points, at most, dB.
+
+    Returns:
+        `None` where a side has no point, or the two are further apart.
+    """
     below = max((one for one in points if one.psnr <= psnr), key=lambda one: one.psnr, default=None)
     above = min((one for one in points if one.psnr >= psnr), key=lambda one: one.psnr, default=None)
-    if below is None or above is None or above.psnr - below.psnr > _GAP:
+    if below is None or above is None or above.psnr - below.psnr > gap:
         return None
     if above.psnr == below.psnr:
         return float(min(below.size_bytes, above.size_bytes))

@@ -78,14 +78,11 @@ class Measured:
         return {how: points for how, points in self.plain().items() if not how.startswith(GRADED)}
 
     def simplified(self) -> Series:
-        """Files of simplified scenes, by number of splats, coding of SH, and PSNR that was looked for.
-
-        What belongs to one PSNR goes together: SH bands are chosen for it.
-        """
+        """Files of simplified scenes, by number of splats, coding of SH, and PSNR that was looked for."""
         return {
-            f"{how} for {one['goal']:.1f}": [Point(**point) for point in points]
+            f"{one['splats']} {one['sh_coding']} for {one['goal']:.1f}": [Point(one["psnr"], one["size_bytes"])]
             for one in self.values.get("simplified", {}).values()
-            for how, points in one["points"].items()
+            if "psnr" in one
         }
 
     def simplified_rate(self, psnr: float) -> Rate | None:
@@ -224,20 +221,22 @@ def _plain_bytes(one: Measured, rate: Rate | None) -> str:
 
 
 def _simplified_table(results: Mapping[str, Measured], *, markdown: bool) -> str:
-    """Files of simplified scenes beside files of the whole ones, at the PSNRs that were looked for."""
+    """Files of simplified scenes beside files of the whole ones of the same PSNR."""
     rows = []
     for scene, one in results.items():
         found = one.values.get("simplified", {})
         for file in sorted(found.values(), key=lambda file: float(file["goal"])):
-            fewer, whole = rate_at(one.simplified(), file["goal"]), rate_at(one.plain(), file["goal"])
-            splats, coding = (fewer.how.split()[:2]) if fewer else ("0", "-")
-            share = f"{fewer.size_bytes / whole.size_bytes:.3f}" if fewer and whole else "-"
-            encodes = sum(map(len, file["points"].values()))
+            psnr = file.get("psnr", file["goal"])
+            whole, seconds = rate_at(one.plain(), psnr), f"{file['seconds']:.0f}"
+            if "remark" in file:
+                rows.append((scene, f"{psnr:.1f}", "-", "-", "-", _plain_bytes(one, whole), "-", "-", seconds))
+                continue
+            share = "-" if whole is None else f"{file['size_bytes'] / whole.size_bytes:.3f}"
             rows.append(
                 (
-                    scene, f"{file['goal']:.1f}", _plain_bytes(one, fewer), coding,
-                    f"{100.0 * int(splats) / one.splats:.0f}", _plain_bytes(one, whole), share, f"{encodes}",
-                    f"{file['seconds']:.0f}",
+                    scene, f"{psnr:.1f}", f"{one.per_splat(file['size_bytes']):.2f}", file["sh_coding"],
+                    f"{100.0 * file['splats'] / one.splats:.0f}", _plain_bytes(one, whole), share,
+                    f"{file['encodes']}", seconds,
                 )
             )  # fmt: skip
     header = ("simplified", "dB", "B/splat of the source", "SH", "splats %", "whole", "of that", "encodes", "s")

@@ -32,8 +32,8 @@ from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
 from csplat_tools.importances import measured_importance
 from csplat_tools.models import without_bands
-from csplat_tools.rate.grading import measuring_views
-from csplat_tools.views import BLACK
+from csplat_tools.optimise.sensitivity import measuring_views
+from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
 _EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files without grades
@@ -60,7 +60,7 @@ def main() -> None:
 def _rows(scene: Scene) -> list[tuple[str, ...]]:
     source = without_bands(read_ply(scene.path), 0)
     given, own = _cameras(scene.path.with_suffix(".cameras.json")), _cameras(_of_psnr(scene.name))
-    measures = {"virtual views": measuring_views(source, None), "half of its cameras": given[::2]}
+    measures = {"virtual views": measuring_views(source, find_view_set(source)), "half of its cameras": given[::2]}
     judges = {"cameras of `psnr`": own or virtual_cameras(source), "the other half": given[1::2][:_JUDGES]}
     kind, found = scene_frame(source).kind, dict[str, tuple[Importance, float]]()
     for name, cameras in measures.items():

@@ -22,24 +22,24 @@ from printing import laid_out
 from scenes import ROOT, Scene, named_scenes
 
 from csplat.decoder import decode, read_header
-from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.encoder import encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.judge import Judge
 from csplat_tools.models import without_bands
-from csplat_tools.rate.control import encode_to_target
-from csplat_tools.rate.targets import RateTarget
+from csplat_tools.optimise.optimiser import optimise
+from csplat_tools.optimise.target import Target
 from csplat_tools.tradeoff.fetching import fetched_bytes
-from csplat_tools.views import BLACK, comparison_cameras
+from csplat_tools.views import BLACK, comparison_cameras, find_view_set
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k,statue"
 #: Name, options of `csplat encode`; the target, and whether all splats stay.
 _POINTS = (
-    ("thumbnail", "--target-psnr 30", RateTarget(psnr=30.0), False),
-    ("web page", "--target-psnr 38", RateTarget(psnr=38.0), False),
+    ("thumbnail", "--target-psnr 30", Target(psnr=30.0), False),
+    ("web page", "--target-psnr 38", Target(psnr=38.0), False),
     ("balanced", "--preset balanced", None, True),
-    ("archive", "--target-psnr 50 --keep-all", RateTarget(psnr=50.0), True),
+    ("archive", "--target-psnr 50 --keep-all", Target(psnr=50.0), True),
 )
 _HEAD = ("scene", "for", "kB", "× smaller", "dB", "whole, s", "first picture, kB", "dB", "s", "encoding, s")
 
@@ -90,10 +90,10 @@ def _measure(scene: Scene, out: Path) -> None:
         print(f"{scene.name} {name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
 
 
-def _encoded(source: SplatModel, target: RateTarget | None, *, whole: bool) -> bytes:
+def _encoded(source: SplatModel, target: Target | None, *, whole: bool) -> bytes:
     if target is None:
         return encode_with_report(source).data
-    return encode_to_target(source, target, EncodeOptions(), prune=False if whole else None).result.data
+    return optimise(source, target, find_view_set(source), keep_all=whole).result.data
 
 
 def _judged(data: bytes, judge: Judge) -> dict[str, Any]:

@@ -1,10 +1,9 @@
-"""Measure simplification: what is left of a scene when splats go, by which method, and what a file of it costs.
+"""Measure simplification: what is left of a scene when splats go, by which method; `targets.py` has files of it.
 
     python tools/benchmarks/simplify.py removal --scenes plane3,donut      # PSNR by share removed and method
-    python tools/benchmarks/simplify.py files --scenes plane3 --psnr 40    # bytes at equal PSNR, with and without
     python tools/benchmarks/simplify.py pass                               # the pass beside a render, and its twin
     python tools/benchmarks/simplify.py bands --scenes plane3              # ways to write bands that are absent
-    python tools/benchmarks/simplify.py tables                             # print what was measured, plot it
+    python tools/benchmarks/simplify.py tables                             # print what was measured
 
 What was measured is kept scene by scene in out/simplify/NAME.json: a run that is interrupted goes on where it ended.
 PSNR is against the source, on cameras that decided nothing: those of the data folder (psnr_cameras/NAME.json).
@@ -16,16 +15,17 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kept import Kept
 from machine import describe_machine
 from scenes import DATA, ROOT
-from simplify_tables import plot_files, tables
+from simplify_tables import tables
 
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.model import SplatModel
@@ -38,7 +38,7 @@ from csplat_render.rasterise import Rasteriser
 from csplat_render.refit import ColourOperator
 from csplat_render.removal import measure_removal, removal_exact
 from csplat_render.virtual import FIELD_OF_VIEW, scene_frame, virtual_cameras
-from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
+from csplat_tools.simplify import SimplifyOptions
 from csplat_tools.simplify.colours import fit
 from csplat_tools.simplify.core import prepare
 from csplat_tools.simplify.order import removal_order
@@ -62,20 +62,18 @@ def main() -> None:
             if path is None:
                 print(f"absent: {name}", file=sys.stderr)
                 continue
-            {"removal": _removal, "files": _files, "pass": _pass, "bands": _bands}[args.what](name, path, args)
+            {"removal": _removal, "pass": _pass, "bands": _bands}[args.what](name, path, args)
     results = {path.stem: json.loads(path.read_text()) for path in sorted(args.out.glob("*.json"))}
     print(tables(results))
-    plot_files(results, args.out / "files.png")
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("removal", "files", "pass", "bands", "tables"))
+    parser.add_argument("what", choices=("removal", "pass", "bands", "tables"))
     parser.add_argument("--scenes", default=_SCENES, help="names, separated by commas; default: %(default)s")
     parser.add_argument("--extra", type=Path, nargs="+", default=[], metavar="PLY", help="further scenes, by file")
     parser.add_argument("--gone", default="10,20,30,40,50,60,70,80", help="per cent removed; default: %(default)s")
     parser.add_argument("--far", action="store_true", help="removal seen from twice as far, too")
-    parser.add_argument("--psnr", default="34,37,40,43", help="of files, dB; default: %(default)s")
     parser.add_argument("--views", type=int, default=160, help="at most; default: %(default)s")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "simplify", help="default: %(default)s")
     return parser.parse_args()
@@ -91,27 +89,9 @@ def _judge(name: str, source: SplatModel) -> Judge:
     return Judge.of_source(source, load_cameras(path) if path.exists() else virtual_cameras(source), (0.0, 0.0, 0.0))
 
 
-class _Kept:
-    """Results of a scene, on disk after each one. Owns the file."""
-
-    def __init__(self, name: str, out: Path) -> None:
-        self.path = out / f"{name}.json"
-        self.values: dict[str, Any] = json.loads(self.path.read_text()) if self.path.exists() else {}
-
-    def measure(self, kind: str, key: str, call: Callable[[], Any]) -> Any:
-        """Return what is known, or find it out and keep it."""
-        known = self.values.setdefault(kind, {})
-        if key not in known:
-            start = time.perf_counter()
-            known[key] = call()
-            self.path.write_text(json.dumps(self.values, indent=1) + "\n")
-            print(f"{self.path.stem} {kind} {key}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-        return known[key]
-
-
 def _removal(name: str, path: Path, args: argparse.Namespace) -> None:
     """Each method at each share removed; the last one without and with a fit, of colours and of all that is fitted."""
-    source, kept = read_ply(path), _Kept(name, args.out)
+    source, kept = read_ply(path), Kept(args.out / f"{name}.json")
     options = SimplifyOptions(views=args.views, bands=False)
     near = _Bench(source, _judge(name, source), options)
     away, others = _far_cameras(source)
@@ -191,36 +171,9 @@ class _Bench:
         return result
 
 
-def _files(name: str, path: Path, args: argparse.Namespace) -> None:
-    """Bytes per source splat at equal PSNR: the smallest of what was tried, and of what was not simplified."""
-    source, kept = read_ply(path), _Kept(name, args.out)
-    cameras = DATA / "psnr_cameras" / f"{name}.json"
-    for goal in (float(text) for text in args.psnr.split(",")):
-
-        def measured(goal: float = goal) -> dict[str, Any]:
-            start = time.perf_counter()
-            views = find_view_set(source, count=args.views)
-            deciding = load_cameras(cameras) if cameras.exists() else views.judges
-            views = replace(views, decides=deciding, judges=())
-            file = encode_simplified(source, views, target=Target(psnr=goal))
-            tried = file.report["tried"]
-            return {
-                "tried": tried,
-                "plain_bytes": min((one["size_bytes"] for one in tried if one["splats"] == len(source)), default=None),
-                "size_bytes": len(file.result.data),
-                "psnr": file.report["psnr"],
-                "splats": file.report["splats"],
-                "source_splats": len(source),
-                "zero_bands": file.report.get("zero_bands"),
-                "seconds": time.perf_counter() - start,
-            }
-
-        kept.measure("files", f"{goal:g}", measured)
-
-
 def _pass(name: str, path: Path, args: argparse.Namespace) -> None:
     """Seconds of the pass and of plain renders of the same views; difference from the twin on a thinned scene."""
-    source, kept = read_ply(path), _Kept(name, args.out)
+    source, kept = read_ply(path), Kept(args.out / f"{name}.json")
     cameras = camera_sequence(source, 24, VIEW_SIZE)
 
     def seconds() -> dict[str, Any]:
@@ -263,7 +216,7 @@ def _pass(name: str, path: Path, args: argparse.Namespace) -> None:
 
 def _bands(name: str, path: Path, args: argparse.Namespace) -> None:
     """Bytes of the SH of half a scene whose bands have gone where they show least, written in five ways."""
-    source, kept = read_ply(path), _Kept(name, args.out)
+    source, kept = read_ply(path), Kept(args.out / f"{name}.json")
     if not source.sh_degree:
         return
 

@@ -11,6 +11,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
+from csplat_tools.targeting import Looking
 
 __all__ = ["Reducing"]
 
@@ -24,8 +25,7 @@ class Reducing:
         distil_sh: the degree given is reached by a fit to renders of the source.
         kmeans: `256`, `means=4096,quats=256`, `0.01`: entries or shares of the variance.
         residual_stages: codebooks per attribute; None: one.
-        cameras, data: views to distil by, a camera file or a data set.
-        views: virtual ones at most.
+        looking: views to distil by.
         sh_degree: of the file, as the encoder's options have it.
         seed: of the clustering.
         threads: how many.
@@ -35,9 +35,7 @@ class Reducing:
     distil_sh: bool
     kmeans: str | None
     residual_stages: int | None
-    cameras: str | None
-    data: str | None
-    views: int
+    looking: Looking
     sh_degree: int | None
     seed: int
     threads: int | None
@@ -58,13 +56,11 @@ class Reducing:
 
         if self.distil_sh and self.sh_degree is None:
             raise typer.BadParameter("--distil-sh wants --sh-degree: which degree is to be reached")
-        if (self.cameras is not None or self.data is not None) and not self.distil_sh:
-            raise typer.BadParameter("--cameras and --data say nothing without --distil-sh")
         try:
             stages = 1 if self.residual_stages is None else self.residual_stages
             kmeans = None if self.kmeans is None else parse_kmeans(self.kmeans, stages=stages, seed=self.seed)
             reduction = Reduction(
-                self.prune_opacity, self.sh_degree, self.distil_sh, kmeans, self.views, threads=self.threads
+                self.prune_opacity, self.sh_degree, self.distil_sh, kmeans, self.looking.count, threads=self.threads
             )
         except InputError as error:
             raise typer.BadParameter(str(error)) from None
@@ -74,12 +70,9 @@ class Reducing:
         def encode(model: SplatModel, encoding: EncodeOptions, progress: Report | None) -> Made:
             if not self.distil_sh:
                 return Made(encode_reduced(model, reduction, encoding, progress=progress))
-            from csplat_tools.views import DataOptions, find_view_set
-
-            if self.cameras is None and self.data is None:
+            if not self.looking.is_given:
                 return Made(encode_reduced(model, reduction, encoding, progress=progress))
-            data = None if self.data is None else DataOptions(self.data)
-            views = find_view_set(model, cameras=self.cameras, data=data)
+            views = self.looking.views(model, quiet=quiet)
             return Made(encode_reduced(model, reduction, encoding, views=views, progress=progress))
 
         return encode

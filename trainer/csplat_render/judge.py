@@ -108,7 +108,7 @@ class Judge:
             metrics.squared_error(self.look(number).picture, draw(camera).rgb)
             for number, camera in enumerate(self.cameras)
         ]
-        return np.array([np.mean(one) for one in squares])
+        return np.array([np.mean(one) for one in squares], np.float64)
 
     def pooled(self, errors: F64) -> float:
         """The mean squared error over all pixels, of those by view."""

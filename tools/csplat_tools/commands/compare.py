@@ -30,10 +30,13 @@ def compare(
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="FILE.json", help="Cameras, instead of virtual ones; of 40 or more those that judge."),
+        typer.Option(
+            metavar="FILE.json", help="Cameras, instead of virtual ones; of 40 or more every fourth, 24 at most."
+        ),
     ] = None,
     data: Annotated[
-        str | None, typer.Option(metavar="DATA", help="Or where a data set's pictures were taken; they judge A and B.")
+        str | None,
+        typer.Option(metavar="DATA", help="Or the cameras of a data set; its photographs judge A and B, too."),
     ] = None,
     split: Split = "test",
     size: Size = None,
@@ -52,7 +55,7 @@ def compare(
     ] = None,
     background: Annotated[
         str | None,
-        typer.Option(metavar="R,G,B", help="Behind the scene: black, but with --data as in training."),
+        typer.Option(metavar="R,G,B", help="Behind the scene: black, but with --data or --cameras as in training."),
     ] = None,
     mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
     force: Annotated[bool, typer.Option("--force", help="Replace existing pictures.")] = False,
@@ -61,12 +64,12 @@ def compare(
 ) -> None:
     """Compare a scene with its source: sizes, errors of the splats, and pictures.
 
-    `psnr` is that of the squared error pooled over eight 640x480 views
-    around A in front of black, over all pixels and channels, 99 at most. The
-    same error scores 10 dB more from four times as far away: compare only
-    numbers from the same cameras and background; white flatters all of them.
-    With --data the held-out photographs judge A and B as well. Needs the
-    packages of the render extra.
+    `psnr` is that of the squared error pooled over all pixels and channels of
+    eight 640x480 views around A in front of black, or of the views given; 99
+    at most. The same error scores 10 dB more from four times as far away:
+    compare only numbers from the same cameras and background; white flatters
+    all of them. With --data the held-out photographs judge A and B as well.
+    Needs the packages of the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat

@@ -11,7 +11,7 @@ from csplat_tools.views import SPLITS, DataOptions
 
 __all__ = ["Images", "Near", "Size", "Split", "TestEvery", "data_options"]
 
-_PANEL = "Photographs of --data (else as the scene was trained)"
+_PANEL = "Photographs of --data (by default as the scene was trained)"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", rich_help_panel=_PANEL, help="Scale them to this size.")]
 Images = Annotated[

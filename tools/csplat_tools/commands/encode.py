@@ -9,12 +9,13 @@ import typer
 from csplat._spec import MEASURE_NAMES, TILE_SPLATS_MAX
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat.errors import InputError
+from csplat_tools.commands.data_options import Images, Size, TestEvery, data_options
 from csplat_tools.console import format_bytes, format_table, guarded, note, progress_bar, say_json
 from csplat_tools.convert import Encoded, SceneFacts, encode_file
 from csplat_tools.inout import STANDARD_STREAM, check_outputs
+from csplat_tools.parsing import parse_colour
 from csplat_tools.reducing import Reducing
-from csplat_tools.simplifying import DEFAULT_VIEWS, Simplifying
-from csplat_tools.targeting import Targeting, target_lines
+from csplat_tools.targeting import DEFAULT_VIEWS, Looking, Targeting, target_lines
 from csplat_tools.ways import Ways
 
 __all__ = ["encode"]
@@ -24,10 +25,9 @@ _PRECISION = "Precision (the preset decides where nothing is given)"
 _COLOUR = "Spherical harmonics"
 _SHAPE = "Codebook of shapes (wants --importance of `csplat sensitivity`)"
 _CODING = "Coding"
-_TARGET = "Targets (sizes and PSNRs need the render extra)"
-_VIEWS = "Views that judge and decide; else virtual ones"
+_TARGET = "Targets (all but --max-error need the render extra)"
+_VIEWS = "Views for targets (virtual ones by default)"
 _SIMPLE = "Simple strategies, to compare with"
-_LESS = "Simplification (needs the render extra)"
 
 
 @guarded
@@ -44,14 +44,16 @@ def encode(
     source_index: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.npy", help="Write which splat each one of the file was; rows that were dropped do not count."
+            metavar="FILE.npy",
+            help="Write which splat of the source each one of the file was; rows that were dropped do not count.",
         ),
     ] = None,
     importance: Annotated[
         str | None,
         typer.Option(
             metavar="FILE",
-            help="What `csplat sensitivity` wrote; or weights (.npy), without dropped rows. Instead of opacity x size.",
+            help="How much each splat matters, instead of opacity x size: what `csplat sensitivity` wrote, or weights"
+            " (.npy) without dropped rows.",
         ),
     ] = None,
     prune_unseen: Annotated[
@@ -73,34 +75,53 @@ def encode(
     ] = None,
     target_size: Annotated[
         str | None,
-        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="The best picture within so many bytes; or:"),
+        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="The best picture within so many bytes."),
     ] = None,
     target_psnr: Annotated[
         float | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="The smallest file whose renders have this PSNR."),
+        typer.Option(
+            metavar="DB",
+            rich_help_panel=_TARGET,
+            help="The smallest file whose renders have this PSNR against the source's.",
+        ),
     ] = None,
     max_error: Annotated[
         str | None,
         typer.Option(
             metavar="means=0.001,...",
             rich_help_panel=_TARGET,
-            help=f"No splat errs by more: {', '.join(MEASURE_NAMES.values())}. With mm where the unit is known.",
+            help=f"No splat errs by more, and all stay: {', '.join(MEASURE_NAMES.values())}. With mm where the unit is"
+            " known.",
         ),
     ] = None,
-    prune: Annotated[
-        bool | None,
+    max_loss: Annotated[
+        str | None,
         typer.Option(
-            "--prune/--keep-all",
+            metavar="DB",
             rich_help_panel=_TARGET,
-            help="Leave out splats not worth their bits, or never. By default of objects, or with 40 cameras or more.",
+            help="The smallest file whose PSNR against the photographs of --data falls by no more than this.",
         ),
     ] = None,
+    keep: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            rich_help_panel=_TARGET,
+            help="This share of the splats, those that pictures need most, fitted anew; the preset says how precisely.",
+        ),
+    ] = None,
+    keep_all: Annotated[
+        bool,
+        typer.Option(
+            "--keep-all", rich_help_panel=_TARGET, help="The target leaves out and refits no splat: much sooner."
+        ),
+    ] = False,
     attribute_psnr: Annotated[
         float | None,
         typer.Option(
             metavar="DB",
             rich_help_panel=_PRECISION,
-            help="PSNR that each attribute keeps by itself; the file's is 5 to 12 dB lower.",
+            help="PSNR that each attribute keeps by itself; that of pictures is 5 to 12 dB lower.",
         ),
     ] = None,
     position_bits: Annotated[
@@ -205,27 +226,40 @@ def encode(
     residual_stages: Annotated[
         int | None, typer.Option(metavar="1..4", rich_help_panel=_SIMPLE, help="Codebooks one after the other.")
     ] = None,
-    simplify: Annotated[
-        bool, typer.Option("--simplify", rich_help_panel=_LESS, help="Remove what pictures need least, fit colours.")
-    ] = False,
-    keep: Annotated[
-        float | None, typer.Option(metavar="SHARE", rich_help_panel=_LESS, help="Share of the splats that stay; or:")
-    ] = None,
-    max_loss: Annotated[
-        str | None,
-        typer.Option(metavar="DB", rich_help_panel=_LESS, help="How far PSNR of photographs may fall; or a target."),
-    ] = None,
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="FILE.json", rich_help_panel=_VIEWS, help="A camera file."),
+        typer.Option(
+            metavar="FILE.json",
+            rich_help_panel=_VIEWS,
+            help="Cameras that judge; of 40 or more every fourth does, the others teach and decide.",
+        ),
     ] = None,
     data: Annotated[
-        str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set with its photographs.")
+        str | None,
+        typer.Option(
+            metavar="DATA",
+            rich_help_panel=_VIEWS,
+            help="A data set: views of its training teach and decide, held-out ones judge.",
+        ),
+    ] = None,
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="R,G,B",
+            rich_help_panel=_VIEWS,
+            help="Behind the scene: black, but with --data or --cameras as in training.",
+        ),
     ] = None,
     views: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=1, rich_help_panel=_VIEWS, help=f"Virtual views at most, {DEFAULT_VIEWS} by default."
+            metavar="N",
+            min=1,
+            rich_help_panel=_VIEWS,
+            help=f"Virtual views that teach, at most; {DEFAULT_VIEWS} by default.",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
@@ -237,6 +271,14 @@ def encode(
     Reads the PLY of any 3DGS trainer, repairs what is safe to repair (and
     says so), and states in the file how far its splats lie from the source.
 
+    A target asks for the smallest file that reaches a PSNR, or the best one
+    of a size: precision, coding of colours, grades, and how many splats stay
+    are chosen, and what stays is fitted to what the scene looks like. That
+    takes minutes; --keep-all leaves all splats as they are and is sooner.
+    --preset fast and --max-error leave them, too. Splats are fitted in views
+    that teach, files compared in views that decide, and the result is scored
+    in views that judge; no view does two of these.
+
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
@@ -244,10 +286,12 @@ def encode(
         csplat verify scene.csplat --source scene.ply --source-index scene.npy
       csplat sensitivity scene.ply scene.npz --data photographs && \
         csplat encode scene.ply scene.csplat --importance scene.npz
-      csplat encode scene.ply scene.csplat --target-size 5MB
+      csplat encode scene.ply scene.csplat --target-psnr 40
       csplat encode scene.ply scene.csplat --target-psnr 42 --keep-all
+      csplat encode scene.ply scene.csplat --target-size 5MB
+      csplat encode scene.ply scene.csplat --keep 0.5
+      csplat encode scene.ply scene.csplat --max-loss 0.3dB --data photographs
       csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
-      csplat encode scene.ply scene.csplat --simplify --target-size 5MB
       csplat encode scene.ply scene.csplat --prune-opacity 0.005 --sh-degree 0
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
@@ -284,15 +328,14 @@ def encode(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    given, views = views is not None, views or DEFAULT_VIEWS
+    colour = None if background is None else parse_colour(background)
+    looking = Looking(cameras, data_options(data, size, images, test_every), colour, views or DEFAULT_VIEWS)
     ways = Ways(
         options,
-        simplify,
-        Simplifying(keep, max_loss, target_psnr, target_size, cameras, data, views, threads),
-        Targeting(target_size, target_psnr, max_error, prune, importance, cameras, data, views, threads),
-        Reducing(prune_opacity, distil_sh, kmeans, residual_stages, cameras, data, views, sh_degree, seed, threads),
+        Targeting(target_size, target_psnr, max_loss, keep, max_error, keep_all, importance, looking),
+        Reducing(prune_opacity, distil_sh, kmeans, residual_stages, looking, sh_degree, seed, threads),
         prune_unseen,
-        views_given=given,
+        views_given=views is not None,
     )
     encoder = ways.encoder(quiet=quiet)
     if as_json and target == STANDARD_STREAM:
@@ -329,9 +372,6 @@ def _report(encoded: Encoded) -> None:
     report = encoded.result.report
     for line in target_lines(encoded.made.said) if encoded.made.key == "target" else ():
         note(line)
-    if encoded.made.key == "simplified":
-        said = encoded.made.said
-        note(f"simplified: {said['splats']} of {said['splats_before']} splats, PSNR {said['psnr']:.2f} dB of the file")
     per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
     note(

@@ -39,7 +39,11 @@ def finetune(
     output: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write.")],
     data: Annotated[
         str | None,
-        typer.Option(metavar="DATA", rich_help_panel=_LIKE, help="Posed photographs; those held out judge."),
+        typer.Option(
+            metavar="DATA",
+            rich_help_panel=_LIKE,
+            help="Posed photographs: those of the training teach, those held out judge.",
+        ),
     ] = None,
     itself: Annotated[
         bool, typer.Option("--self", rich_help_panel=_LIKE, help="The scene's own renders, from all around.")
@@ -51,7 +55,9 @@ def finetune(
     cameras: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.json", rich_help_panel=_LIKE, help="With --self: they judge; 40 or more teach, too."
+            metavar="FILE.json",
+            rich_help_panel=_LIKE,
+            help="With --self: cameras that judge; of 40 or more most teach instead.",
         ),
     ] = None,
     views: Annotated[
@@ -63,7 +69,9 @@ def finetune(
     background: Annotated[
         str | None,
         typer.Option(
-            metavar="R,G,B", rich_help_panel=_LIKE, help="Behind the scene: black, but with --data as in training."
+            metavar="R,G,B",
+            rich_help_panel=_LIKE,
+            help="Behind the scene: black, but with --data or --cameras as in training.",
         ),
     ] = None,
     aside: Annotated[
@@ -72,12 +80,17 @@ def finetune(
             metavar="N",
             min=0,
             rich_help_panel=_LIKE,
-            help="Views that decide which step was best, and do not teach; 0: with --data some that teach decide.",
+            help="Views that decide which step was best, and do not teach; 0: with --data some that teach decide, with"
+            " --self a few others.",
         ),
     ] = 0,
     keep: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", rich_help_panel=_HOW, help="Remove what pictures need least first."),
+        typer.Option(
+            metavar="SHARE",
+            rich_help_panel=_HOW,
+            help="First leave only this share of the splats, those that pictures need most.",
+        ),
     ] = None,
     prune_unseen: Annotated[
         bool | None,
@@ -98,32 +111,46 @@ def finetune(
     ] = 1_000,
     lr_factor: Annotated[
         float | None,
-        typer.Option(metavar="FACTOR", rich_help_panel=_HOW, help="Of all learning rates: 1, or 0.03 with --self."),
+        typer.Option(
+            metavar="FACTOR",
+            rich_help_panel=_HOW,
+            help="Multiplies all learning rates; by default 1, with --self 0.03.",
+        ),
     ] = None,
     byte_cost: Annotated[
         float | None,
         typer.Option(
             metavar="COST",
             rich_help_panel=_HOW,
-            help="What a bit per splat weighs in the loss, 0: nothing; 1e-4, or 2e-5 with --self.",
+            help="What a bit per splat weighs in the loss; by default 1e-4, with --self 2e-5; 0: nothing.",
         ),
     ] = None,
     patience: Annotated[
         int,
-        typer.Option(metavar="N", min=0, rich_help_panel=_HOW, help="Late looks without a gain that end it; 0: none."),
+        typer.Option(
+            metavar="N", min=0, rich_help_panel=_HOW, help="Stop after so many late looks without a gain; 0: never."
+        ),
     ] = 4,
     lpips: Annotated[
         str | None, typer.Option(metavar="WEIGHTS.npz", help="Report LPIPS (Alex) with these weights, or `auto`.")
     ] = None,
     source_index: Annotated[
         str | None,
-        typer.Option(metavar="FILE.npy", rich_help_panel=_FILES, help="Write which splat each one of the file was."),
+        typer.Option(
+            metavar="FILE.npy", rich_help_panel=_FILES, help="Write which splat of the source each one of the file was."
+        ),
     ] = None,
     report: Annotated[
         str | None, typer.Option(metavar="FILE.json", rich_help_panel=_FILES, help="What came of it, for programs.")
     ] = None,
     log: Annotated[
-        str | None, typer.Option("--json", metavar="LOG", rich_help_panel=_FILES, help="Options, losses, looks.")
+        str | None,
+        typer.Option(
+            "--json",
+            metavar="LOG",
+            rich_help_panel=_FILES,
+            help="Write options, losses and what each look at the views found.",
+        ),
     ] = None,
     checkpoint: Annotated[
         str | None, typer.Option(metavar="FILE.npz", rich_help_panel=_FILES, help="Where checkpoints go.")
@@ -135,7 +162,9 @@ def finetune(
         str | None, typer.Option(metavar="FILE.npz", rich_help_panel=_FILES, help="Go on from this checkpoint.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
-    as_text: Annotated[bool, typer.Option("--say-json", help="The report on standard output.")] = False,
+    as_text: Annotated[
+        bool, typer.Option("--say-json", help="Write the report to standard output, for programs.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
 ) -> None:
     """Compress a scene, and tune what the file holds until it looks right.

@@ -27,7 +27,7 @@ def sensitivity(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY or .csplat file, or - for standard input.")],
     output: Annotated[str, typer.Argument(metavar="OUT.npz", help="The file to write.")],
     data: Annotated[
-        str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views.")
+        str | None, typer.Option(metavar="DATA", rich_help_panel=_VIEWS, help="A data set: the views of its training.")
     ] = None,
     size: Size = None,
     images: Images = None,
@@ -35,7 +35,9 @@ def sensitivity(
     cameras: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.json", rich_help_panel=_VIEWS, help="Your own, without those that judge of 40 or more."
+            metavar="FILE.json",
+            rich_help_panel=_VIEWS,
+            help="Your own cameras; of 40 or more not those that judge in other commands.",
         ),
     ] = None,
     views: Annotated[
@@ -47,12 +49,17 @@ def sensitivity(
     background: Annotated[
         str | None,
         typer.Option(
-            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, but with --data as in training."
+            metavar="R,G,B",
+            rich_help_panel=_VIEWS,
+            help="Behind the scene: black, but with --data or --cameras as in training.",
         ),
     ] = None,
     matrices: Annotated[
         bool,
-        typer.Option("--matrices/--no-matrices", help="How SH errors add up, for codebooks; 240 bytes per splat."),
+        typer.Option(
+            "--matrices/--no-matrices",
+            help="Store how errors of SH add up, which codebooks are chosen by: 240 bytes per splat.",
+        ),
     ] = True,
     seed: Annotated[int, typer.Option(min=0, help="Of the virtual views.")] = 0,
     threads: Annotated[int | None, typer.Option(min=1, help="One per core by default; the result stays.")] = None,

@@ -19,7 +19,7 @@ from csplat_tools.views import find_view_set
 __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
-_VIEWS = "Views that decide"
+_VIEWS = "Views (virtual ones by default)"
 _HOW = "How"
 
 
@@ -39,34 +39,40 @@ def simplify(
     target_psnr: Annotated[
         float | None,
         typer.Option(
-            metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders, where it is decided."
+            metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders, by the views that decide."
         ),
     ] = None,
     cameras: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.json", rich_help_panel=_VIEWS, help="They judge; of 40 or more, most teach and decide."
+            metavar="FILE.json",
+            rich_help_panel=_VIEWS,
+            help="Cameras that judge; of 40 or more every fourth does, the others teach and decide.",
         ),
     ] = None,
     data: Annotated[
         str | None,
         typer.Option(
-            metavar="DATA", rich_help_panel=_VIEWS, help="A data set: its training views; held-out photographs judge."
+            metavar="DATA",
+            rich_help_panel=_VIEWS,
+            help="A data set: views of its training teach and decide, held-out ones judge.",
         ),
     ] = None,
     size: Size = None,
     images: Images = None,
     test_every: TestEvery = None,
     views: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views at most.")
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_VIEWS, help="Virtual views that teach, at most.")
     ] = 160,
     view_size: Annotated[
-        str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="About how large the pictures are.")
+        str, typer.Option(metavar="WxH", rich_help_panel=_VIEWS, help="About how large the pictures that teach are.")
     ] = "240x180",
     background: Annotated[
         str | None,
         typer.Option(
-            metavar="R,G,B", rich_help_panel=_VIEWS, help="Behind the scene: black, but with --data as in training."
+            metavar="R,G,B",
+            rich_help_panel=_VIEWS,
+            help="Behind the scene: black, but with --data or --cameras as in training.",
         ),
     ] = None,
     method: Annotated[
@@ -106,9 +112,10 @@ def simplify(
     What the removal of each splat would change is measured exactly, in many
     small views from all around, again and again as splats go. Then colours,
     opacities and scales of the others are fitted to what the source looks
-    like. How much may go is decided in views that teach nothing, and neither
-    of them judge. No photographs are needed but for --max-loss. Needs the
-    packages of the render extra.
+    like in views that teach. Other views decide how much may go, and others
+    again judge the result. Only --max-loss wants photographs. `csplat encode`
+    with a target does all this for the file that it writes. Needs the packages
+    of the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -170,7 +177,7 @@ def _tell(report: dict[str, Any]) -> None:
         f" drawn, {removed['unseen']} unseen, {removed['least_error']} that pictures need least"
     )
     note(
-        f"decided by {views['used']} views of {views['size'][0]}x{views['size'][1]}, checked by {views['check']}"
+        f"measured in {views['used']} views of {views['size'][0]}x{views['size'][1]}, checked in {views['check']}"
         f" others; {100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
     )
     rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]

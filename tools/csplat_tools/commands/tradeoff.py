@@ -21,7 +21,7 @@ from csplat_tools.tradeoff.options import FAMILIES, USUAL, Wanted, parse_numbers
 
 __all__ = ["tradeoff"]
 
-_WHAT = "What is swept"
+_WHAT = "What is tried"
 _JUDGES = "What judges"
 
 
@@ -36,45 +36,63 @@ def tradeoff(
     ] = None,
     plots: Annotated[str | None, typer.Option(metavar="FOLDER", help="Write the plots as SVG files.")] = None,
     what: Annotated[
-        str, typer.Option(metavar="GROUP,…", rich_help_panel=_WHAT, help=f"Of {', '.join(FAMILIES)}.")
+        str, typer.Option(metavar="GROUP,…", rich_help_panel=_WHAT, help=f"Groups: {', '.join(FAMILIES)}.")
     ] = ",".join(USUAL),
     with_finetune: Annotated[
         bool, typer.Option("--with-finetune", rich_help_panel=_WHAT, help="Fine-tuned files, too: minutes for each.")
     ] = False,
     preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), rich_help_panel=_WHAT, help="Of all that is not a preset.")
+        str, typer.Option(metavar="|".join(PRESETS), rich_help_panel=_WHAT, help="Preset of all other files.")
     ] = Wanted.preset,
     attribute_psnr: Annotated[
         str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Values of `encode --attribute-psnr`.")
     ] = None,
     psnr: Annotated[
-        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Targets: PSNR against the source.")
+        str | None, typer.Option(metavar="DB,…", rich_help_panel=_WHAT, help="Values of `encode --target-psnr`.")
     ] = None,
     sizes: Annotated[
-        str | None, typer.Option(metavar="SIZE,…", rich_help_panel=_WHAT, help="Targets: sizes, 2MB,800kB; else none.")
+        str | None,
+        typer.Option(
+            metavar="SIZE,…",
+            rich_help_panel=_WHAT,
+            help="Values of `encode --target-size`: 2MB,800kB; by default none.",
+        ),
     ] = None,
     keep: Annotated[
-        str | None, typer.Option(metavar="SHARE,…", rich_help_panel=_WHAT, help="Splats that simplification leaves.")
+        str | None,
+        typer.Option(metavar="SHARE,…", rich_help_panel=_WHAT, help="Shares of the splats for `encode --keep`."),
     ] = None,
     opacities: Annotated[
-        str | None, typer.Option(metavar="ALPHA,…", rich_help_panel=_WHAT, help="Splats below are left out.")
+        str | None, typer.Option(metavar="ALPHA,…", rich_help_panel=_WHAT, help="Values of `encode --prune-opacity`.")
     ] = None,
     kmeans: Annotated[
-        str | None, typer.Option(metavar="K,…", rich_help_panel=_WHAT, help="Entries of codebooks per attribute.")
+        str | None,
+        typer.Option(metavar="K,…", rich_help_panel=_WHAT, help="Values of `encode --kmeans`: entries per attribute."),
     ] = None,
     iterations: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_WHAT, help="Steps of fine-tuning at most.")
     ] = Wanted.iterations,
     modes: Annotated[
-        str, typer.Option(metavar="exact|standard|fast,…", rich_help_panel=_JUDGES, help="Of the renderer, timed.")
+        str,
+        typer.Option(
+            metavar="exact|standard|fast,…", rich_help_panel=_JUDGES, help="Modes of the renderer that are timed."
+        ),
     ] = ",".join(Wanted.modes),
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="FILE.json", rich_help_panel=_JUDGES, help="Cameras that judge; of 40 or more some."),
+        typer.Option(
+            metavar="FILE.json",
+            rich_help_panel=_JUDGES,
+            help="Cameras that judge; of 40 or more every fourth does, the others teach and decide.",
+        ),
     ] = None,
     data: Annotated[
         str | None,
-        typer.Option(metavar="DATA", rich_help_panel=_JUDGES, help="Posed photographs: those held out judge."),
+        typer.Option(
+            metavar="DATA",
+            rich_help_panel=_JUDGES,
+            help="Posed photographs: those of the training teach and decide, those held out judge.",
+        ),
     ] = None,
     size: Size = None,
     images: Images = None,
@@ -93,10 +111,11 @@ def tradeoff(
 
     Encodes the scene in many ways, measures bytes, pictures and seconds of
     each, and marks those that no other one beats: presets, values of
-    --attribute-psnr, targets, simplification, fewer SH bands, fewer splats. A small
-    scene takes a few minutes. `psnr` is against the source's own renders, as
-    of `csplat compare`; photographs judge beside it. Needs the packages of
-    the render extra.
+    --attribute-psnr, targets (the slowest: they remove and refit splats),
+    shares of the splats, fewer SH bands, and simple strategies. A small scene
+    takes minutes. `psnr` is against the source's own renders, as that of
+    `csplat compare`; photographs judge beside it. Needs the packages of the
+    render extra.
 
     Examples:
       csplat tradeoff scene.ply

@@ -126,9 +126,9 @@ def train(
     those that the data set names, or every eighth.
 
     What is behind the splats is white where pictures have an alpha channel
-    and black where they have none. Comments in OUT.ply say that, which
-    pictures were held out, their size and the near plane, so that other
-    commands judge the scene alike; encode and decode keep it.
+    and black where they have none. A comment in OUT.ply says so, and which
+    pictures were held out, their size and the near plane: other commands read
+    it and judge the scene alike; encode and decode keep it.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000

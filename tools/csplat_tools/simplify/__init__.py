@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from csplat_tools.simplify.core import Simplified, simplify
-from csplat_tools.simplify.encoding import SimplifiedFile, encode_simplified
 from csplat_tools.simplify.options import METHODS, SimplifyOptions, Target
 
 __all__ = [
     "METHODS",
     "Simplified",
-    "SimplifiedFile",
     "SimplifyOptions",
     "Target",
-    "encode_simplified",
     "simplify",
 ]

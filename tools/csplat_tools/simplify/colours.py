@@ -16,7 +16,7 @@ from csplat_tools.simplify.adjusting import adjust
 from csplat_tools.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.simplify.options import SimplifyOptions
 
-__all__ = ["Fitted", "fit"]
+__all__ = ["Fitted", "fit", "refitted"]
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -92,6 +92,32 @@ def fit(
         if options.refit:
             model = fitted(model, _SECOND_STEPS, free_coefficients(stays))
     return Fitted(model, stays, tuple(errors))
+
+
+def refitted(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    steps: int,
+    free: Mask | None,
+    centre: SplatModel,
+    progress: Progress | None = None,
+) -> SplatModel:
+    """Fit colours once, and nothing else.
+
+    Args:
+        model: geometry, and the colours to start from.
+        cameras, wanted, options, centre, progress: as for `fit`.
+        steps: at most.
+        free: [N, (d + 1)²], which coefficients may change; None for all.
+    """
+    x, _ = fit_colours(
+        model, cameras, wanted, centre=_coefficients(centre), free=free, steps=steps, background=options.background,
+        antialiased=model.antialiased, threads=options.threads, progress=progress,
+    )  # fmt: skip
+    return replace(model, sh0=np.ascontiguousarray(x[:, 0]), shN=np.ascontiguousarray(x[:, 1:]))
 
 
 def _coefficients(model: SplatModel) -> F32:

@@ -22,7 +22,6 @@ class Target:
         keep: share of the splats that stay, above 0, at most 1.
         psnr: dB of the result against the source's renders, in the views that decide.
         max_loss: dB that PSNR against photographs may fall, in the views that decide.
-        size_bytes: of the file at most, when one is written.
 
     Raises:
         InputError: none or several are given, or one is out of range.
@@ -31,12 +30,11 @@ class Target:
     keep: float | None = None
     psnr: float | None = None
     max_loss: float | None = None
-    size_bytes: int | None = None
 
     def __post_init__(self) -> None:
-        given = [name for name in ("keep", "psnr", "max_loss", "size_bytes") if getattr(self, name) is not None]
+        given = [name for name in ("keep", "psnr", "max_loss") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise InputError(f"{len(given)} targets, wanted one of keep, psnr, max_loss and size_bytes")
+            raise InputError(f"{len(given)} targets, wanted one of keep, psnr and max_loss")
         if self.keep is not None and not 0.0 < self.keep <= 1.0:
             raise InputError(f"keep is {self.keep:g}, wanted a share above 0, at most 1")
         if self.psnr is not None and not 0.0 < self.psnr <= 99.0:

@@ -65,6 +65,9 @@ def removal_order(
     options: SimplifyOptions,
     left: int | None,
     progress: Callable[[str, float], None] | None = None,
+    *,
+    least: int = 0,
+    start: Order | None = None,
 ) -> Order:
     """Find out in which order splats go.
 
@@ -74,6 +77,8 @@ def removal_order(
         options: method, rounds.
         left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.
+        least: such an order ends where so many are left.
+        start: goes on from there.
     """
     count = len(model)
     if options.method in ("opacity", "opacity-area"):
@@ -82,12 +87,12 @@ def removal_order(
             keys = keys * surface_areas(model)
         rows = np.argsort(keys, kind="stable")
         return Order(rows, np.zeros(count), ())
-    targets = _targets(count, options, left)
     rows, removal = np.arange(count), views.removal
-    gone: list[I64] = []
-    errors: list[F64] = []
-    rounds = []
-    for target in targets:
+    gone, errors, rounds = list[I64](), list[F64](), list[Round]()
+    if start is not None:
+        gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
+        rows = np.delete(rows, start.rows)
+    for target in _targets(count, options, left, least, len(rows)):
         if gone:
             removal = measure_removal(
                 model.select(rows), views.used, background=options.background, threads=options.threads,
@@ -107,15 +112,15 @@ def removal_order(
     return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
 
 
-def _targets(count: int, options: SimplifyOptions, left: int | None) -> list[int]:
+def _targets(count: int, options: SimplifyOptions, left: int | None, least: int, now: int) -> list[int]:
     """How many splats are left after each round, each time fewer."""
-    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
+    last = max(1, least, round(count * _LEAST_SHARE)) if left is None else left
     if options.method == "exact":
         targets = [last]
     elif left is not None:
         targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
     else:
-        targets = [count]
+        targets = [now]
         while targets[-1] > last:
             targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
-    return sorted({target for target in targets if target < count}, reverse=True)
+    return sorted({target for target in targets if target < now}, reverse=True)

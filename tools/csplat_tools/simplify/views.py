@@ -19,7 +19,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.removal import Removal, measure_removal
-from csplat_tools.views import VIEW_SIZE, ViewSet, reduced
+from csplat_tools.views import CHECKS, VIEW_SIZE, ViewSet, reduced
 
 __all__ = ["Measured", "find_views", "removal_keys"]
 
@@ -83,6 +83,9 @@ def find_views(
         found = len(views.teaches) + len(views.decides)
         raise InputError(f"{found} cameras, wanted 2 at least: one to decide by, one to check by")
     every, check = reduced(views.teaches, size), reduced(views.decides, size)
+    if views.virtual:
+        # What was taught is to hold elsewhere; whether it does, views of the same kind say.
+        every, check = _parted(every)
     checked = measured(check)
     count = min(_BATCH, len(every)) if views.virtual else len(every)
     removal = measured(every[:count])
@@ -93,6 +96,16 @@ def find_views(
         removal += measured(every[count : count + _BATCH])
         count = min(count + _BATCH, len(every))
     return Measured(every[:count], check, removal, _gap(model, removal, checked, gone))
+
+
+def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
+    """Cameras to use, and some to check by.
+
+    These are taken evenly from the whole sequence: its beginning is not spread as evenly as all of it.
+    """
+    count = min(CHECKS, len(cameras) - 1)
+    aside = set(np.linspace(0, len(cameras) - 1, count + 2).astype(int)[1:-1].tolist())
+    return [one for i, one in enumerate(cameras) if i not in aside], [cameras[i] for i in sorted(aside)]
 
 
 def removal_keys(model: SplatModel, removal: Removal, *, keep_unseen: bool = True) -> F64:

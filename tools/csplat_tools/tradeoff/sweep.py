@@ -98,7 +98,7 @@ def _targets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for keep in wanted.keep:
-        yield Candidate(f"keep {keep:g}", "simplify", partial(_simplify, setting, wanted, keep))
+        yield Candidate(f"keep {keep:g}", "simplify", partial(_reach, setting, wanted, keep=keep))
 
 
 def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
@@ -124,38 +124,13 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Re
     )  # fmt: skip
 
 
-def _reach(
-    setting: Setting,
-    wanted: Wanted,
-    progress: Report,
-    *,
-    psnr: float | None = None,
-    size_bytes: int | None = None,
-) -> Made:
-    from csplat_tools.rate.control import encode_to_target
-    from csplat_tools.rate.targets import RateTarget
+def _reach(setting: Setting, wanted: Wanted, progress: Report, **asked: Any) -> Made:
+    from csplat_tools.optimise.optimiser import optimise
+    from csplat_tools.optimise.target import Target
 
-    target = RateTarget(size_bytes=size_bytes, psnr=psnr)
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
-    found = encode_to_target(
-        setting.source, target, options, cameras=setting.views.decides, background=setting.views.background,
-        progress=progress,
-    )  # fmt: skip
-    return _made(found.result, rate=found.report)
-
-
-def _simplify(setting: Setting, wanted: Wanted, keep: float, progress: Report) -> Made:
-    from csplat_tools.simplify import SimplifyOptions, Target, encode_simplified
-
-    found = encode_simplified(
-        setting.source,
-        setting.views,
-        target=Target(keep=keep),
-        encoding=EncodeOptions(preset=wanted.preset, threads=wanted.threads),
-        options=SimplifyOptions(threads=wanted.threads),
-        progress=progress,
-    )
-    return _made(found.result, simplify={"keep": keep, **found.report})
+    found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)
+    return _made(found.result, target=found.report.as_json())
 
 
 def _made(result: EncodeResult, **said: Any) -> Made:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from csplat_tools.views.finding import SPLITS, DataOptions, comparison_cameras, find_view_set, with_deciders
-from csplat_tools.views.placing import VIEW_SIZE, camera_sequence, reduced
-from csplat_tools.views.viewset import BLACK, WHITE, Colour, ViewSet
+from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence, evenly, reduced
+from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet
 
 __all__ = [
     "BLACK",
+    "CHECKS",
     "SPLITS",
     "VIEW_SIZE",
+    "VIRTUAL",
     "WHITE",
     "Colour",
     "DataOptions",
     "ViewSet",
     "camera_sequence",
     "comparison_cameras",
+    "evenly",
     "find_view_set",
     "reduced",
     "with_deciders",

@@ -2,7 +2,7 @@
 
 | views | teach | decide | judge |
 |---|---|---|---|
-| virtual | `count` small ones, all around | 16 spread among those | the eight of `psnr` |
+| virtual | `count` small ones, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
 | data set | training photographs | every 8th of those | held-out photographs |
@@ -24,7 +24,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.extras import need_photographs
-from csplat_tools.views.placing import VIEW_SIZE, camera_sequence
+from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence
 from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ _JUDGING = (8, 640, 480)  # the views of `psnr`
 _ENOUGH = 40  # cameras of a file that they may teach and judge
 _JUDGE_EVERY, _MOST_JUDGES = 4, 24
 _DECIDE_EVERY = 8
-_VIRTUAL_ASIDE = 16
+_DECIDING, _DECIDING_SEED = (12, 320, 240), 1000
 _TEST_EVERY = 8
 
 
@@ -86,7 +86,7 @@ def find_view_set(
         cameras: a camera file, relative to the scene's origin.
         data: instead: a data set.
         background: behind everything; `None`: what the scene says it was trained in front of, else black.
-        count: virtual views that teach; 0: no virtual ones teach or decide.
+        count: virtual views that teach, and as many more as check what they taught; 0: no virtual ones teach or decide.
         size, seed: of virtual views.
         aside: how many views decide; `None`: as many as the table says.
         split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
@@ -205,15 +205,12 @@ def _moved(pictures: Sequence[Picture], source: SplatModel) -> list[Picture]:
 def _virtual(
     source: SplatModel, count: int, size: tuple[int, int], seed: int, aside: int | None
 ) -> tuple[list[Camera], list[Camera]]:
-    """Views that teach and views that decide."""
+    """Views that teach, and views that decide: like those of `psnr`, by which they are judged, but others."""
     if count < 1:
         return [], []
-    kept = _VIRTUAL_ASIDE if aside is None else aside
-    every = camera_sequence(source, count + kept, size, seed=seed)
-    # Evenly from the whole sequence: its beginning is not spread as evenly as all of it.
-    places = np.linspace(0, len(every) - 1, kept + 2).astype(int)[1:-1].tolist()
-    decides, teaches = _parted(every, places)
-    return teaches, decides
+    kept = _DECIDING[0] if aside is None else aside
+    decides = virtual_cameras(source, kept, *_DECIDING[1:], seed=_DECIDING_SEED + seed) if kept else []
+    return camera_sequence(source, count + CHECKS, size, seed=seed), decides
 
 
 def _apart(cameras: Sequence[Camera], aside: int | None) -> tuple[list[Camera], list[Camera]]:

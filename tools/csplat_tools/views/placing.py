@@ -18,12 +18,15 @@ from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
 from csplat_render.virtual import FIELD_OF_VIEW, Frame, scene_frame
 
-__all__ = ["VIEW_SIZE", "camera_sequence", "reduced"]
+__all__ = ["CHECKS", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
 
 F64 = NDArray[np.float64]
 
 #: Width and height of the pictures that decide, in pixels.
 VIEW_SIZE = (240, 180)
+
+#: Virtual views beside those that are asked for: whether what these taught holds elsewhere, they say.
+CHECKS = 16
 
 _POINTS = 20_000
 _OBJECT_DISTANCE = (0.95, 1.6)  # extents from the centre
@@ -111,3 +114,9 @@ def _in_surroundings(frame: Frame, number: int, point: F64, K: F64, size: tuple[
         eye = frame.centre + frame.extent * _between(_AROUND_DISTANCE, point[2]) * along
         target = frame.centre + frame.extent * offset
     return look_at(eye, target, frame.up, K, *size, frame.near)
+
+
+def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
+    """So many of some cameras at most, spread over their order."""
+    places = np.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().astype(int)
+    return [cameras[i] for i in places]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 __all__ = ["Window", "meet"]
@@ -34,6 +34,7 @@ def meet(
     slope: float,
     bounds: tuple[float, float],
     tries: int,
+    known: Sequence[tuple[float, float]] = (),
 ) -> list[tuple[float, float]]:
     """Try places until a value that grows with them lies in a window.
 
@@ -44,12 +45,15 @@ def meet(
         slope: of the value, about, above 0.
         bounds: the least and the largest place.
         tries: how many at most.
+        known: places and values from before; where there are some, `start` says nothing.
 
     Returns:
-        Places and values in the order in which they were tried; the last one lies in the window
+        Places and values in the order in which they were tried, those known first; the last one lies in the window
         where any does. Fewer than `tries` where a bound is the best that there is, or values grow no more.
     """
-    points: list[tuple[float, float]] = []
+    points = sorted(known, key=lambda point: -abs(point[1] - window.aim))  # what is nearest to the aim comes last
+    if points and window.low <= points[-1][1] <= window.high:
+        return points
     for _ in range(tries):
         place = _next(points, window, slope, bounds) if points else min(max(start, bounds[0]), bounds[1])
         if place is None:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_tools.rate.targets import RateResult
+from csplat_tools.optimise.report import Optimised, Report
+from csplat_tools.optimise.target import Target
 
-__all__ = ["Bounded", "meet_bounds"]
+__all__ = ["Bounded", "encode_within", "meet_bounds"]
 
 Progress = Callable[[str, float], None]
 
@@ -38,29 +39,45 @@ class Bounded:
 
     Attributes:
         encoding: options of the encoder. result: their file.
-        bounds: largest error by measure, as asked.
         encodes: how many files were made.
-        seconds: for all of them.
     """
 
     encoding: EncodeOptions
     result: EncodeResult
-    bounds: Mapping[str, float]
     encodes: int
-    seconds: float
 
-    def as_result(self) -> RateResult:
-        """The file, and a report."""
-        errors = self.result.report.errors
-        report = {
-            "goal": {"max_error": dict(self.bounds)},
-            "reached": {name: errors.get(name, (0.0, 0.0))[0] for name in self.bounds},
-            "size_bytes": len(self.result.data),
-            "renders": 0,
-            "encodes": self.encodes,
-            "seconds": round(self.seconds, 3),
-        }
-        return RateResult(self.result, report)
+
+def encode_within(
+    source: SplatModel,
+    target: Target,
+    encoding: EncodeOptions,
+    *,
+    importance: NDArray[Any] | Importance | None = None,
+    progress: Progress | None = None,
+) -> Optimised:
+    """The file that keeps to largest errors and to nothing else; nothing is rendered.
+
+    Args:
+        source: the scene.
+        target: largest errors.
+        encoding, importance, progress: as for `meet_bounds`.
+
+    Raises:
+        InputError: as `meet_bounds`.
+    """
+    start = time.perf_counter()
+    bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
+    result = bounded.result
+    report = Report(
+        goal=target.as_json(),
+        size_bytes=len(result.data),
+        splats=result.report.splat_count,
+        splats_before=len(source),
+        encodes=bounded.encodes,
+        seconds=round(time.perf_counter() - start, 3),
+        reached={name: result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
+    )
+    return Optimised(result, report)
 
 
 def meet_bounds(
@@ -87,7 +104,6 @@ def meet_bounds(
     Raises:
         InputError: the caller fixed a step that a bound would have to choose, or no step keeps to a bound.
     """
-    start = time.perf_counter()
     options = _started(source, encoding, bounds)
     best: tuple[EncodeOptions, EncodeResult] | None = None
     files = 0
@@ -115,7 +131,7 @@ def meet_bounds(
             f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best that was found is"
             f" {result.report.errors[worst][0]:.3g}"
         )
-    return Bounded(*best, bounds, files, time.perf_counter() - start)
+    return Bounded(*best, files)
 
 
 def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:

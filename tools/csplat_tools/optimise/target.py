@@ -1,4 +1,4 @@
-"""What is asked of a file, a size, a PSNR, largest errors, how a command line says so; and what came of it."""
+"""What is asked of a file: a size, a PSNR, a loss, a share of the splats, largest errors; how a user writes it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from csplat._spec import MEASURE_NAMES
-from csplat.encoder import EncodeResult
 from csplat.errors import InputError
+from csplat_render.metrics import PSNR_CAP
 
-__all__ = ["RateResult", "RateTarget", "parse_max_error", "parse_size_bytes"]
+__all__ = ["Target", "parse_max_error", "parse_size_bytes"]
 
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
@@ -21,50 +21,61 @@ _IN_UNITS = "means"  # the one measure that is a length
 
 
 @dataclass(frozen=True)
-class RateTarget:
-    """What a file is to keep to.
+class Target:
+    """What a file is to keep to: one of the first four, largest errors alone or beside a PSNR or a size.
 
     Attributes:
-        size_bytes: its size at most; the best picture within it is looked for.
         psnr: dB of its renders against the source's at least; the smallest file that reaches them is looked for.
+        size_bytes: its size at most; the best picture within it is looked for.
+        max_loss: dB that its PSNR against photographs may be below the source's; the smallest such file.
+        keep: share of the splats that stay, above 0, at most 1, at the precision of the preset.
         max_error: by measure of the format (means in scene units, covariance relative, opacities, sh0, sh1, sh2, sh3),
-            the largest error of any splat; alone, or beside one of the others.
+            the largest error of any splat.
 
     Raises:
-        InputError: nothing is asked for, or size and PSNR both, or a value is out of range.
+        InputError: nothing is asked for, or too much, or a value is out of range.
     """
 
-    size_bytes: int | None = None
     psnr: float | None = None
+    size_bytes: int | None = None
+    max_loss: float | None = None
+    keep: float | None = None
     max_error: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.size_bytes is None and self.psnr is None and not self.max_error:
-            raise InputError("no target, wanted a size, a PSNR or largest errors")
-        if self.size_bytes is not None and self.psnr is not None:
-            raise InputError("a target size and a target PSNR, wanted one of them: the other follows")
+        given = [words for name, words in _ASKED.items() if getattr(self, name) is not None]
+        if not given and not self.max_error:
+            raise InputError("no target, wanted a size, a PSNR, a loss, a share of the splats or largest errors")
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)} are asked for, wanted one of them: the others follow")
+        if self.max_error and (self.keep is not None or self.max_loss is not None):
+            raise InputError(f"largest errors and {given[0]}: what is left out or fitted anew has no bounds")
         if self.size_bytes is not None and self.size_bytes < 1:
             raise InputError(f"the target size is {self.size_bytes} bytes, wanted 1 or more")
-        if self.psnr is not None and not 0.0 < self.psnr <= 99.0:
-            raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most 99")
+        if self.psnr is not None and not 0.0 < self.psnr <= PSNR_CAP:
+            raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most {PSNR_CAP:g}")
+        if self.max_loss is not None and not (math.isfinite(self.max_loss) and self.max_loss > 0.0):
+            raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted above 0")
+        if self.keep is not None and not 0.0 < self.keep <= 1.0:
+            raise InputError(f"the share of the splats is {self.keep:g}, wanted above 0, at most 1")
         for name, bound in self.max_error.items():
             if name not in MEASURE_NAMES.values():
                 raise InputError(f"{name!r} is no measure of errors, wanted one of {', '.join(MEASURE_NAMES.values())}")
             if not (math.isfinite(bound) and bound > 0.0):
                 raise InputError(f"the largest error of {name} is {bound:g}, wanted above 0")
 
+    @property
+    def is_rendered(self) -> bool:
+        """Whether pictures have to be rendered to meet it."""
+        return any(getattr(self, name) is not None for name in _ASKED)
 
-@dataclass(frozen=True, eq=False)
-class RateResult:
-    """A file that keeps to a target.
+    def as_json(self) -> dict[str, Any]:
+        """What is asked, by name."""
+        said = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
+        return {**said, "max_error": dict(self.max_error)} if self.max_error else said
 
-    Attributes:
-        result: of the encoder; its source index is into the source.
-        report: what was asked, reached, tried and chosen, why and how sure; JSON-compatible.
-    """
 
-    result: EncodeResult
-    report: dict[str, Any]
+_ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_loss": "a loss", "keep": "a share of the splats"}
 
 
 def parse_size_bytes(text: str) -> int:
@@ -101,7 +112,7 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
         if name in bounds:
             raise InputError(f"the largest error of {name} is given twice")
         bounds[name] = float(found[1]) * _factor(part.strip(), name, found[2], unit_metres)
-    return dict(RateTarget(max_error=bounds).max_error)
+    return dict(Target(max_error=bounds).max_error)
 
 
 def _factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:

@@ -1,4 +1,4 @@
-"""What splats and bits are worth in pictures: the one error model that rate control and simplification decide by.
+"""What splats and bits are worth in pictures: the one error model that the search decides by.
 
 A decibel costs the share s of a file's bytes, so that quantisation which errs by Q takes bytes in proportion to
 n · Q^-k for n splats, k = 10 / ln(10) · s. With P(n) the error of what was removed, a file that may err by D is

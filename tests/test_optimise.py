@@ -1,0 +1,467 @@
+"""`optimise`: the smallest file at a PSNR or a loss, the best one of a size; what it chooses, what it leaves alone."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="targets want the extra [render]")
+
+# Importing them needs what is looked for above.
+import extremes
+from captures import cameras, shell, views_of
+
+from csplat import EncodeOptions, decode, encode, read_ply
+from csplat.decoder import decode_scene
+from csplat.encoder import PRESETS
+from csplat.encoder.measure import measure_errors
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.cameras import intrinsics, look_at, resized
+from csplat_render.judge import Judge, renderer
+from csplat_render.virtual import scene_frame
+from csplat_tools.importances import measured_importance
+from csplat_tools.optimise import optimiser
+from csplat_tools.optimise.optimiser import expected_seconds, optimise
+from csplat_tools.optimise.search import Window, meet
+from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.trials import Trials, spread_of
+from csplat_tools.proof import prove
+from csplat_tools.simplify import SimplifyOptions
+from csplat_tools.views import BLACK, ViewSet, camera_sequence, comparison_cameras, find_view_set, with_deciders
+from csplat_tools.views.viewset import pose
+from csplat_trainer.pictures import Picture
+
+SMALL = SimplifyOptions(steps=4, rounds=2)
+SIZE = (48, 36)
+
+
+def around(source, count=24):
+    """Small virtual views of it."""
+    views = find_view_set(source, count=count, size=SIZE)
+    return replace(views, judges=[resized(camera, 96, 72) for camera in views.judges])
+
+
+def within(source, views=None, encoding=None, *, simplifying=SMALL, keep_all=False, importance=None, **goal):
+    """The file on a target."""
+    return optimise(
+        source, Target(**goal), views or around(source), encoding,
+        keep_all=keep_all, importance=importance, simplifying=simplifying,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return shell(8)
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    """A shell, and twice as many splats that hardly anybody sees."""
+    rng, scene = np.random.default_rng(1), shell(3)
+    faint = {
+        "means": (0.5 * rng.standard_normal((600, 3))).astype(np.float32),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (600, 1)),
+        "scales": np.full((600, 3), -4.0, np.float32),
+        "opacities": np.full(600, 0.02, np.float32),
+        "sh0": np.zeros((600, 3), np.float32),
+        "shN": np.zeros((600, 3, 3), np.float32),
+    }
+    return SplatModel(**{name: np.concatenate([getattr(scene, name), array]) for name, array in faint.items()})
+
+
+@pytest.fixture(scope="module")
+def surroundings(crowded):
+    far = np.where(np.arange(len(crowded)) % 3, 1.0, 9.0)[:, None]
+    found = replace(crowded, means=(crowded.means * far).astype(np.float32))
+    assert scene_frame(found).kind == "surrounding"
+    return found
+
+
+@pytest.fixture(scope="module")
+def at_30(crowded):
+    """What is found of the crowded scene at 30 dB."""
+    return within(crowded, psnr=30.0)
+
+
+# looking for a number
+
+
+def test_meet_ends_inside_the_window():
+    points = meet(lambda q: q * q / 50, Window(31.9, 32.1, 32.0), start=20.0, slope=1.0, bounds=(0, 100), tries=9)
+    assert 31.9 <= points[-1][1] <= 32.1
+    assert 40.0 == pytest.approx(points[-1][0], abs=0.1)
+
+
+def test_meet_stops_at_a_bound():
+    points = meet(lambda q: q, Window(200, 201, 200), start=50.0, slope=1.0, bounds=(0, 100), tries=9)
+    assert [50.0, 100.0] == [place for place, _ in points]
+
+
+def test_a_plateau_is_crossed():
+    def value(place):
+        return 34.0 if place < 55.0 else place - 21.0
+
+    points = meet(value, Window(38.0, 38.25, 38.1), start=42.0, slope=1.0, bounds=(24, 110), tries=9)
+    assert 38.0 <= points[-1][1] <= 38.25
+
+
+def test_meet_gives_up_where_values_grow_no_more():
+    points = meet(lambda q: min(q, 40.0), Window(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 100), tries=9)
+    assert len(points) < 6
+
+
+def test_spread_is_that_of_the_views():
+    assert 0.0 == spread_of(np.full(8, 1e-4))
+    assert 10 * math.log10(4) / 2 == pytest.approx(spread_of(np.array([1e-4, 4e-4])))
+    assert math.isnan(spread_of(np.array([1e-4])))
+
+
+# PSNRs
+
+
+def test_a_psnr_is_reached_and_hardly_exceeded(sample_path):
+    source = read_ply(sample_path)
+    found = within(source, find_view_set(source, count=24, size=SIZE), psnr=38.0, keep_all=True)
+    psnr = Judge.of_source(source, comparison_cameras(source)).psnr(decode(found.result.data))
+    assert 38.0 <= psnr <= 38.3
+    assert psnr == pytest.approx(found.report.psnr, abs=1e-4)
+    assert len(found.result.data) == found.report.size_bytes
+
+
+def test_splats_that_nobody_needs_are_left_out(crowded, at_30):
+    kept = within(crowded, psnr=30.0, keep_all=True)
+    assert 900 == len(decode(kept.result.data))
+    assert len(decode(at_30.result.data)) < 600
+    assert len(at_30.result.data) < 0.8 * len(kept.result.data)
+    assert 30.0 <= at_30.report.psnr <= 31.0  # files of so few splats jump
+    proof = measure_errors(crowded, decode(at_30.result.data), at_30.result.source_index)
+    for name, (largest, _) in at_30.result.report.errors.items():
+        assert proof[name][0] <= largest
+
+
+@pytest.mark.parametrize(("goal", "count"), [(30.0, 24), (36.0, 48)])
+def test_no_file_that_was_tried_reaches_a_psnr_with_fewer_bytes(crowded, goal, count):
+    report = within(crowded, around(crowded, count), psnr=goal).report
+    good = [one["size_bytes"] for one in report.tried if one["psnr"] is not None and one["psnr"] >= goal]
+    assert min(good) == report.size_bytes
+
+
+@pytest.mark.parametrize("goal", [30.0, 36.0])
+def test_no_preset_has_a_smaller_and_better_file(scene, goal):
+    views = around(scene)
+    found, judge = within(scene, views, psnr=goal).report, views.judge(scene)
+    for name in PRESETS:
+        data = encode(scene, EncodeOptions(preset=name))
+        assert len(data) >= 0.99 * found.size_bytes or judge.psnr(decode(data)) <= found.psnr + 0.1, name
+
+
+def test_a_psnr_below_all_files_is_exceeded_and_said_to_be(scene):
+    report = within(scene, psnr=2.0, keep_all=True).report
+    assert report.psnr > 2.3
+    assert any("no smaller file of those tried reaches the target" in line for line in report.why)
+
+
+def test_a_psnr_beyond_float32_is_refused(scene):
+    for keep_all in (True, False):
+        with pytest.raises(InputError, match="no file reaches 98"):
+            within(scene, psnr=98.9, keep_all=keep_all)
+
+
+def test_bounds_hold_beside_a_psnr_and_all_splats_stay(scene):
+    found = within(scene, psnr=30.0, max_error={"means": 1e-3})
+    assert found.result.report.errors["means"][0] <= 1e-3
+    assert 30.0 <= found.report.psnr <= 30.6  # files of so few splats jump
+    assert 300 == found.report.splats
+
+
+@pytest.mark.extremes
+@pytest.mark.parametrize("name", ["one splat", "exploded", "all transparent", "float32 limits"])
+def test_extreme_scenes_meet_a_psnr(name):
+    source = extremes.scene(name)[0]
+    views = around(source)
+    found = within(source, views, psnr=17.0)
+    assert views.judge(source).psnr(decode(found.result.data)) >= 17.0
+    assert len(decode(found.result.data)) >= 1
+
+
+# sizes
+
+
+@pytest.mark.parametrize("goal", [4500, 7000])
+def test_a_size_is_filled_and_not_exceeded(scene, goal):
+    kept = within(scene, size_bytes=goal, keep_all=True)
+    assert 0.97 * goal <= len(kept.result.data) <= goal
+    fewer = within(scene, around(scene, 64), size_bytes=goal)  # of so few splats the largest file is not always best
+    assert 0.9 * goal <= len(fewer.result.data) <= goal
+
+
+def test_more_bytes_are_better_pictures(scene):
+    small, large = (within(scene, size_bytes=size, keep_all=True).report.psnr for size in (3000, 6000))
+    assert large > small + 3.0
+
+
+def test_a_size_that_starves_all_splats_is_met_by_fewer(crowded):
+    found = within(crowded, size_bytes=1500)
+    assert len(found.result.data) <= 1500
+    assert found.report.splats < 900
+    without = within(crowded, None, EncodeOptions(sh_degree=0), size_bytes=1500)
+    assert found.report.psnr > without.report.psnr - 0.2
+
+
+def test_a_size_below_all_files_is_refused(scene):
+    with pytest.raises(InputError, match="no file with all splats has 300 bytes"):
+        within(scene, size_bytes=300, keep_all=True)
+    with pytest.raises(InputError, match="no file has 300 bytes"):
+        within(scene, size_bytes=300)
+
+
+@pytest.mark.parametrize("goal", [{"size_bytes": 5000}, {"psnr": 32.0}])
+def test_the_same_target_gives_the_same_bytes_at_any_number_of_threads(scene, goal):
+    one, again, two = (
+        within(scene, None, EncodeOptions(threads=n), simplifying=replace(SMALL, threads=n), **goal).result.data
+        for n in (1, 1, 2)
+    )
+    assert one == again
+    assert one == two
+
+
+# shares of the splats, and what is fitted
+
+
+def test_a_share_of_the_splats_has_its_colours_fitted_and_proves_what_it_states(scene):
+    found = within(scene, keep=0.6)
+    decoded = decode_scene(found.result.data)
+    assert 180 == found.report.splats == len(decoded.model) == len(np.unique(found.result.source_index))
+    distances = np.linalg.norm(decoded.model.means - scene.means[found.result.source_index], axis=1)
+    assert distances.max() <= found.result.report.errors["means"][0]
+    proof = prove(scene, decoded.model, decoded.header, decoded.stated_errors, found.result.source_index)
+    assert proof.holds
+    assert decoded.stated_errors.refitted
+    assert found.report.psnr > 20.0
+
+
+def test_fitting_to_the_quantised_geometry_mends_it(scene):
+    """Coarse geometry, fine colours: fitted colours are better than the source's in views that taught nothing."""
+    coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
+    bare = replace(scene, shN=scene.shN[:, :0])
+    fitted = within(bare, around(bare, 80), coarse, simplifying=replace(SMALL, steps=8), keep=1.0)
+    judge = Judge.of_source(bare, camera_sequence(bare, 60, (64, 48), seed=9), BLACK)
+    assert judge.psnr(decode(fitted.result.data)) > judge.psnr(decode(encode(bare, coarse))) + 0.3
+
+
+def test_shapes_are_clustered_by_what_the_views_say_of_them(scene):
+    alike = replace(scene, quats=scene.quats[np.arange(300) % 8], scales=scene.scales[np.arange(300) % 8])
+    found = within(alike, None, EncodeOptions(shape_codebook_size=64, sh_coding="none"), keep=0.9)
+    assert 0 < found.result.report.options["shape_codebook_size"] <= 60
+    assert 270 == len(decode(found.result.data))
+
+
+# losses against photographs
+
+
+@pytest.fixture(scope="module")
+def photographed(crowded):
+    """Photographs that the source misses by 25 dB, every eighth of which judges."""
+    seen_from = camera_sequence(crowded, 96, SIZE, seed=3)
+    rng, draw = np.random.default_rng(1), renderer(crowded, BLACK)
+    noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
+    pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]
+    teaches = [camera for number, camera in enumerate(seen_from) if number % 8]
+    return ViewSet("made", BLACK, teaches, (), seen_from[::8], pictures)
+
+
+def test_a_loss_against_photographs_lets_splats_go(crowded, photographed):
+    found = within(crowded, photographed, max_loss=0.5)
+    scores = found.report.photographs
+    assert scores["source"] < 28.0
+    assert scores["file"] == pytest.approx(photographed.photograph_judge().psnr(decode(found.result.data)))
+    assert scores["file"] >= scores["source"] - 1.0  # other photographs decided:
+    decider = with_deciders(photographed).photograph_decider()
+    assert decider.psnr(decode(found.result.data)) >= decider.psnr(crowded) - 0.5
+    assert found.report.splats < 900
+    assert len(found.result.data) < 0.9 * len(within(crowded, photographed, max_loss=0.5, keep_all=True).result.data)
+
+
+def test_a_loss_wants_photographs(scene):
+    with pytest.raises(InputError, match="wants photographs"):
+        within(scene, max_loss=0.5)
+
+
+# views
+
+
+@pytest.mark.parametrize("kind", ["virtual", "cameras", "photographs"])
+def test_no_view_that_judges_decides_or_teaches(crowded, photographed, monkeypatch, kind):
+    views = {"virtual": around(crowded), "cameras": judged_by(cameras(40)), "photographs": photographed}[kind]
+    made, taught, removal = [], [], optimiser.Removal
+
+    def remove(source, views, *rest, **more):
+        taught.append(views)
+        return removal(source, views, *rest, **more)
+
+    monkeypatch.setattr(optimiser, "Trials", lambda *parts: made.append(Trials(*parts)) or made[-1])
+    monkeypatch.setattr(optimiser, "Removal", remove)
+    within(crowded, views, **({"max_loss": 1.0} if kind == "photographs" else {"psnr": 30.0}))
+    trials = made[0]
+    deciders = [trials.decider] if trials.photographs is None else [trials.decider, trials.photographs]
+    judges, decides = poses(trials.judge.cameras), set.union(*(poses(one.cameras) for one in deciders))
+    assert judges
+    assert decides
+    assert not judges & decides
+    assert not (judges | decides) & poses(taught[0].teaches)
+    assert poses(views.judges) == judges
+
+
+def test_whoever_judges_does_not_choose_the_file_of_a_size(crowded):
+    views = around(crowded)
+    others = replace(views, judges=camera_sequence(crowded, 6, (64, 48), seed=7))
+    one, other = (within(crowded, these, size_bytes=2000) for these in (views, others))
+    assert one.report.psnr != other.report.psnr
+    for name in ("means", "opacities", "sh0", "shN"):  # a file says its own PSNR, which differs
+        assert np.array_equal(*(getattr(decode(found.result.data), name) for found in (one, other))), name
+
+
+def poses(seen_from):
+    return {pose(camera) for camera in seen_from}
+
+
+def judged_by(seen_from):
+    """Every fourth of them judges, the others teach."""
+    teaches = [camera for number, camera in enumerate(seen_from) if number % 4]
+    return ViewSet("cameras", BLACK, teaches, (), seen_from[::4])
+
+
+def test_cameras_that_see_nothing_are_refused(scene):
+    K = intrinsics(48, 40, 60.0)
+    away = look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)
+    with pytest.raises(InputError, match="cameras of this scene"):
+        within(scene, replace(views_of(cameras(12)), judges=[away]), psnr=30.0)
+
+
+def test_inside_of_surroundings_views_that_were_placed_measure_nothing_and_the_report_warns(surroundings):
+    report = within(surroundings, psnr=30.0).report
+    assert report.splats < 900
+    assert report.sensitivity_views == 0
+    assert "cameras inside of surroundings" in report.why[-1]
+    assert "--keep-all" in report.why[-1]
+    kept = within(surroundings, psnr=30.0, keep_all=True).report
+    assert (900, 0, 0) == (kept.splats, kept.removal_views, kept.sensitivity_views)
+    assert not any("surroundings" in line for line in kept.why)
+
+
+# what is fixed, and what is chosen
+
+
+def test_the_preset_fast_tries_no_codebook_and_keeps_all(crowded):
+    report = within(crowded, None, EncodeOptions(preset="fast"), psnr=36.0).report
+    assert 900 == report.splats
+    assert {one["sh_coding"] for one in report.tried} <= {"scalar", "none"}
+
+
+def test_what_the_caller_fixed_is_not_chosen(scene):
+    fixed = EncodeOptions(sh_degree=1, sh_coding="scalar", sh0_step=0.5)
+    found = within(scene, None, fixed, psnr=24.0)
+    assert {(1, "scalar")} == {(one["sh_degree"], one["sh_coding"]) for one in found.report.tried}
+    assert 0.5 == found.result.report.options["sh0_step"]
+
+
+def test_knobs_that_contradict_a_target_are_refused(scene):
+    with pytest.raises(InputError, match="without splats"):
+        within(scene.select(np.zeros(0, np.int64)), camera_views(), psnr=30.0)
+    with pytest.raises(InputError, match="what a target chooses"):
+        within(scene, None, EncodeOptions(attribute_psnr=40.0), psnr=30.0)
+    with pytest.raises(InputError, match="one of the two"):
+        within(scene, keep=0.5, keep_all=True)
+
+
+def camera_views():
+    return judged_by(cameras(8))
+
+
+# grades
+
+
+@pytest.fixture(scope="module")
+def unequal():
+    """An object of 9,000 splats, most of them small."""
+    rng = np.random.default_rng(3)
+    means = rng.standard_normal((9000, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    return SplatModel(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (9000, 1)),
+        scales=np.repeat(rng.normal(-4.0, 0.8, (9000, 1)), 3, axis=1).astype(np.float32),
+        opacities=rng.uniform(0.05, 0.95, 9000).astype(np.float32),
+        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
+        shN=np.zeros((9000, 0, 3), np.float32),
+    )
+
+
+def test_splats_are_graded_where_that_makes_files_smaller(unequal):
+    def reached(**knobs):
+        return within(unequal, judged_by(cameras(53)), EncodeOptions(**knobs), psnr=38.0, keep_all=True).report
+
+    graded, even, fast = reached(), reached(grades=1), reached(preset="fast")
+    assert graded.chosen["grades"] > 1
+    assert 34 == graded.sensitivity_views
+    assert any("grades" in line for line in graded.why)
+    assert graded.size_bytes < 0.97 * even.size_bytes
+    for report in (even, fast):
+        assert (1, 0) == (report.chosen["grades"], report.sensitivity_views)
+
+
+def test_an_importance_that_is_given_stays(unequal):
+    weights = np.linspace(1.0, 2.0, len(unequal))
+    views = judged_by(cameras(53))
+    report = within(unequal, views, psnr=34.0, keep_all=True, importance=weights).report
+    assert (True, 34) == (report.chosen["grades"] > 1, report.sensitivity_views)
+
+
+def test_curvatures_that_are_given_are_compared_with_none_inside_of_surroundings(unequal):
+    far = np.where(np.arange(len(unequal)) % 3, 1.0, 9.0)[:, None]
+    inside = replace(unequal, means=(unequal.means * far).astype(np.float32))
+    assert scene_frame(inside).kind == "surrounding"
+    given = measured_importance(inside, cameras(12), BLACK, threads=None)
+    report = within(inside, psnr=32.0, keep_all=True, importance=given).report
+    tried = {trial["grades"] for trial in report.tried}
+    assert 1 == min(tried) < max(tried)
+    assert 0 == report.sensitivity_views
+    alone = replace(given, curvatures=None)
+    assert 1 == within(inside, psnr=32.0, keep_all=True, importance=alone).report.chosen["grades"]
+
+
+def test_small_scenes_without_sh_are_not_measured(scene):
+    bare = replace(scene, shN=scene.shN[:, :0])
+    report = within(bare, psnr=30.0, keep_all=True).report
+    assert 0 == report.sensitivity_views
+    assert len(report.tried) == len({trial["size_bytes"] for trial in report.tried})
+
+
+# what is said
+
+
+def test_the_report_says_what_why_and_how_sure(at_30):
+    report = at_30.report
+    assert {"psnr": 30.0} == report.goal
+    assert len(report.tried) == report.encodes
+    assert 8 == report.views
+    assert report.worst_psnr <= report.psnr
+    assert "8 virtual views" in report.sure
+    assert any("left out" in line for line in report.why)
+    assert report.removal_views > 0
+    json.dumps(report.as_json(), allow_nan=False)
+
+
+def test_the_file_says_what_it_stands_for(at_30):
+    assert 900 == at_30.result.report.options["simplified"]["splats"]
+    assert 900 == decode_scene(at_30.result.data).stated_errors.source_count
+
+
+def test_keeping_all_is_expected_to_be_sooner(scene):
+    target, options = Target(psnr=30.0), EncodeOptions()
+    quick, slow = (expected_seconds(scene, options, target, keep_all=keep) for keep in (True, False))
+    assert quick < slow
+    assert quick == expected_seconds(scene, EncodeOptions(preset="fast"), target, keep_all=False)

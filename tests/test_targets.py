@@ -1,0 +1,240 @@
+"""Targets as users write them: what a command line asks for, what it refuses, what it says; largest errors."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import EncodeOptions, decode, write_ply
+from csplat.encoder import encode_with_report
+from csplat.encoder.measure import measure_errors
+from csplat.errors import InputError
+from csplat_tools.app import app
+from csplat_tools.optimise.bounds import encode_within, meet_bounds
+from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes
+
+pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
+
+# Importing it needs what is looked for above.
+from captures import photograph, shell
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return shell(8)
+
+
+# what is asked
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("5MB", 5_000_000), ("1.5 MiB", 1_572_864), ("300kB", 300_000), ("300KiB", 307_200), ("123456", 123_456)],
+)
+def test_sizes_are_read_as_they_are_written(text, expected):
+    assert expected == parse_size_bytes(text)
+
+
+@pytest.mark.parametrize("text", ["", "MB", "5 apples", "-3MB", "0", "1e30GB", "5 M B"])
+def test_other_texts_are_no_sizes(text):
+    with pytest.raises(InputError, match="a size is"):
+        parse_size_bytes(text)
+
+
+def test_bounds_are_read_by_measure():
+    assert {"means": 0.001, "opacities": 0.01} == parse_max_error("means=0.001,opacities=1e-2", None)
+
+
+def test_a_length_with_a_unit_wants_a_scene_that_has_one():
+    with pytest.raises(InputError, match="--unit-metres"):
+        parse_max_error("means=1mm", None)
+    assert {"means": 0.002} == parse_max_error("means=1mm", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("means", "bounds no error"),
+        ("means=", "bounds no error"),
+        ("weight=1", "no measure"),
+        ("means=0", "above 0"),
+        ("means=1,means=2", "twice"),
+        ("sh0=1mm", "no length"),
+        ("means=1parsec", "wanted one of"),
+    ],
+)
+def test_other_bounds_are_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        parse_max_error(text, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({}, "no target"),
+        ({"size_bytes": 1000, "psnr": 40.0}, "one of them"),
+        ({"keep": 0.5, "max_loss": 1.0}, "one of them"),
+        ({"keep": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
+        ({"max_loss": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
+        ({"size_bytes": 0}, "wanted 1 or more"),
+        ({"psnr": 99.5}, "at most 99"),
+        ({"psnr": float("nan")}, "above 0"),
+        ({"max_loss": 0.0}, "above 0"),
+        ({"keep": 1.5}, "at most 1"),
+    ],
+)
+def test_a_target_is_one_thing_within_its_range(asked, message):
+    with pytest.raises(InputError, match=message):
+        Target(**asked)
+
+
+# largest errors
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}],
+)
+def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
+    found = encode_within(scene, Target(max_error=bounds), EncodeOptions())
+    proof = measure_errors(scene, decode(found.result.data), found.result.source_index)
+    for name, bound in bounds.items():
+        assert 0.3 * bound < proof[name][0] <= bound
+        assert found.report.reached[name] == found.result.report.errors[name][0] <= bound
+    assert (300, 0) == (found.report.splats, found.report.renders)
+
+
+def test_outliers_keep_to_a_bound_of_the_means(scene):
+    away = (scene.means[:20] * 3000.0).astype(np.float32)
+    far = replace(scene, means=np.concatenate([away, scene.means[20:]]))
+    coarse = encode_with_report(far, EncodeOptions(position_step=1e-4)).report.errors["means"][0]
+    bounded = meet_bounds(far, EncodeOptions(), {"means": 1e-4}).result
+    assert bounded.report.errors["means"][0] <= 1e-4 < coarse
+    assert any("tiles" in note for note in meet_bounds(far, EncodeOptions(), {"means": 1e-7}).result.report.notes)
+
+
+def test_a_bound_that_no_lattice_keeps_is_refused(scene):
+    with pytest.raises(InputError, match="no lattice keeps the error of opacities within 1e-09"):
+        meet_bounds(scene, EncodeOptions(), {"opacities": 1e-9})
+
+
+def test_a_knob_and_its_bound_contradict_each_other(scene):
+    with pytest.raises(InputError, match="position_step is given"):
+        meet_bounds(scene, EncodeOptions(position_step=0.1), {"means": 0.1})
+    for fixed in (EncodeOptions(sh_coding="none"), EncodeOptions(adaptive=0.5)):
+        with pytest.raises(InputError, match="error"):
+            meet_bounds(scene, fixed, {"sh1": 0.1})
+    with pytest.raises(InputError, match="codebook bounds no error"):
+        meet_bounds(scene, EncodeOptions(sh_coding="codebook"), {"sh1": 0.1})
+
+
+# the command
+
+
+@pytest.fixture
+def ply(tmp_path, scene):
+    write_ply(tmp_path / "scene.ply", scene)
+    return tmp_path / "scene.ply"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def test_the_command_meets_a_size_and_says_why(tmp_path, ply):
+    out = tmp_path / "scene.csplat"
+    done = run("encode", ply, out, "--target-size", "5kB", "--keep-all")
+    assert 0 == done.exit_code, done.output
+    assert 4850 <= out.stat().st_size <= 5000
+    assert "target: 5.0 kB" in done.stderr
+    assert "chosen: SH degree" in done.stderr
+    assert "measured on the file itself" in done.stderr
+
+
+def test_the_command_reports_a_target_as_json(tmp_path, ply):
+    done = run("encode", ply, tmp_path / "scene.csplat", "--target-psnr", "34", "--keep-all", "--json")
+    report = json.loads(done.stdout)
+    assert 34.0 <= report["target"]["psnr"] <= 35.2  # files of so few splats jump
+    assert report["target"]["size_bytes"] == report["size_bytes"]
+    assert 300 == report["target"]["splats"] == report["splats"]
+
+
+def test_the_command_keeps_a_share_whose_file_is_proved(tmp_path, ply):
+    out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
+    done = run("encode", ply, out, "--keep", "0.5", "--views", "12", "--source-index", index, "--json")
+    assert 0 == done.exit_code, done.output
+    report = json.loads(done.stdout)
+    assert (150, {"keep": 0.5}) == (report["splats"], report["target"]["goal"])
+    assert 0 == run("verify", out, "--source", ply, "--source-index", index).exit_code
+    assert 0 == run("verify", out, "--source", ply).exit_code
+    assert "150 pruned" in run("info", out).stdout
+
+
+def test_the_command_keeps_to_largest_errors(tmp_path, ply):
+    out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
+    arguments = ["encode", ply, out, "--max-error", "means=2mm,sh0=0.01", "--unit-metres", "0.5", "--json"]
+    report = json.loads(run(*arguments, "--source-index", index).stdout)
+    assert report["stated_errors"]["means"]["max"] <= 0.004
+    assert report["stated_errors"]["sh0"]["max"] <= 0.01
+    assert 0 == run("verify", out, "--source", ply, "--source-index", index).exit_code
+
+
+def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path, scene):
+    folder = photograph(scene, tmp_path)
+    words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-loss", "1dB", "--data", folder)
+    done = run(*words, "--keep-all", "--json")
+    assert 0 == done.exit_code, done.output
+    scores = json.loads(done.stdout)["target"]["photographs"]
+    assert scores["source"] - 1.6 <= scores["file"] < scores["source"]  # other photographs decided
+
+
+def test_a_long_search_says_beforehand_how_long_it_takes(tmp_path, ply, monkeypatch):
+    told = "this takes about 2 minutes on two cores"
+    monkeypatch.setattr("csplat_tools.optimise.optimiser.expected_seconds", lambda *_, **__: 120.0)
+    words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--preset", "fast", "--force")
+    assert told in run(*words).stderr
+    assert told not in run(*words, "--quiet").stderr
+    monkeypatch.setattr("csplat_tools.optimise.optimiser.expected_seconds", lambda *_, **__: 5.0)
+    assert "this takes" not in run(*words).stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["--target-size", "5kB", "--target-psnr", "30"], 2, "one of them"),
+        (["--keep", "0.5", "--target-psnr", "30"], 2, "one of them"),
+        (["--target-size", "many"], 2, "a size is"),
+        (["--target-psnr", "120"], 2, "at most 99"),
+        (["--keep", "2"], 2, "at most 1"),
+        (["--max-error", "means=1mm"], 1, "--unit-metres"),
+        (["--keep", "0.5", "--max-error", "means=1"], 1, "no bounds"),
+        (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr is what a target chooses"),
+        (["--views", "9"], 2, "--views says nothing"),
+        (["--grades", "3"], 2, "--grades says nothing"),
+        (["--grades", "9", "--target-size", "5kB"], 2, "grades is 9"),
+        (["--keep-all"], 2, "--keep-all says nothing without a target"),
+        (["--keep", "0.5", "--keep-all"], 2, "--keep-all says nothing without a target"),
+        (["--keep", "0.5", "--importance", "w.npy"], 2, "--keep measures the importance of splats itself"),
+        (["--max-loss", "1"], 2, "--max-loss wants --data"),
+        (["--max-loss", "1", "--cameras", "c.json"], 2, "--max-loss wants --data"),
+        (["--background", "white"], 2, "--background says nothing"),
+        (["--background", "white", "--max-error", "means=1"], 2, "--background says nothing"),
+        (["--cameras", "c.json"], 2, "without a target"),
+        (["--max-error", "means=1", "--data", "d"], 2, "nothing is rendered"),
+        (["--size", "9x9", "--target-psnr", "30"], 2, "are for the photographs of --data"),
+        (["--target-size", "10", "--keep-all"], 1, "no file"),
+        (["--target-psnr", "30", "--kmeans", "16"], 2, "go with no target"),
+        (["--simplify"], 2, "No such option"),
+        (["--prune"], 2, "No such option"),
+        (["--residual-stages", "2"], 2, "without --kmeans"),
+        (["--distil-sh"], 2, "wants --sh-degree"),
+    ],
+)
+def test_the_command_refuses_what_says_nothing(tmp_path, ply, arguments, status, message):
+    out = tmp_path / "scene.csplat"
+    done = run("encode", ply, out, *arguments)
+    assert status == done.exit_code
+    assert message in " ".join(done.stderr.replace("│", " ").split())
+    assert not out.exists()

@@ -1,0 +1,179 @@
+"""Tables of what `targets.py` measured: two builds at equal PSNR, files that others beat, and means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from distortion_curves import Point, bytes_between
+from printing import laid_out
+
+__all__ = ["Ratio", "at_equal_psnr", "dominated", "kind_of", "tables"]
+
+_BUILDS = ("before", "now")
+_BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs, where no two files say it
+_SMALLER, _BETTER = 0.01, 0.1  # share of the bytes, and dB, by which one file beats another
+_GUESSED = "≈ "  # before what they say
+
+Rows = Mapping[str, Mapping[str, Any]]
+Known = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """What files take beside those of another build, at the same PSNR.
+
+    Attributes:
+        value: their bytes over the other's.
+        guessed: one side had no file, so that 4.5 % of the bytes per dB were taken.
+    """
+
+    value: float
+    guessed: bool = False
+
+
+def tables(known: Known, *, markdown: bool) -> str:
+    """Everything that is known, as text.
+
+    Args:
+        known: by scene, what `targets.py` keeps of it.
+        markdown: as a guide has it.
+    """
+    every = (_targets_table, _means_table, _dominated_table, _failed_table)
+    return "\n\n".join(part for part in (table(known, markdown=markdown) for table in every) if part)
+
+
+def kind_of(name: str) -> str:
+    """What rows have in common that differ in nothing but a number: `dB, every splat` of `38 dB, every splat`."""
+    return " ".join(word for word in name.split() if not word.replace(".", "", 1).isdigit())
+
+
+def at_equal_psnr(before: Rows, now: Rows, name: str) -> Ratio | None:
+    """Bytes of a row now over those before, at the PSNR that it had before.
+
+    log(bytes) is straight between those rows of the same kind of now that lie on either side of that PSNR.
+
+    Args:
+        before, now: rows by name.
+        name: of the row.
+
+    Returns:
+        `None` where it was not measured twice.
+    """
+    if not all(name in dict(_files(rows)) for rows in (before, now)):
+        return None
+    kind, size, psnr = kind_of(name), before[name]["bytes"], before[name]["psnr"]
+    points = [Point(row["psnr"], row["bytes"]) for other, row in _files(now) if kind_of(other) == kind]
+    between = bytes_between(points, psnr, gap=math.inf)
+    if between is not None:
+        return Ratio(between / size)
+    near = min(points, key=lambda point: abs(point.psnr - psnr))
+    return Ratio(near.size_bytes * math.exp(_BYTES_PER_DB * (psnr - near.psnr)) / size, guessed=True)
+
+
+def dominated(rows: Rows) -> dict[str, str]:
+    """Which files another one beats by more than 1 % of the bytes and 0.1 dB, and the smallest that does.
+
+    A file that holds every splat is beaten by others that do.
+
+    Args:
+        rows: of a scene and a build, by name.
+    """
+    found = {}
+    for name, row in _files(rows):
+        better = [
+            other
+            for other, one in _files(rows)
+            if one["bytes"] < (1.0 - _SMALLER) * row["bytes"]
+            and one["psnr"] > row["psnr"] + _BETTER
+            and (one["all_splats"] or not row["all_splats"])
+        ]
+        if better:
+            found[name] = min(better, key=lambda other: rows[other]["bytes"])
+    return found
+
+
+def _targets_table(known: Known, *, markdown: bool) -> str:
+    lines = []
+    for scene, one in known.items():
+        before, now = (_rows(one, build) for build in _BUILDS)
+        for name in dict.fromkeys([*before, *now]):
+            pair, ratio = (before.get(name, {}), now.get(name, {})), at_equal_psnr(before, now, name)
+            sizes = [f"{row['bytes'] / 1e3:.1f}" if "bytes" in row else "-" for row in pair]
+            psnrs = [f"{row['psnr']:.2f}" if "psnr" in row else "-" for row in pair]
+            seconds = [f"{row['seconds']:.1f}" if "seconds" in row else "-" for row in pair]
+            share = "-" if ratio is None else f"{_GUESSED * ratio.guessed}{ratio.value:.3f}"
+            lines.append((scene, name, *sizes, share, *psnrs, *seconds))
+    header = ("scene", "file", "kB before", "now", "of it, same dB", "dB before", "now", "s before", "now")
+    table = laid_out(header, lines, markdown=markdown)
+    if any(line[4].startswith(_GUESSED) for line in lines):
+        table += f"\n\n{_GUESSED}by {100.0 * _BYTES_PER_DB:g} % of the bytes per dB: files of now lie on one side only."
+    return table
+
+
+def _means_table(known: Known, *, markdown: bool) -> str:
+    """Geometric means over scenes of what was measured twice, by kind of row."""
+    ratios, seconds = dict[str, list[float]](), dict[str, list[tuple[float, float]]]()
+    for one in known.values():
+        before, now = (_rows(one, build) for build in _BUILDS)
+        for name in before:
+            ratio = at_equal_psnr(before, now, name)
+            if ratio is None:
+                continue
+            for kind in (kind_of(name), *(["all targets"] if kind_of(name) != name else [])):
+                ratios.setdefault(kind, []).append(ratio.value)
+                seconds.setdefault(kind, []).append((before[name]["seconds"], now[name]["seconds"]))
+    lines = []
+    for kind in sorted(ratios, key=lambda kind: kind == "all targets"):
+        earlier, later = (_geometric(part) for part in zip(*seconds[kind], strict=True))
+        share = f"{_geometric(ratios[kind]):.3f}"
+        lines.append((kind, f"{len(ratios[kind])}", share, f"{earlier:.1f}", f"{later:.1f}", f"{later / earlier:.2f}"))
+    header = ("geometric means", "files", "bytes, same dB", "s before", "s now", "now of before")
+    return laid_out(header, lines, markdown=markdown)
+
+
+def _dominated_table(known: Known, *, markdown: bool) -> str:
+    """Files that others of the same scene and build beat; or that there are none."""
+    lines, count = [], 0
+    for scene, one in known.items():
+        for build in one["builds"]:
+            rows = _rows(one, build)
+            count += len(list(_files(rows)))
+            for name, other in dominated(rows).items():
+                lines.append((scene, build, *_beside(name, rows[name]), *_beside(other, rows[other])))
+    if count and not lines:
+        return f"None of {count} files is beaten by another one of its scene and build."
+    header = ("scene", "build", "beaten", "kB", "dB", "by", "kB", "dB")
+    return laid_out(header, lines, markdown=markdown)
+
+
+def _failed_table(known: Known, *, markdown: bool) -> str:
+    """What could not be made, and why."""
+    lines = [
+        (scene, build, name, row["error"])
+        for scene, one in known.items()
+        for build in one["builds"]
+        for name, row in _rows(one, build).items()
+        if "error" in row
+    ]
+    return laid_out(("scene", "build", "not made", "why"), lines, markdown=markdown)
+
+
+def _beside(name: str, row: Mapping[str, Any]) -> tuple[str, str, str]:
+    return name, f"{row['bytes'] / 1e3:.1f}", f"{row['psnr']:.2f}"
+
+
+def _rows(one: Mapping[str, Any], build: str) -> Rows:
+    rows: Rows = one["builds"].get(build, {}).get("rows", {})
+    return rows
+
+
+def _files(rows: Rows) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Rows of which there is a file."""
+    return ((name, row) for name, row in rows.items() if "error" not in row)
+
+
+def _geometric(values: Sequence[float]) -> float:
+    return math.exp(sum(map(math.log, values)) / len(values))

@@ -1,0 +1,42 @@
+"""A target in the words of the search."""
+
+from __future__ import annotations
+
+import math
+
+from csplat.model import SplatModel
+from csplat_render.judge import Judge
+from csplat_render.metrics import PSNR_CAP
+from csplat_tools.optimise.solving import Goal
+from csplat_tools.optimise.target import Target
+
+__all__ = ["goal_of", "loss_as_psnr"]
+
+
+def goal_of(target: Target, source: SplatModel, photographs: Judge | None) -> Goal:
+    """What is looked for.
+
+    Args:
+        target: a PSNR, a size or a loss.
+        source: the scene.
+        photographs: that decide what a loss is; without them there is none.
+    """
+    if target.max_loss is None or photographs is None:
+        return Goal(target.psnr, target.size_bytes)
+    reached = photographs.psnr(source)
+    # Photographs are missed by far more than what may be lost: a file's own error is a small share of what they say.
+    slope = 1.0 - 10.0 ** (-target.max_loss / 10.0)
+    return Goal(min(loss_as_psnr(target.max_loss, reached), PSNR_CAP), None, reached - target.max_loss, slope)
+
+
+def loss_as_psnr(loss: float, photo_psnr: float) -> float:
+    """The PSNR against the source's renders at which photographs are missed by so much more.
+
+    The source misses photographs by an error of its own; what a file adds is taken as independent of it, so that the
+    two squared errors add up.
+
+    Args:
+        loss: dB, above 0.
+        photo_psnr: of the source against photographs, dB.
+    """
+    return photo_psnr - 10.0 * math.log10(10.0 ** (loss / 10.0) - 1.0)

@@ -1,0 +1,188 @@
+"""The moves of a search, in their order: codings of the whole scene, fewer splats, the goal itself, the presets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from csplat.encoder import PRESETS
+from csplat.errors import InputError
+from csplat_render.metrics import psnr_of_mse
+from csplat_tools.optimise.coding import Codings
+from csplat_tools.optimise.exchange import BYTES_PER_DB, error_of_psnr
+from csplat_tools.optimise.removal import Removal
+from csplat_tools.optimise.solving import QUALITIES, Solver
+from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
+
+__all__ = ["Moves"]
+
+_LOSS = (5.0, 8.5)  # dB between what each attribute keeps by itself and what all keep at 30 dB, without and with SH
+_LOSS_GROWS = (0.0, 0.22)  # with every dB above
+_USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
+_COUNTS = 3  # numbers of splats that are fitted
+_SAME = 0.12  # of the splats that are left: fewer or more by less are not worth another fit
+_FEWER = 0.7  # of the splats, where a size holds none of their files
+_ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
+_LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
+_WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
+_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
+_FAR = 0.03  # of the bytes
+_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
+
+
+@dataclass(eq=False)
+class Moves:
+    """Looks for the coding, the splats and the precision.
+
+    Attributes:
+        solver: brings files near the goal, and onto it.
+        codings: what may be done to SH.
+        whole: all splats.
+        removal: takes some away; `None`: all have to stay.
+    """
+
+    solver: Solver
+    codings: Codings
+    whole: Whole
+    removal: Removal | None
+
+    @staticmethod
+    def kept(trials: Trials, removal: Removal, keep: float) -> Trial:
+        """The file of a share of the splats, at the precision that the options say."""
+        part = removal.fitted(max(1, round(keep * len(removal.source))), None)
+        return trials.make(part, Coding(None), None, quick=False)
+
+    def best(self) -> Trial:
+        """The file on the goal that is smallest, or best.
+
+        Raises:
+            InputError: there is none.
+        """
+        tried = self.codings.best(self.solver, self.whole, self._start(), brief=self.removal is not None)
+        if self.removal is not None:
+            cost, fitted = self.solver.cost, self._removed(self.removal, tried[0])
+            if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
+                tried = self.codings.best(self.solver, self.whole, tried[0].quality or 0.0)
+            tried += fitted
+        found: list[Trial] = []
+        for trial in sorted(tried, key=self.solver.cost):
+            if self._pays(trial, found):
+                on = self.solver.on(trial.part, trial.coding)
+                found += [] if on is None else [on]
+        self._presets(tried)
+        best = self.solver.goal.best([trial for trial in self.solver.trials.made if self._may_be_written(trial)])
+        if best is None:
+            raise InputError(self._out_of_reach())
+        return best
+
+    def _may_be_written(self, trial: Trial) -> bool:
+        """Whether it is no draft; where views that judge set the level, of what they looked at."""
+        return trial.is_packed and (trial.is_judged or not self.solver.goal.is_judged)
+
+    def _start(self) -> float:
+        """The PSNR of attributes to begin with."""
+        goal, has_sh = self.solver.goal, self.codings.usual(self.whole) != [Coding("none")]
+        if goal.size_bytes is None:
+            psnr = goal.psnr or 0.0
+            return _bounded(psnr + _LOSS[has_sh] + _LOSS_GROWS[has_sh] * (psnr - 30.0))
+        per_splat = goal.size_bytes / len(self.whole.model)
+        return _bounded(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
+
+    def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
+        """Files near the goal of some numbers of splats, each of which says which to try next."""
+        solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
+        slope, found = solver.slope(whole), list[Trial]()
+        left = self._first_left(removal, whole, slope)
+        start = (whole.quality or 0.0) - solver.about(whole)
+        for _ in range(_COUNTS):
+            if left > (1.0 - _ALL_BUT) * splats:
+                break
+            part = removal.fitted(left, goal.psnr)
+            fitted_psnr, banded_psnr = (solver.trials.decider.psnr(one) for one in (part.model, part.banded[0]))
+            quality = start if goal.psnr is None else _finer(start, goal.psnr, banded_psnr)
+            tries = self.codings.best(solver, part, quality)
+            trial, before = tries[0], left
+            found += tries
+            if math.isinf(solver.cost(trial)):
+                if len(part.rows) > left or left == 1:
+                    break  # nobody saw the others
+                # None of them is small enough for a size, or good enough for a PSNR.
+                left = int(left * (_FEWER if goal.size_bytes is not None else 1.0 / _FEWER))
+                continue
+            if goal.psnr is not None:
+                # What bands that are left out cost is no matter of how many splats there are.
+                wanted = _without(solver.level(part), error_of_psnr(banded_psnr) - error_of_psnr(fitted_psnr))
+                left = removal.next_at_psnr(len(part.rows), fitted_psnr, wanted, slope)
+            else:
+                left = removal.next_at_size(len(part.rows), fitted_psnr, trial.decided_psnr, slope)
+            if abs(left - before) <= _SAME * before or min(found, key=solver.cost).part is not part:
+                break
+        return found
+
+    def _first_left(self, removal: Removal, whole: Trial, slope: float) -> int:
+        """How many splats to begin with."""
+        goal, seen = self.solver.goal, self.solver.trials.decider.psnr
+        if goal.psnr is not None:
+            return removal.first_at_psnr(goal.psnr, slope, seen)
+        near = None if math.isinf(self.solver.cost(whole)) else (whole.splats, whole.decided_psnr)
+        return removal.first_at_size(goal.size_bytes or 0, near, slope, seen)
+
+    def _pays(self, trial: Trial, found: list[Trial]) -> bool:
+        """Whether a file near the goal may be better on it than those that are there."""
+        if any(one.part is trial.part for one in found):
+            return False  # a coding that was expected to be better is there
+        best = self.solver.goal.best(found)
+        return best is None or self.solver.cost(trial) < self.solver.cost(best) + _PAYS
+
+    def _presets(self, tried: Sequence[Trial]) -> None:
+        """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""
+        goal, plain = self.solver.goal, [trial for trial in tried if trial.part is self.whole]
+        if not goal.is_judged:
+            return
+        near = min(plain, key=lambda trial: (trial.coding.graded, self.solver.cost(trial)))
+        if self.solver.cost(near) > min(map(self.solver.cost, tried)) + _FAR:
+            return  # presets have all splats in one grade, too
+        lost = (near.quality or 0.0) - self.solver.about(near)
+        for name, preset in PRESETS.items():
+            expected = preset.quality[near.coding.sh == "none"] - lost
+            if _is_asked(name, self.codings.encoding.preset) and _PRESETS[0] <= expected <= _PRESETS[1]:
+                encoding = replace(self.codings.encoding, preset=name)
+                plainly = Coding(None, graded=False)
+                made = self.solver.trials.make(self.whole, plainly, None, quick=False, encoding=encoding)
+                _ = made.psnr
+
+    def _out_of_reach(self) -> str:
+        goal, made = self.solver.goal, self.solver.trials.made
+        if goal.size_bytes is not None:
+            kept = " with all splats" if self.removal is None else ""
+            smallest = min(trial.size_bytes for trial in made)
+            return f"no file{kept} has {goal.size_bytes} bytes or fewer: of those tried one has {smallest}"
+        if goal.photo_psnr is not None:
+            nearest = max(trial.photo_psnr for trial in made)
+            return (
+                f"no file reaches {goal.photo_psnr:.2f} dB by the photographs that decide; the best has {nearest:.2f}"
+            )
+        highest = max(trial.psnr for trial in made if trial.is_judged)
+        return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best of those tried has {highest:.2f} dB"
+
+
+def _is_asked(name: str, preset: str) -> bool:
+    """Whether a preset's file may be one of a search that was asked for with a preset: `fast` is for who wants that."""
+    return name == preset if "fast" in (name, preset) else True
+
+
+def _without(psnr: float, error: float) -> float:
+    """The PSNR that is left to ask for where part of the error that it allows is taken."""
+    allowed = error_of_psnr(psnr)
+    return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_LEFT * allowed))
+
+
+def _finer(quality: float, psnr: float, fitted_psnr: float) -> float:
+    """The PSNR of attributes where what was removed has taken its share of the error already."""
+    left = max(_LEAST_LEFT, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
+    return _bounded(quality + psnr_of_mse(left))
+
+
+def _bounded(quality: float) -> float:
+    return min(max(quality, QUALITIES[0]), QUALITIES[1])

@@ -1,0 +1,148 @@
+"""`optimise`: the smallest file at a PSNR or a loss, the best one within a size, by every move that files have.
+
+Moves are the precision, from which all steps follow; what is kept of SH and how it is coded; grades; how many splats
+stay, the others being fitted to what the source looks like. Every kind of file is brought near the goal by a few tries
+and compared by what it would cost on it; what is best there is brought onto it, and the presets' own files are asked
+whether they are better. Nothing is tried that is not expected to pay.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, Importance
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render.judge import Judge
+from csplat_render.virtual import scene_frame
+from csplat_tools.optimise.bounds import meet_bounds
+from csplat_tools.optimise.coding import Codings
+from csplat_tools.optimise.goals import goal_of
+from csplat_tools.optimise.moves import Moves
+from csplat_tools.optimise.removal import Removal
+from csplat_tools.optimise.report import Optimised
+from csplat_tools.optimise.reporting import reported
+from csplat_tools.optimise.sensitivity import measured_for
+from csplat_tools.optimise.solving import Solver
+from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.trials import Trial, Trials, Whole
+from csplat_tools.simplify.options import SimplifyOptions
+from csplat_tools.views import VIRTUAL, ViewSet, with_deciders
+
+__all__ = ["expected_seconds", "optimise"]
+
+Weights = NDArray[Any] | Importance
+Progress = Callable[[str, float], None]
+
+_INSIDE = (
+    "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
+    " --data, or --cameras with 40 of them, would decide by yours, --keep-all leaves all"
+)
+
+
+def optimise(
+    source: SplatModel,
+    target: Target,
+    views: ViewSet,
+    encoding: EncodeOptions | None = None,
+    *,
+    keep_all: bool = False,
+    importance: Weights | None = None,
+    simplifying: SimplifyOptions | None = None,
+    progress: Progress | None = None,
+) -> Optimised:
+    """Encode a scene so that its file keeps to a target.
+
+    Args:
+        source: the scene.
+        target: what is asked for.
+        views: teach, decide and judge; no view does two of these.
+        encoding: knobs that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
+        keep_all: every splat stays.
+        importance: how much splats matter, as for the encoder.
+        simplifying: how splats are removed and fitted; its background is that of the views.
+        progress: is told the stages.
+
+    Raises:
+        InputError: there are no splats, a knob is set that the target has to choose, or it is out of reach.
+    """
+    start = time.perf_counter()
+    encoding = encoding or EncodeOptions()
+    _check(source, target, encoding, keep_all=keep_all)
+    files = 0
+    if target.max_error:
+        bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
+        files, encoding = bounded.encodes, bounded.encoding
+    views = with_deciders(views)
+    judge = views.judge(source, threads=encoding.threads)
+    if views.name != VIRTUAL and _is_empty(judge):
+        raise InputError("no splat shows in the views given: are these cameras of this scene?")
+    inside = views.virtual and scene_frame(source).kind == "surrounding"
+    removal = None
+    if not _all_stay(target, encoding, keep_all=keep_all):
+        options = replace(simplifying or SimplifyOptions(), background=views.background, threads=encoding.threads)
+        removal = Removal(source, views, options, grades=not inside, progress=progress, psnr=target.psnr)
+    photographs = None
+    if target.max_loss is not None:
+        if not views.photographs:
+            raise InputError("a largest loss wants photographs (--data): it is lost against them")
+        photographs = views.photograph_decider(threads=encoding.threads)
+    decider = views.decider(source, threads=encoding.threads)
+    trials, sensitivity_views = Trials(encoding, judge, decider, photographs), 0
+    if target.keep is not None and removal is not None:
+        found = Moves.kept(trials, removal, target.keep)
+    else:
+        goal = goal_of(target, source, photographs)
+        measured, sensitivity_views = measured_for(
+            source, views, encoding, importance, inside=inside, progress=progress
+        )
+        whole = Whole(source, importance, measured, progress)
+        found = Moves(Solver(trials, goal), Codings(source, encoding, measured is not None), whole, removal).best()
+    photo = _photographed(source, found, views, encoding.threads) if views.photographs else {}
+    report = reported(
+        target, found, trials, splats_before=len(source), views_of=views.name,
+        remarks=[_INSIDE] * (inside and found.splats < len(source)), encodes=files + len(trials.made),
+        seconds=round(time.perf_counter() - start, 3), photographs=photo, sensitivity_views=sensitivity_views,
+        removal_views=0 if removal is None else removal.view_count,
+    )  # fmt: skip
+    return Optimised(found.result, report)
+
+
+def expected_seconds(source: SplatModel, encoding: EncodeOptions, target: Target, *, keep_all: bool) -> float:
+    """About how long a target takes on two cores, for a person who may choose otherwise."""
+    seconds = 4.0 + len(source) / 1e5 * (9.0 + 6.0 * source.sh_degree)
+    return seconds if _all_stay(target, encoding, keep_all=keep_all) else 20.0 + 5.0 * seconds
+
+
+def _all_stay(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> bool:
+    """Whether no splat is left out: where that is asked, where errors are bounded, and where speed comes first."""
+    blocked = keep_all or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
+    return target.keep is None and blocked
+
+
+def _check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_all: bool) -> None:
+    if not len(source):
+        raise InputError("a scene without splats has no size or quality to choose")
+    if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:
+        raise InputError("attribute_psnr is what a target chooses: give one of them")
+    if target.keep is not None and keep_all:
+        raise InputError("a share of the splats is to stay, and all of them: give one of the two")
+
+
+def _is_empty(judge: Judge) -> bool:
+    """Whether all pictures that judge are of one colour each."""
+    pictures = (judge.look(number).picture for number in range(len(judge.cameras)))
+    return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
+
+
+def _photographed(source: SplatModel, found: Trial, views: ViewSet, threads: int | None) -> dict[str, float]:
+    """PSNR of file and source by the photographs that judge."""
+    judge = views.photograph_judge(threads=threads)
+    return {"file": judge.psnr(decode(found.result.data)), "source": judge.psnr(source)}

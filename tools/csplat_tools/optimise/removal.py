@@ -1,0 +1,176 @@
+"""How many splats may go: exact errors of their removal, what a fit of the others mends, and what bits are worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_tools.optimise.exchange import LEAST_QUANTISED, error_at_size, error_of_psnr, log_bytes_at_error
+from csplat_tools.optimise.fitted import Fitted
+from csplat_tools.simplify.core import Session, prepare
+from csplat_tools.simplify.options import SimplifyOptions
+from csplat_tools.simplify.order import removal_order
+from csplat_tools.views import ViewSet
+
+__all__ = ["Removal"]
+
+F64 = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+Cost = Callable[[F64, F64], F64]
+Seen = Callable[[SplatModel], float]
+
+_USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, without and with SH
+_FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated errors
+_MOST_REMOVED = 0.7  # of the error that a PSNR allows
+_LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
+_MENDED = 4.0  # dB that a fit makes removal err by less, about
+_FAR = 20.0  # times the error that a PSNR allows: no fit mends so much
+_CALIBRATIONS = 3
+_AGREED = 1.15  # times the error that was predicted
+_NOTHING = 1e-12
+
+
+@dataclass(eq=False)
+class Removal:
+    """Takes splats out of a scene and fits the others. Owns views, source's pictures and order, made when asked for.
+
+    Attributes:
+        source: the scene.
+        views: those that teach and those that decide.
+        options: how splats are removed and fitted.
+        grades: what is left may be sorted into grades.
+        progress: is told the stages.
+        psnr: that is looked for, dB: far below it no order is needed; `None`: some other target is.
+    """
+
+    source: SplatModel
+    views: ViewSet
+    options: SimplifyOptions
+    grades: bool
+    progress: Progress | None
+    psnr: float | None
+    _session: Session | None = field(default=None, init=False)
+
+    @property
+    def session(self) -> Session:
+        """What all numbers of splats share."""
+        if self._session is None:
+            allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
+            self._session = prepare(self.source, self.views, None, self.options, self.progress, allowed=allowed)
+        return self._session
+
+    @property
+    def view_count(self) -> int:
+        """Small views in which removal was measured, pass by pass; 0 where it was not."""
+        if self._session is None:
+            return 0
+        views = self._session.views
+        return len(views.used) * len(self._session.order.rounds) + len(views.check)
+
+    def fitted(self, left: int, allowed: float | None) -> Fitted:
+        """So many splats, or those that no view saw if they are more; see `Fitted.allowed`."""
+        gone = min(len(self.source) - left, len(self.session.order.rows))
+        return Fitted(self.session, gone, allowed, self.grades, self.progress)
+
+    def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:
+        """How many splats to begin with for the smallest file of a PSNR.
+
+        Views that decide show more or less of what is removed than those that taught: measured, and allowed for.
+
+        Args:
+            psnr: dB.
+            slope: share of the bytes that a decibel costs.
+            seen: PSNR of some of the source's splats by the views that decide, dB.
+        """
+        return self._calibrated(_at_psnr(psnr, slope), seen)
+
+    def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, seen: Seen) -> int:
+        """How many to begin with for the best file of a size.
+
+        Args:
+            size_bytes: of the file.
+            near: splats and PSNR of a file of about that size; `None`: there is none.
+            slope, seen: as above.
+        """
+        if near is None:
+            usual = (size_bytes - _FRAME_BYTES) / _USUAL_BYTES[self.source.sh_degree > 0]
+            return max(1, min(len(self.source), int(usual)))
+        return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), seen)
+
+    def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
+        """How many splats are likely to make the smallest file of a PSNR.
+
+        Args:
+            left: so many were fitted,
+            fitted_psnr: and have this PSNR before they are quantised, dB.
+            psnr, slope: as above.
+        """
+        removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
+        return self._least(_at_psnr(psnr, slope), removed / self._error(left))
+
+    def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
+        """How many are likely to make the best file of a size.
+
+        Args:
+            left: of so many splats there is a file of that size.
+            fitted_psnr: theirs before they were quantised. psnr: of the file, dB.
+            slope: as above.
+        """
+        error = error_of_psnr(psnr)
+        removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
+        quantised = max(error - removed, LEAST_QUANTISED * error)
+        return self._least(_at_size(left, quantised, slope), removed / self._error(left))
+
+    def _calibrated(self, cost: Cost, seen: Seen) -> int:
+        factor, left = 1.0, len(self.source)
+        for _ in range(_CALIBRATIONS):
+            left = self._least(cost, factor * error_of_psnr(_MENDED))
+            if left == len(self.source):
+                break
+            rows = self.session.pruned(len(self.source) - left)
+            before, factor = factor, error_of_psnr(seen(self.source.select(rows))) / self._error(left)
+            if before / _AGREED <= factor <= before * _AGREED:
+                break
+        return left
+
+    def _least(self, cost: Cost, factor: float) -> int:
+        """Splats left where a cost of their number and of the error of the others, times a factor, is least."""
+        while True:
+            errors = self._errors()
+            left = len(self.source) - np.arange(len(errors), dtype=np.float64)
+            best = int(np.argmin(cost(left, factor * errors)))
+            if best < len(errors) - 1 or not self._goes_on():
+                return int(left[best])
+
+    def _goes_on(self) -> bool:
+        """Let the order go on to half of what it leaves; false where it goes no further."""
+        session, before = self.session, len(self.session.order.rows)
+        least = (len(self.source) - before) // 2
+        order = removal_order(
+            self.source, session.views, session.options, None, self.progress, least=least, start=session.order
+        )
+        self._session = replace(session, order=order)
+        return len(order.rows) > before
+
+    def _error(self, left: int) -> float:
+        """Mean squared error of the removal of all but so many, as predicted."""
+        errors = self._errors()
+        return max(float(errors[min(len(self.source) - left, len(errors) - 1)]), _NOTHING)
+
+    def _errors(self) -> F64:
+        session = self.session
+        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.views.removal.value_count
+        return sums[: len(self.source)]  # one stays
+
+
+def _at_psnr(psnr: float, slope: float) -> Cost:
+    return lambda left, removed: log_bytes_at_error(left, removed, error_of_psnr(psnr), _MOST_REMOVED, slope)
+
+
+def _at_size(splats: int, quantised: float, slope: float) -> Cost:
+    return lambda left, removed: error_at_size(left / splats, removed, quantised, slope)

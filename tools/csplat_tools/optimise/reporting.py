@@ -1,0 +1,93 @@
+"""Reports of searches: what was reached and tried, why this file, and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from csplat_render.metrics import psnr_of_mse
+from csplat_tools.optimise.report import Report
+from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.trials import Trial, Trials, spread_of
+
+__all__ = ["reported"]
+
+_FAR = 0.3  # dB above a target
+
+
+def reported(
+    target: Target, found: Trial, trials: Trials, *, splats_before: int, views_of: str, remarks: Sequence[str],
+    **counted: Any,
+) -> Report:  # fmt: skip
+    """Report a search.
+
+    Args:
+        target: what was asked.
+        found: the file.
+        trials: all that were tried.
+        splats_before: of the scene.
+        views_of: where the views that judge come from: `virtual`, or a name.
+        remarks: further sentences.
+        counted: what else `Report` holds.
+    """
+    errors, spread = found.errors, spread_of(found.errors)
+    worst = min(psnr_of_mse(float(error)) for error in errors)
+    many = f"{len(errors)} virtual views" if views_of == "virtual" else f"{len(errors)} views of {views_of}"
+    sure = (
+        f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
+    )
+    if not math.isnan(spread):
+        sure += (
+            f"; other such views would change the {found.psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
+        )
+    return Report(
+        goal=target.as_json(),
+        size_bytes=found.size_bytes,
+        splats=found.splats,
+        splats_before=splats_before,
+        psnr=found.psnr,
+        worst_psnr=worst,
+        spread=None if math.isnan(spread) else round(spread, 3),
+        views=len(errors),
+        views_of=views_of,
+        renders=trials.renders,
+        chosen=found.as_json(),
+        tried=tuple(trial.as_json() for trial in trials.made),
+        why=(*_why(target, found, trials, splats_before), *remarks),
+        sure=sure,
+        **counted,
+    )
+
+
+def _why(target: Target, found: Trial, trials: Trials, splats_before: int) -> list[str]:
+    """Sentences: how SH is coded and among what that was chosen, and how many splats went."""
+    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
+    if found.quality is None:
+        lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]
+    else:
+        lines = [f"{_coding(found)}; each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"]
+    if found.grades > 1:
+        lines.append(f"splats are sorted into {found.grades} grades by what pictures lose, each with steps of its own")
+    others = [coding for coding in codings if coding != _coding(found)]
+    if others:
+        expected = "look worse" if target.size_bytes is not None else "take more"
+        lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
+    if target.psnr is not None and found.psnr > target.psnr + _FAR:
+        lines.append("no smaller file of those tried reaches the target")
+    gone = splats_before - found.splats
+    if gone:
+        share = 100.0 * gone / splats_before
+        lines.append(f"{gone} splats ({share:.0f} %) are left out, the others fitted to what the source looks like")
+    return lines
+
+
+def _coding(trial: Trial) -> str:
+    options = trial.result.report.options
+    if options["sh_coding"] == "none":
+        return "no SH bands" if trial.part.model.sh_degree else "no SH to code"
+    bands = f"SH degree {options['sh_degree']}"
+    if options["sh_coding"] == "codebook":
+        return f"{bands} by a codebook of {'+'.join(map(str, options['codebook_sizes']))}"
+    adaptive = " by importance" if options["adaptive"] == 1.0 else ""
+    return f"{bands} value by value{adaptive}"

@@ -1,0 +1,171 @@
+"""One goal, many kinds of file: near it, to compare them; exactly on it, to be the one that is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from csplat_tools.optimise.exchange import BYTES_PER_DB
+from csplat_tools.optimise.search import Window, meet
+from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
+
+__all__ = ["QUALITIES", "Goal", "Solver"]
+
+#: Between which the PSNR that each attribute keeps is looked for, dB.
+QUALITIES = (24.0, 110.0)
+
+_NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: what says well enough what a file on it would cost
+_ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from one precision to the next
+_ON_REFITTED = Window(0.0, 0.2, 0.08)  # each try takes pictures
+_WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
+_MENDED = 0.5  # dB that a fit to quantised geometry mends, about
+_FEW, _MANY = 3, 6  # tries
+_APART = 0.5  # dB between two files that say what a decibel costs
+_SLOPES = (0.02, 0.1)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is looked for.
+
+    Attributes:
+        psnr: dB of renders against the source's; beside a loss, what is likely to keep to it.
+        size_bytes: of the file, at most.
+        photo_psnr: dB against photographs, beside `psnr`.
+        photo_slope: by what that grows with every dB of `psnr`, about: little, where a file's own error is little.
+    """
+
+    psnr: float | None = None
+    size_bytes: int | None = None
+    photo_psnr: float | None = None
+    photo_slope: float = 1.0
+
+    def above(self, trial: Trial, slope: float = BYTES_PER_DB) -> float:
+        """By how many dB a file is better than what is looked for; of a size, by how many its bytes are more."""
+        if self.size_bytes is not None:
+            return math.log(trial.size_bytes / self.size_bytes) / slope
+        if self.photo_psnr is not None:
+            return (trial.photo_psnr - self.photo_psnr) / self.photo_slope
+        return trial.psnr - (self.psnr or 0.0)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the views that judge say where files stand: those of a PSNR."""
+        return self.size_bytes is None and self.photo_psnr is None
+
+    def is_met(self, trial: Trial) -> bool:
+        """Whether a file keeps to it."""
+        above = self.above(trial)
+        return above <= 0.0 if self.size_bytes is not None else above >= 0.0
+
+    def best(self, trials: list[Trial]) -> Trial | None:
+        """Of the files that keep to it, the smallest; of a size, the one whose renders are best."""
+        good = [trial for trial in trials if self.is_met(trial)]
+        if self.size_bytes is not None:
+            return max(good, key=lambda trial: trial.decided_psnr, default=None)
+        return min(good, key=lambda trial: trial.size_bytes, default=None)
+
+
+@dataclass(eq=False)
+class Solver:
+    """Finds the precision at which files of some splats and a coding are where a goal is.
+
+    Attributes:
+        trials: makes the files.
+        goal: what is looked for.
+    """
+
+    trials: Trials
+    goal: Goal
+
+    def near(self, part: Part, coding: Coding, start: float, tries: int = _FEW) -> Trial:
+        """A file near the goal, or the nearest of a few.
+
+        Args:
+            part: its splats.
+            coding: of their colours.
+            start: PSNR that each attribute is to keep, to begin with.
+            tries: files at most.
+        """
+        self._approach(part, coding, start, _NEAR, tries, self.about)
+        return self._nearest(part, coding)
+
+    def on(self, part: Part, coding: Coding, tries: int = _MANY) -> Trial | None:
+        """The best file that keeps to the goal, of some splats and a coding of which there are files near it."""
+        known = self._nearest(part, coding)
+        assert known.quality is not None
+        if self.goal.size_bytes is not None:
+            start = known.quality - self.goal.above(known, self.slope(known))
+            self._approach(part, coding, start, _WITHIN, tries, self.goal.above, careful=True)
+            return self.goal.best(self.trials.of(part, coding, careful=True))
+        if part.refits:
+            start = known.quality - self.about(known) - _MENDED
+            self._approach(part, coding, start, _ON_REFITTED, _FEW, self.goal.above, careful=True)
+            return self.goal.best(self.trials.of(part, coding, careful=True))
+        self._approach(part, coding, known.quality, _ON, tries, self.goal.above)
+        best = self.goal.best(self.trials.of(part, coding))
+        if best is None:
+            return None
+        packed = self.trials.make(part, coding, best.quality, quick=False)
+        return packed if self.goal.is_met(packed) else None
+
+    def cost(self, trial: Trial) -> float:
+        """What a file like this one costs on the goal: a logarithm of bytes, but for a constant.
+
+        A file that is too bad, or too large, although it was tried to bring it near, costs infinitely much.
+        """
+        above = self.about(trial)
+        far = above < _NEAR.low if self.goal.size_bytes is None else above > _NEAR.high
+        level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
+        return math.inf if far else math.log(trial.size_bytes) - self.slope(trial) * (trial.decided_psnr - level)
+
+    def about(self, trial: Trial) -> float:
+        """By how many dB a file is better than the goal, or larger, as far as the views that decide say."""
+        if not self.goal.is_judged:
+            return self.goal.above(trial)
+        return trial.decided_psnr - self.level(trial.part)
+
+    def slope(self, trial: Trial) -> float:
+        """The share of the bytes that a decibel costs here."""
+        for other in self.trials.of(trial.part, trial.coding):
+            apart = other.decided_psnr - trial.decided_psnr
+            if abs(apart) > _APART and other.options.effort == trial.options.effort:
+                return min(max(math.log(other.size_bytes / trial.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
+        return BYTES_PER_DB
+
+    def level(self, part: Part) -> float:
+        """What the goal is by the views that decide, dB: they see errors larger or smaller than those that judge.
+
+        Errors of removal more so than others: so it is not the same for all splats and for some.
+        """
+        made = [trial for trial in self.trials.made if trial.part is part]
+        judged = [trial for trial in made if trial.is_judged] or made[:1]
+        nearest = min(judged, key=lambda trial: abs(trial.psnr - (self.goal.psnr or 0.0)))
+        return (self.goal.psnr or 0.0) + nearest.decided_psnr - nearest.psnr
+
+    def _level_of_size(self) -> float:
+        return min(self.trials.made, key=lambda trial: abs(self.goal.above(trial))).decided_psnr
+
+    def _approach(
+        self,
+        part: Part,
+        coding: Coding,
+        start: float,
+        window: Window,
+        tries: int,
+        above: Callable[[Trial], float],
+        *,
+        careful: bool = False,
+    ) -> None:
+        def measure(quality: float) -> float:
+            return above(self.trials.make(part, coding, quality, quick=not careful))
+
+        made = self.trials.of(part, coding, careful=careful)
+        if part.refits and not careful:
+            made = [trial for trial in made if not trial.is_careful]
+        known = [(one.quality, above(one)) for one in made if one.quality is not None]
+        meet(measure, window, start=start, slope=1.0, bounds=QUALITIES, tries=max(0, tries - len(known)), known=known)
+
+    def _nearest(self, part: Part, coding: Coding) -> Trial:
+        return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))

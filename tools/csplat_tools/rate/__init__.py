@@ -1,1 +1,0 @@
-"""Files that keep to a target: a size, a PSNR, largest errors. `targets` and `bounds` want no renderer."""
