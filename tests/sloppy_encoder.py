@@ -25,7 +25,7 @@ import numpy as np
 
 import csplat
 from csplat import _spec
-from csplat.encoder import apart, blocks, container, pipeline, streams, tile
+from csplat.encoder import apart, blocks, coded, container, streams, tile
 from csplat.model import normalise_quats
 from csplat_conformance.encoders import LEVELS, EncoderChoice, run_encoder
 from csplat_conformance.mutate import mapped
@@ -293,7 +293,7 @@ MISTAKES = {
         ),
     ),
     "blocks_swapped": Mistake(
-        "rotations come before scales", ("L1", "TLE-2"), stage=replaced(pipeline, "encode_tile", swapped_blocks)
+        "rotations come before scales", ("L1", "TLE-2"), stage=replaced(coded, "encode_tile", swapped_blocks)
     ),
     "zlib_for_deflate": Mistake(
         "DEFLATE is what zlib.compress gives",
@@ -348,7 +348,7 @@ MISTAKES = {
         "a bound may be generous", ("L3", "SER-5"), data=stated(lambda r: r._replace(max=r.max * 1.5))
     ),
     "pruned_invented": Mistake("counts are decoration", ("L2", "SER-5"), data=counts(3, 3)),
-    "coarse": Mistake("honest errors may be of any size", ("L4", ""), options={"quality": 16.0, "sh_coding": "none"}),
+    "coarse": Mistake("honest errors may be of any size", ("L4", ""), options={"attribute_psnr": 16.0, "sh_coding": "none"}),
     "refitted_claimed": Mistake(
         "whoever says that colours were fitted anew may write any",
         ("L4", ""),

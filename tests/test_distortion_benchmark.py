@@ -218,7 +218,7 @@ def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_
 
     assert "sample balanced" in run("plain").err
     assert "0.500" in run("simplified").out
-    assert [(36.0, 20, 8)] == searches
+    assert [(36.0, 36, 8)] == searches
     one = distortion_tables.Measured(json.loads(known.read_text()))
     assert rate_at(one.plain(), 36.0).measured is None  # enclosed
     before = known.read_text()

@@ -102,8 +102,9 @@ def find_view_set(
     if data is not None:
         return _of_data(source, data, background, aside, split)
     if cameras is None:
-        teaches, decides = _virtual(source, count, size, seed, aside)
         judges = comparison_cameras(source)
+        judging = {pose(camera) for camera in judges}  # of a scene without splats all are alike
+        teaches, decides = (_without(judging, part) for part in _virtual(source, count, size, seed, aside))
         return ViewSet(VIRTUAL, background or BLACK, teaches, decides, judges, virtual=True, origin=source.origin)
     return _of_file(source, cameras, background, (count, size, seed), aside)
 
