@@ -348,7 +348,9 @@ MISTAKES = {
         "a bound may be generous", ("L3", "SER-5"), data=stated(lambda r: r._replace(max=r.max * 1.5))
     ),
     "pruned_invented": Mistake("counts are decoration", ("L2", "SER-5"), data=counts(3, 3)),
-    "coarse": Mistake("honest errors may be of any size", ("L4", ""), options={"attribute_psnr": 16.0, "sh_coding": "none"}),
+    "coarse": Mistake(
+        "honest errors may be of any size", ("L4", ""), options={"attribute_psnr": 16.0, "sh_coding": "none"}
+    ),
     "refitted_claimed": Mistake(
         "whoever says that colours were fitted anew may write any",
         ("L4", ""),

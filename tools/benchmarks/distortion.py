@@ -132,7 +132,8 @@ class _Bench:
         cameras = measuring_views(self.source, find_view_set(self.source, cameras=given, background=BLACK))
         found = measured_importance(self.source, cameras, BLACK, threads=None)
         seconds = time.perf_counter() - start
-        self.kept.values["graded by"] = {"cameras": len(cameras), "given": given is not None, "seconds": seconds}
+        facts = {"cameras": len(cameras), "given": given is not None, "seconds": seconds}
+        self.kept.values.setdefault("graded by", facts)
         return found
 
     @classmethod
