@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -16,13 +17,17 @@ from csplat_tools.optimise.trials import Coding, Part, Trial
 __all__ = ["Codings"]
 
 _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
-_SHARE = 1 / 32  # entries of an SH codebook per splat, to begin with
+_SHARE_AT = (38.0, 1 / 64, 0.4)  # dB of a file, entries of its SH codebook per splat, and how many octaves a dB is
 _SHARE_STEP = 4.0
 _SHARES = (1 / 512, 1 / 8)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
 _FIRST_TRIES, _TRIES = 4, 2  # files that bring a coding near the goal, at most
+_CLOSER = 3  # files that bring what seems best so near that it may be taken for it
 _GRADED = 1.0  # dB that grades are worth, about
+_BOOKED = 0.7  # dB by which a codebook's file is better than one of values one by one, at the same precision
+_UNSURE = (0.02, 0.04)  # of the bytes: what a file says of the cost on the goal, and for every dB that it lies beside
+_PLATEAU = -1.5  # dB above the goal: a codebook that is so much worse than values one by one there is too small
 _CLOSE = 0.1  # of the bytes: a codebook that costs so much more than values one by one may win in another size
 
 
@@ -41,13 +46,18 @@ class Codings:
     gradable: bool
     _truncated: dict[int, float] = field(default_factory=dict, init=False)
 
-    def usual(self, part: Part) -> list[Coding]:
-        """One coding of each kind that may be: values one by one, a codebook, none."""
+    def usual(self, part: Part, psnr: float = _SHARE_AT[0]) -> list[Coding]:
+        """One coding of each kind that may be: values one by one, a codebook, none.
+
+        Args:
+            part: the splats.
+            psnr: of files near the goal, about, dB.
+        """
         if not self._degree or self.encoding.sh_coding == "none":
             return [Coding("none")]
         coarse = self.gradable and not part.refits and self.encoding.adaptive is None
         scalar = Coding("scalar", adaptive=_ADAPTIVE if coarse else None)
-        kinds = {"scalar": [scalar], "codebook": [Coding("codebook", _SHARE)]}
+        kinds = {"scalar": [scalar], "codebook": [Coding("codebook", _share(psnr))]}
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
         huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
@@ -70,28 +80,44 @@ class Codings:
 
         def cost(coding: Coding, finer: float = 0.0) -> float:
             if coding not in found:
+                known = min(map(solver.expected, found.values()), default=math.inf)
                 quality = _start(solver, found, start) + finer
-                found[coding] = solver.near(part, coding, quality, _TRIES if found else _FIRST_TRIES)
-            return solver.cost(found[coding])
+                quality -= _BOOKED if coding.sh == "codebook" and all(one.sh != "codebook" for one in found) else 0.0
+                found[coding] = trial = solver.near(part, coding, quality, 1 if found else _FIRST_TRIES)
+                unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
+                if len(found) > 1 and solver.expected(trial) < known + unsure and not self._is_small(trial, solver):
+                    found[coding] = solver.near(part, coding, quality, _TRIES)
+            return solver.expected(found[coding])
 
         def best() -> Coding:
-            return min(found, key=lambda coding: solver.cost(found[coding]))
+            return min(found, key=lambda coding: (solver.cost(found[coding]), solver.expected(found[coding])))
 
-        for coding in self.usual(part):
+        first, *others = self.usual(part, solver.goal.psnr or _SHARE_AT[0])
+        cost(first)
+        if others:
+            others = self.usual(part, found[first].decided_psnr - solver.about(found[first]))[1:]
+        for coding in others:
             cost(coding)
         if brief:
             return sorted(found.values(), key=solver.cost)
         for book in [coding for coding in found if coding.sh == "codebook" and self.encoding.codebook_size is None]:
             if cost(book) < cost(best()) + (0.0 if part.refits else _CLOSE) + 1e-9:
-                _descend(book, cost)
+                _resize(book, cost, larger=self._is_small(found[book], solver))
         if best().adaptive is not None:
             cost(replace(best(), adaptive=None))
+        for _ in range(0 if part.refits else _CLOSER):
+            found[best()] = solver.closer(found[best()])
         if not part.refits and self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
             for degree in self._degrees(solver):
                 cost(Coding("none", degree=0) if degree == 0 else replace(best(), degree=degree))
         if self.gradable and part.gradable and not part.refits:
             cost(replace(best(), graded=False, adaptive=None), _GRADED)
         return sorted(found.values(), key=solver.cost)
+
+    def _is_small(self, trial: Trial, solver: Solver) -> bool:
+        """Whether finer steps would not bring it near: its codebook is too small, and there are larger ones."""
+        share = trial.coding.share
+        return share is not None and share * _SHARE_STEP <= _SHARES[1] and solver.about(trial) < _PLATEAU
 
     @property
     def _degree(self) -> int:
@@ -122,9 +148,15 @@ def _start(solver: Solver, found: dict[Coding, Trial], start: float) -> float:
     return known.quality - solver.about(known)
 
 
-def _descend(start: Coding, cost: Callable[[Coding], float]) -> None:
-    """Codebooks larger and smaller by steps, as long as it pays."""
-    for factor in (1 / _SHARE_STEP, _SHARE_STEP):
+def _share(psnr: float) -> float:
+    """Entries of a codebook per splat that are usual at a PSNR."""
+    usual, share, octaves = _SHARE_AT
+    return min(max(share * 2.0 ** (octaves * (psnr - usual)), _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
+
+
+def _resize(start: Coding, cost: Callable[[Coding], float], *, larger: bool) -> None:
+    """Codebooks of other sizes by steps, as long as it pays; first the larger ones or the smaller ones."""
+    for factor in (_SHARE_STEP, 1 / _SHARE_STEP) if larger else (1 / _SHARE_STEP, _SHARE_STEP):
         coding, gained = start, False
         while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
             after = replace(coding, share=(coding.share or 0.0) * factor)

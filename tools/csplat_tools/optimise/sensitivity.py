@@ -22,7 +22,7 @@ Weights = NDArray[Any] | Importance
 Progress = Callable[[str, float], None]
 
 _GIVEN = 40  # cameras that are enough, of those given
-_VIRTUAL = (40, 80)  # and of small virtual ones, for large scenes and for small ones
+_VIRTUAL = {False: (120, 120), True: (80, 40)}  # small virtual ones, without and with SH; for small scenes and large
 _LARGE = 40_000  # splats: of fewer, half of the views would change the size of files by a per cent
 
 
@@ -32,7 +32,7 @@ def measuring_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     Virtual ones look from nearer and farther, from below and beside, too. Cameras like those that judge would say less
     of what others see: plane3 graded by 40 of them has 42 dB by them and 39 by others; by these, 41 and 40.
     """
-    return evenly(views.teaches, _VIRTUAL[len(source) < _LARGE] if views.virtual else _GIVEN)
+    return evenly(views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN)
 
 
 def measured_for(

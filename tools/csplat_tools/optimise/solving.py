@@ -16,6 +16,7 @@ __all__ = ["QUALITIES", "Goal", "Solver"]
 QUALITIES = (24.0, 110.0)
 
 _NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: what says well enough what a file on it would cost
+_CLOSE = Window(-0.35, 0.4, 0.05)  # what is taken for the best
 _ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from one precision to the next
 _ON_REFITTED = Window(0.0, 0.2, 0.08)  # each try takes pictures
 _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
@@ -23,6 +24,7 @@ _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
 _FEW, _MANY = 3, 6  # tries
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
+_GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,15 @@ class Solver:
         self._approach(part, coding, start, _NEAR, tries, self.about)
         return self._nearest(part, coding)
 
+    def closer(self, trial: Trial) -> Trial:
+        """One more file of its kind, if it lies too far from the goal to say what it would cost there; or itself."""
+        if _CLOSE.low <= self.about(trial) <= _CLOSE.high:
+            return trial
+        assert trial.quality is not None
+        tries = len(self.trials.of(trial.part, trial.coding)) + 1
+        self._approach(trial.part, trial.coding, trial.quality, _CLOSE, tries, self.about)
+        return self._nearest(trial.part, trial.coding)
+
     def on(self, part: Part, coding: Coding, tries: int = _MANY) -> Trial | None:
         """The best file that keeps to the goal, of some splats and a coding of which there are files near it."""
         known = self._nearest(part, coding)
@@ -111,14 +122,15 @@ class Solver:
         return packed if self.goal.is_met(packed) else None
 
     def cost(self, trial: Trial) -> float:
-        """What a file like this one costs on the goal: a logarithm of bytes, but for a constant.
-
-        A file that is too bad, or too large, although it was tried to bring it near, costs infinitely much.
-        """
+        """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""
         above = self.about(trial)
         far = above < _NEAR.low if self.goal.size_bytes is None else above > _NEAR.high
+        return math.inf if far else self.expected(trial)
+
+    def expected(self, trial: Trial) -> float:
+        """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant."""
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
-        return math.inf if far else math.log(trial.size_bytes) - self.slope(trial) * (trial.decided_psnr - level)
+        return math.log(trial.size_bytes) - self.slope(trial) * (trial.decided_psnr - level)
 
     def about(self, trial: Trial) -> float:
         """By how many dB a file is better than the goal, or larger, as far as the views that decide say."""
@@ -165,7 +177,8 @@ class Solver:
         if part.refits and not careful:
             made = [trial for trial in made if not trial.is_careful]
         known = [(one.quality, above(one)) for one in made if one.quality is not None]
-        meet(measure, window, start=start, slope=1.0, bounds=QUALITIES, tries=max(0, tries - len(known)), known=known)
+        slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
+        meet(measure, window, start=start, slope=slope, bounds=QUALITIES, tries=left, known=known)
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
         return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))
