@@ -151,7 +151,8 @@ def _start(solver: Solver, found: dict[Coding, Trial], start: float) -> float:
 def _share(psnr: float) -> float:
     """Entries of a codebook per splat that are usual at a PSNR."""
     usual, share, octaves = _SHARE_AT
-    return min(max(share * 2.0 ** (octaves * (psnr - usual)), _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
+    wanted = share * math.pow(2.0, octaves * (psnr - usual))
+    return min(max(wanted, _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
 
 
 def _resize(start: Coding, cost: Callable[[Coding], float], *, larger: bool) -> None:
