@@ -19,7 +19,7 @@ __all__ = ["Codings"]
 _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _SHARE_AT = (38.0, 1 / 64, 0.4)  # dB of a file, entries of its SH codebook per splat, and how many octaves a dB is
 _SHARE_STEP = 4.0
-_SHARES = (1 / 512, 1 / 8)
+_SHARES = (1 / 4096, 1 / 8)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
 _FIRST_TRIES, _TRIES = 4, 2  # files that bring a coding near the goal, at most
@@ -27,7 +27,7 @@ _CLOSER = 3  # files that bring what seems best so near that it may be taken for
 _GRADED = 1.0  # dB that grades are worth, about
 _BOOKED = 0.7  # dB by which a codebook's file is better than one of values one by one, at the same precision
 _UNSURE = (0.02, 0.04)  # of the bytes: what a file says of the cost on the goal, and for every dB that it lies beside
-_PLATEAU = -1.5  # dB above the goal: a codebook that is so much worse than values one by one there is too small
+_OFF = 1.5  # dB: a codebook that is so much worse than values one by one is too small, one so much better too large
 _CLOSE = 0.1  # of the bytes: a codebook that costs so much more than values one by one may win in another size
 
 
@@ -85,12 +85,12 @@ class Codings:
                 quality -= _BOOKED if coding.sh == "codebook" and all(one.sh != "codebook" for one in found) else 0.0
                 found[coding] = trial = solver.near(part, coding, quality, 1 if found else _FIRST_TRIES)
                 unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
-                if len(found) > 1 and solver.expected(trial) < known + unsure and not self._is_small(trial, solver):
+                if len(found) > 1 and solver.expected(trial) < known + unsure and not self._is_off(trial, solver):
                     found[coding] = solver.near(part, coding, quality, _TRIES)
             return solver.expected(found[coding])
 
         def best() -> Coding:
-            return min(found, key=lambda coding: (solver.cost(found[coding]), solver.expected(found[coding])))
+            return min(found, key=lambda coding: solver.expected(found[coding]))
 
         first, *others = self.usual(part, solver.goal.psnr or _SHARE_AT[0])
         cost(first)
@@ -102,7 +102,7 @@ class Codings:
             return sorted(found.values(), key=solver.cost)
         for book in [coding for coding in found if coding.sh == "codebook" and self.encoding.codebook_size is None]:
             if cost(book) < cost(best()) + (0.0 if part.refits else _CLOSE) + 1e-9:
-                _resize(book, cost, larger=self._is_small(found[book], solver))
+                _resize(book, cost, larger=solver.about(found[book]) < -_OFF)
         if best().adaptive is not None:
             cost(replace(best(), adaptive=None))
         for _ in range(0 if part.refits else _CLOSER):
@@ -114,10 +114,13 @@ class Codings:
             cost(replace(best(), graded=False, adaptive=None), _GRADED)
         return sorted(found.values(), key=solver.cost)
 
-    def _is_small(self, trial: Trial, solver: Solver) -> bool:
-        """Whether finer steps would not bring it near: its codebook is too small, and there are larger ones."""
-        share = trial.coding.share
-        return share is not None and share * _SHARE_STEP <= _SHARES[1] and solver.about(trial) < _PLATEAU
+    def _is_off(self, trial: Trial, solver: Solver) -> bool:
+        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
+        if trial.coding.share is None or self.encoding.codebook_size is not None:
+            return False
+        above = solver.about(trial)
+        share = trial.coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
+        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
 
     @property
     def _degree(self) -> int:

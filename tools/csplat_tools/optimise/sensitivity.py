@@ -22,7 +22,7 @@ Weights = NDArray[Any] | Importance
 Progress = Callable[[str, float], None]
 
 _GIVEN = 40  # cameras that are enough, of those given
-_VIRTUAL = {False: (120, 120), True: (80, 40)}  # small virtual ones, without and with SH; for small scenes and large
+_VIRTUAL = {False: (120, 120), True: (80, 60)}  # small virtual ones, without and with SH; for small scenes and large
 _LARGE = 40_000  # splats: of fewer, half of the views would change the size of files by a per cent
 
 

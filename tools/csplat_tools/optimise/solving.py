@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from csplat_tools.optimise.exchange import BYTES_PER_DB
 from csplat_tools.optimise.search import Window, meet
@@ -22,6 +23,8 @@ _ON_REFITTED = Window(0.0, 0.2, 0.08)  # each try takes pictures
 _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
 _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
 _FEW, _MANY = 3, 6  # tries
+_JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
+_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision: where files jump, others beside one are smaller or better
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
 _GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
@@ -118,8 +121,19 @@ class Solver:
         best = self.goal.best(self.trials.of(part, coding))
         if best is None:
             return None
+        best = self._beside(best)
         packed = self.trials.make(part, coding, best.quality, quick=False)
         return packed if self.goal.is_met(packed) else None
+
+    def _beside(self, best: Trial) -> Trial:
+        """The smallest file that meets the goal at precisions beside one that does, where files jump between these."""
+        found = best
+        for step in _BESIDE if _jumps(self.trials.of(best.part, best.coding)) else ():
+            assert best.quality is not None
+            trial = self.trials.make(best.part, best.coding, _bounded(best.quality + step), quick=True)
+            if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
+                found = trial
+        return found
 
     def cost(self, trial: Trial) -> float:
         """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""
@@ -182,3 +196,13 @@ class Solver:
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
         return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))
+
+
+def _jumps(trials: Sequence[Trial]) -> bool:
+    """Whether a file is worse than another of less precision, by more than chance."""
+    ordered = [one.decided_psnr for one in sorted(trials, key=lambda trial: trial.quality or 0.0)]
+    return any(after < before - _JUMP for before, after in pairwise(ordered))
+
+
+def _bounded(quality: float) -> float:
+    return min(max(quality, QUALITIES[0]), QUALITIES[1])
