@@ -156,7 +156,7 @@ def test_the_command_meets_a_size_and_says_why(tmp_path, ply):
 def test_the_command_reports_a_target_as_json(tmp_path, ply):
     done = run("encode", ply, tmp_path / "scene.csplat", "--target-psnr", "34", "--keep-all", "--json")
     report = json.loads(done.stdout)
-    assert 34.0 <= report["target"]["psnr"] <= 35.2  # files of so few splats jump
+    assert 34.0 <= report["target"]["psnr"] <= 34.6  # files of so few splats jump
     assert report["target"]["size_bytes"] == report["size_bytes"]
     assert 300 == report["target"]["splats"] == report["splats"]
 

@@ -102,11 +102,12 @@ class Codings:
             return sorted(found.values(), key=solver.cost)
         for book in [coding for coding in found if coding.sh == "codebook" and self.encoding.codebook_size is None]:
             if cost(book) < cost(best()) + (0.0 if part.refits else _CLOSE) + 1e-9:
-                _resize(book, cost, larger=solver.about(found[book]) < -_OFF)
+                _resize(book, cost, solver.about(found[book]))
         if best().adaptive is not None:
             cost(replace(best(), adaptive=None))
         for _ in range(0 if part.refits else _CLOSER):
-            found[best()] = solver.closer(found[best()])
+            likeliest = best()
+            found[likeliest] = solver.closer(found[likeliest])
         if not part.refits and self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
             for degree in self._degrees(solver):
                 cost(Coding("none", degree=0) if degree == 0 else replace(best(), degree=degree))
@@ -158,9 +159,10 @@ def _share(psnr: float) -> float:
     return min(max(wanted, _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
 
 
-def _resize(start: Coding, cost: Callable[[Coding], float], *, larger: bool) -> None:
-    """Codebooks of other sizes by steps, as long as it pays; first the larger ones or the smaller ones."""
-    for factor in (_SHARE_STEP, 1 / _SHARE_STEP) if larger else (1 / _SHARE_STEP, _SHARE_STEP):
+def _resize(start: Coding, cost: Callable[[Coding], float], above: float) -> None:
+    """Codebooks of other sizes by steps, as long as it pays; smaller ones, where the first is so far above the goal."""
+    factors = [factor for factor, off in ((1 / _SHARE_STEP, above < -_OFF), (_SHARE_STEP, above > _OFF)) if not off]
+    for factor in factors:
         coding, gained = start, False
         while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
             after = replace(coding, share=(coding.share or 0.0) * factor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,8 +29,12 @@ F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
+Seen = Callable[[SplatModel], float]
 
 _GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 of plane3 take 3 % more with grades
+_LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
+_MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
+_BAND_TRIES, _FEWER_BANDS = 3, 4.0  # where they take more: times less each
 _BAND_STEPS = 8  # of a fit after bands were left out
 _STEPS = 4  # of a fit that begins where another one ended
 _SENSITIVITY_VIEWS = 40  # that say how precise the splats have to be
@@ -42,7 +47,9 @@ class Fitted:
     Attributes:
         session: the scene, its views, the order in which its splats go.
         gone: how many went.
-        allowed: PSNR that files are to have, by which SH bands are measured; `None`: what the fit leaves decides.
+        allowed: PSNR that files are to have by the views that decide, dB: what the fit leaves of that error says which
+            SH bands are worth their bits; `None`: the fit's own error does.
+        seen: PSNR of some splats by the views that decide, dB.
         grades: they may be sorted into grades, if views can say how.
         progress: is told the stages.
     """
@@ -50,6 +57,7 @@ class Fitted:
     session: Session
     gone: int
     allowed: float | None
+    seen: Seen
     grades: bool
     progress: Progress | None
     refits: bool = True
@@ -79,10 +87,19 @@ class Fitted:
         session, model = self.session, self.model
         if not session.options.bands or not model.sh_degree:
             return model, None
-        psnr = session.checked.psnr(model) if self.allowed is None else self.allowed
-        stays = band_mask(self._removal, error_of_psnr(psnr) * session.views.removal.value_count / max(1, len(model)))
-        model = without(model, stays)
-        return (self._refitted(model, stays, _BAND_STEPS) if session.options.refit else model), stays
+        error, most = error_of_psnr(session.checked.psnr(model)), math.inf
+        if self.allowed is not None:  # views that teach and those that decide see errors of different size
+            fitted, allowed = error_of_psnr(self.seen(model)), error_of_psnr(self.allowed)
+            error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
+            most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
+        for _ in range(_BAND_TRIES):
+            stays = band_mask(self._removal, error * session.views.removal.value_count / max(1, len(model)))
+            banded = without(model, stays)
+            banded = self._refitted(banded, stays, _BAND_STEPS) if session.options.refit else banded
+            if error_of_psnr(self.seen(banded)) <= most:
+                break
+            error /= _FEWER_BANDS
+        return banded, stays
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
         """Quantise the geometry, fit colours to that, code all of it; quick is without the fit."""

@@ -50,7 +50,7 @@ class Moves:
     @staticmethod
     def kept(trials: Trials, removal: Removal, keep: float) -> Trial:
         """The file of a share of the splats, at the precision that the options say."""
-        part = removal.fitted(max(1, round(keep * len(removal.source))), None)
+        part = removal.fitted(max(1, round(keep * len(removal.source))), None, trials.decider.psnr)
         return trials.make(part, Coding(None), None, quick=False)
 
     def best(self) -> Trial:
@@ -69,6 +69,7 @@ class Moves:
         for trial in sorted(tried, key=self.solver.cost):
             if self._pays(trial, found):
                 on = self.solver.on(trial.part, trial.coding)
+                on = self._of_more(trial) if on is None else on
                 found += [] if on is None else [on]
         self._presets(tried)
         best = self.solver.goal.best([trial for trial in self.solver.trials.made if self._may_be_written(trial)])
@@ -92,14 +93,15 @@ class Moves:
     def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
         """Files near the goal of some numbers of splats, each of which says which to try next."""
         solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
-        slope, found = solver.slope(whole), list[Trial]()
+        slope, found, seen = solver.slope(whole), list[Trial](), solver.trials.decider.psnr
+        allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole)
         for _ in range(_COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
                 break
-            part = removal.fitted(left, goal.psnr)
-            fitted_psnr, banded_psnr = (solver.trials.decider.psnr(one) for one in (part.model, part.banded[0]))
+            part = removal.fitted(left, allowed, seen)
+            fitted_psnr, banded_psnr = (seen(one) for one in (part.model, part.banded[0]))
             quality = start if goal.psnr is None else _finer(start, goal.psnr, banded_psnr)
             tries = self.codings.best(solver, part, quality)
             trial, before = tries[0], left
@@ -119,6 +121,16 @@ class Moves:
             if abs(left - before) <= _SAME * before or min(found, key=solver.cost).part is not part:
                 break
         return found
+
+    def _of_more(self, trial: Trial) -> Trial | None:
+        """A file on the goal of more splats, where those of a trial turned out to be too few for any precision."""
+        left = int(trial.splats / _FEWER)
+        all_stay = trial.part is self.whole or left > (1.0 - _ALL_BUT) * len(self.whole.model)
+        if self.removal is None or self.solver.goal.psnr is None or all_stay:
+            return None
+        part = self.removal.fitted(left, self.solver.level(self.whole), self.solver.trials.decider.psnr)
+        best = self.codings.best(self.solver, part, trial.quality or 0.0)[0]
+        return self.solver.on(best.part, best.coding)
 
     def _first_left(self, removal: Removal, whole: Trial, slope: float) -> int:
         """How many splats to begin with."""

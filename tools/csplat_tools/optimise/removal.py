@@ -72,10 +72,10 @@ class Removal:
         views = self._session.views
         return len(views.used) * len(self._session.order.rounds) + len(views.check)
 
-    def fitted(self, left: int, allowed: float | None) -> Fitted:
-        """So many splats, or those that no view saw if they are more; see `Fitted.allowed`."""
+    def fitted(self, left: int, allowed: float | None, seen: Seen) -> Fitted:
+        """So many splats, or those that no view saw if they are more; see `Fitted`."""
         gone = min(len(self.source) - left, len(self.session.order.rows))
-        return Fitted(self.session, gone, allowed, self.grades, self.progress)
+        return Fitted(self.session, gone, allowed, seen, self.grades, self.progress)
 
     def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:
         """How many splats to begin with for the smallest file of a PSNR.

@@ -22,11 +22,19 @@ _ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from 
 _ON_REFITTED = Window(0.0, 0.2, 0.08)  # each try takes pictures
 _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
 _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
-_FEW, _MANY = 3, 6  # tries
+_FEW, _SOME, _MANY = 3, 4, 6  # tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
-_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision: where files jump, others beside one are smaller or better
+_BESIDE = (
+    -1.2,
+    -0.8,
+    -0.4,
+    0.4,
+    0.8,
+    1.2,
+)  # dB of precision beside what was found, where files jump
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
+_PLATEAU = 1.5  # dB below the goal
 _GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
 
 
@@ -115,7 +123,7 @@ class Solver:
             return self.goal.best(self.trials.of(part, coding, careful=True))
         if part.refits:
             start = known.quality - self.about(known) - _MENDED
-            self._approach(part, coding, start, _ON_REFITTED, _FEW, self.goal.above, careful=True)
+            self._approach(part, coding, start, _ON_REFITTED, _SOME, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         self._approach(part, coding, known.quality, _ON, tries, self.goal.above)
         best = self.goal.best(self.trials.of(part, coding))
@@ -144,7 +152,9 @@ class Solver:
     def expected(self, trial: Trial) -> float:
         """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant."""
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
-        return math.log(trial.size_bytes) - self.slope(trial) * (trial.decided_psnr - level)
+        above = trial.decided_psnr - level
+        far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
+        return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
     def about(self, trial: Trial) -> float:
         """By how many dB a file is better than the goal, or larger, as far as the views that decide say."""
