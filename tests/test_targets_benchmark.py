@@ -91,7 +91,7 @@ def test_tables_state_bytes_psnr_and_seconds_of_both_builds_and_their_means():
     assert "plane3 38 dB, every splat 4.0 2.0 0.500 38.00 38.00 1.0 4.0" in lines
     assert "dB, every splat 2 0.707 1.0 2.0 2.00" in lines
     assert "all targets 2 0.707 1.0 2.0 2.00" in lines
-    assert "None of 4 files is beaten by another one of its scene and build." in lines
+    assert "None of 4 results of searches is beaten by another file of its scene and build." in lines
 
 
 def test_tables_mark_what_no_two_files_say():
@@ -102,9 +102,15 @@ def test_tables_mark_what_no_two_files_say():
 
 
 def test_tables_state_what_is_beaten_and_what_was_not_made():
-    now = {"small": row(2000, 38.0), "fast": row(1000, 39.0), "38 dB, every splat": {"error": "out of reach"}}
+    now = {
+        "small": row(3000, 38.0),
+        "34 dB, every splat": row(2000, 38.0),
+        "fast": row(1000, 39.0),
+        "38 dB, every splat": {"error": "out of reach"},
+    }
     text = tables(known(now), markdown=True)
-    assert "| plane3 | now | small | 2.0 | 38.00 | fast | 1.0 | 39.00 |" in text
+    assert "| plane3 | now | 34 dB, every splat | 2.0 | 38.00 | fast | 1.0 | 39.00 |" in text
+    assert "| small |" not in text.split("| beaten |")[1]  # a preset looks at no picture
     assert "| plane3 | now | 38 dB, every splat | out of reach |" in text
     assert "| plane3 | 38 dB, every splat | 4.0 | - | - | 38.00 | - | 1.0 | - |" in text
     assert not tables({}, markdown=True)

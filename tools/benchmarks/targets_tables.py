@@ -135,16 +135,18 @@ def _means_table(known: Known, *, markdown: bool) -> str:
 
 
 def _dominated_table(known: Known, *, markdown: bool) -> str:
-    """Files that others of the same scene and build beat; or that there are none."""
+    """Results of searches that other files of the same scene and build beat; or that there are none."""
     lines, count = [], 0
     for scene, one in known.items():
         for build in one["builds"]:
             rows = _rows(one, build)
-            count += len(list(_files(rows)))
+            searched = {name for name, _ in _files(rows) if kind_of(name) != name}  # presets look at no picture
+            count += len(searched)
             for name, other in dominated(rows).items():
-                lines.append((scene, build, *_beside(name, rows[name]), *_beside(other, rows[other])))
+                if name in searched:
+                    lines.append((scene, build, *_beside(name, rows[name]), *_beside(other, rows[other])))
     if count and not lines:
-        return f"None of {count} files is beaten by another one of its scene and build."
+        return f"None of {count} results of searches is beaten by another file of its scene and build."
     header = ("scene", "build", "beaten", "kB", "dB", "by", "kB", "dB")
     return laid_out(header, lines, markdown=markdown)
 
