@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ _SHARES = (1 / 4096, 1 / 8)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
 _FIRST_TRIES, _TRIES = 4, 2  # files that bring a coding near the goal, at most
-_CLOSER = 3  # files that bring what seems best so near that it may be taken for it
+_CLOSER = 3  # files that bring what seems best nearer still
 _GRADED = 1.0  # dB that grades are worth, about
 _BOOKED = 0.7  # dB by which a codebook's file is better than one of values one by one, at the same precision
 _UNSURE = (0.02, 0.04)  # of the bytes: what a file says of the cost on the goal, and for every dB that it lies beside
@@ -76,52 +76,29 @@ class Codings:
         Returns:
             One file of each coding that was tried, what costs least first.
         """
-        found: dict[Coding, Trial] = {}
-
-        def cost(coding: Coding, finer: float = 0.0) -> float:
-            if coding not in found:
-                known = min(map(solver.expected, found.values()), default=math.inf)
-                quality = _start(solver, found, start) + finer
-                quality -= _BOOKED if coding.sh == "codebook" and all(one.sh != "codebook" for one in found) else 0.0
-                found[coding] = trial = solver.near(part, coding, quality, 1 if found else _FIRST_TRIES)
-                unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
-                if len(found) > 1 and solver.expected(trial) < known + unsure and not self._is_off(trial, solver):
-                    found[coding] = solver.near(part, coding, quality, _TRIES)
-            return solver.expected(found[coding])
-
-        def best() -> Coding:
-            return min(found, key=lambda coding: solver.expected(found[coding]))
-
+        tried = _Tried(solver, part, start)
         first, *others = self.usual(part, solver.goal.psnr or _SHARE_AT[0])
-        cost(first)
+        tried.add(first)
         if others:
-            others = self.usual(part, found[first].decided_psnr - solver.about(found[first]))[1:]
+            others = self.usual(part, tried.found[first].decided_psnr - solver.about(tried.found[first]))[1:]
         for coding in others:
-            cost(coding)
+            tried.add(coding, sized=self.encoding.codebook_size is None)
         if brief:
-            return sorted(found.values(), key=solver.cost)
-        for book in [coding for coding in found if coding.sh == "codebook" and self.encoding.codebook_size is None]:
-            if cost(book) < cost(best()) + (0.0 if part.refits else _CLOSE) + 1e-9:
-                _resize(book, cost, solver.about(found[book]))
-        if best().adaptive is not None:
-            cost(replace(best(), adaptive=None))
-        for _ in range(0 if part.refits else _CLOSER):
-            likeliest = best()
-            found[likeliest] = solver.closer(found[likeliest])
-        if not part.refits and self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
-            for degree in self._degrees(solver):
-                cost(Coding("none", degree=0) if degree == 0 else replace(best(), degree=degree))
-        if self.gradable and part.gradable and not part.refits:
-            cost(replace(best(), graded=False, adaptive=None), _GRADED)
-        return sorted(found.values(), key=solver.cost)
-
-    def _is_off(self, trial: Trial, solver: Solver) -> bool:
-        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
-        if trial.coding.share is None or self.encoding.codebook_size is not None:
-            return False
-        above = solver.about(trial)
-        share = trial.coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
-        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
+            return tried.ordered()
+        if self.encoding.codebook_size is None:
+            for book in [coding for coding in tried.found if coding.sh == "codebook"]:
+                if tried.add(book) < tried.add(tried.best) + (0.0 if part.refits else _CLOSE) + 1e-9:
+                    tried.resize(book)
+        if tried.best.adaptive is not None:
+            tried.add(replace(tried.best, adaptive=None))
+        if not part.refits:
+            tried.bring_closer()
+            if self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
+                for degree in self._degrees(solver):
+                    tried.add(Coding("none", degree=0) if degree == 0 else replace(tried.best, degree=degree))
+            if self.gradable and part.gradable:
+                tried.add(replace(tried.best, graded=False, adaptive=None), finer=_GRADED)
+        return tried.ordered()
 
     @property
     def _degree(self) -> int:
@@ -143,13 +120,85 @@ class Codings:
                 break
 
 
-def _start(solver: Solver, found: dict[Coding, Trial], start: float) -> float:
-    """Where the best of those tried would meet the goal."""
-    if not found:
-        return start
-    known = min(found.values(), key=solver.cost)
-    assert known.quality is not None
-    return known.quality - solver.about(known)
+@dataclass(eq=False)
+class _Tried:
+    """One file of each coding that was tried for some splats: near the goal, or as near as was worth it.
+
+    Attributes:
+        solver: brings files near the goal.
+        part: the splats.
+        start: PSNR that each attribute is to keep, to begin with.
+        found: the files.
+    """
+
+    solver: Solver
+    part: Part
+    start: float
+    found: dict[Coding, Trial] = field(default_factory=dict, init=False)
+
+    @property
+    def best(self) -> Coding:
+        """What is expected to cost least."""
+        return min(self.found, key=lambda coding: self.solver.expected(self.found[coding]))
+
+    def ordered(self) -> list[Trial]:
+        """The files, what costs least first."""
+        return sorted(self.found.values(), key=self.solver.cost)
+
+    def add(self, coding: Coding, *, finer: float = 0.0, sized: bool = True) -> float:
+        """What a coding is expected to cost; a first file says whether a second one is worth it.
+
+        Args:
+            coding: what is tried, if it was not yet.
+            finer: dB by which it wants more precision than the best one so far, about.
+            sized: another size of a codebook may be tried instead of other steps.
+        """
+        solver, found = self.solver, self.found
+        if not found:
+            found[coding] = solver.near(self.part, coding, self.start, _FIRST_TRIES)
+        elif coding not in found:
+            known, quality = solver.expected(found[self.best]), self._quality() + finer
+            if coding.sh == "codebook" and all(one.sh != "codebook" for one in found):
+                quality -= _BOOKED
+            found[coding] = trial = solver.near(self.part, coding, quality, 1)
+            unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
+            if solver.expected(trial) < known + unsure and not (sized and self._is_off(trial)):
+                found[coding] = solver.near(self.part, coding, quality, _TRIES)
+        return solver.expected(found[coding])
+
+    def resize(self, book: Coding) -> None:
+        """Codebooks of other sizes by steps, as long as it pays; where one is far off, the way that this says."""
+        above = self.solver.about(self.found[book])
+        ways = ((1 / _SHARE_STEP, above < -_OFF), (_SHARE_STEP, above > _OFF))
+        for factor in [factor for factor, is_wrong in ways if not is_wrong]:
+            coding, gained = book, False
+            while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
+                after = replace(coding, share=(coding.share or 0.0) * factor)
+                if self.add(after) >= self.add(coding):
+                    break
+                coding, gained = after, True
+            if gained:
+                break
+
+    def bring_closer(self) -> None:
+        """More files of what seems best, until it lies so near the goal that it may be taken for it."""
+        for _ in range(_CLOSER):
+            best = self.best
+            self.found[best] = self.solver.closer(self.found[best])
+
+    def _quality(self) -> float:
+        """The precision at which the best of those tried would meet the goal."""
+        known = min(self.found.values(), key=self.solver.cost)
+        assert known.quality is not None
+        return known.quality - self.solver.about(known)
+
+    def _is_off(self, trial: Trial) -> bool:
+        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
+        if trial.coding.share is None:
+            return False
+        above = self.solver.about(trial)
+        share = trial.coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
+        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
 
 
 def _share(psnr: float) -> float:
@@ -157,17 +206,3 @@ def _share(psnr: float) -> float:
     usual, share, octaves = _SHARE_AT
     wanted = share * math.pow(2.0, octaves * (psnr - usual))
     return min(max(wanted, _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
-
-
-def _resize(start: Coding, cost: Callable[[Coding], float], above: float) -> None:
-    """Codebooks of other sizes by steps, as long as it pays; smaller ones, where the first is so far above the goal."""
-    factors = [factor for factor, off in ((1 / _SHARE_STEP, above < -_OFF), (_SHARE_STEP, above > _OFF)) if not off]
-    for factor in factors:
-        coding, gained = start, False
-        while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
-            after = replace(coding, share=(coding.share or 0.0) * factor)
-            if cost(after) >= cost(coding):
-                break
-            coding, gained = after, True
-        if gained:
-            break

@@ -34,7 +34,7 @@ Seen = Callable[[SplatModel], float]
 _GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 of plane3 take 3 % more with grades
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
-_BAND_TRIES, _FEWER_BANDS = 3, 4.0  # where they take more: times less each
+_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
 _BAND_STEPS = 8  # of a fit after bands were left out
 _STEPS = 4  # of a fit that begins where another one ended
 _SENSITIVITY_VIEWS = 40  # that say how precise the splats have to be
@@ -92,13 +92,12 @@ class Fitted:
             fitted, allowed = error_of_psnr(self.seen(model)), error_of_psnr(self.allowed)
             error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
             most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
+        banded, stays = self._left_out(error)
         for _ in range(_BAND_TRIES):
-            stays = band_mask(self._removal, error * session.views.removal.value_count / max(1, len(model)))
-            banded = without(model, stays)
-            banded = self._refitted(banded, stays, _BAND_STEPS) if session.options.refit else banded
             if error_of_psnr(self.seen(banded)) <= most:
                 break
             error /= _FEWER_BANDS
+            banded, stays = self._left_out(error)
         return banded, stays
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
@@ -134,6 +133,13 @@ class Fitted:
     @cached_property
     def _pruned(self) -> SplatModel:
         return self.session.source.select(self.rows)
+
+    def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
+        """The splats without the bands that are not worth their bits where files err by so much; those that stay."""
+        session, model = self.session, self.model
+        stays = band_mask(self._removal, error * session.views.removal.value_count / max(1, len(model)))
+        banded = without(model, stays)
+        return (self._refitted(banded, stays, _BAND_STEPS) if session.options.refit else banded), stays
 
     def _refitted(self, model: SplatModel, stays: Mask | None, steps: int) -> SplatModel:
         """Fit the colours that may be other than zero."""
