@@ -82,6 +82,11 @@ class Fitted:
         return self._fitted
 
     @cached_property
+    def fitted_psnr(self) -> float:
+        """Of these by the views that decide, dB."""
+        return self.seen(self.model)
+
+    @cached_property
     def banded(self) -> tuple[SplatModel, Mask | None]:
         """The same without the SH bands that are not worth their bits, and which bands stay; `None`: all do."""
         session, model = self.session, self.model
@@ -89,11 +94,11 @@ class Fitted:
             return model, None
         error, most = error_of_psnr(session.checked.psnr(model)), math.inf
         if self.allowed is not None:  # views that teach and those that decide see errors of different size
-            fitted, allowed = error_of_psnr(self.seen(model)), error_of_psnr(self.allowed)
+            fitted, allowed = error_of_psnr(self.fitted_psnr), error_of_psnr(self.allowed)
             error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
             most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
         banded, stays = self._left_out(error)
-        for _ in range(_BAND_TRIES):
+        for _ in range(0 if self.allowed is None else _BAND_TRIES):
             if error_of_psnr(self.seen(banded)) <= most:
                 break
             error /= _FEWER_BANDS

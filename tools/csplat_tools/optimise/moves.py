@@ -12,7 +12,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.exchange import BYTES_PER_DB, error_of_psnr
 from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.solving import QUALITIES, Solver
+from csplat_tools.optimise.solving import Solver, bounded
 from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
 
 __all__ = ["Moves"]
@@ -86,9 +86,9 @@ class Moves:
         goal, has_sh = self.solver.goal, self.codings.usual(self.whole) != [Coding("none")]
         if goal.size_bytes is None:
             psnr = goal.psnr or 0.0
-            return _bounded(psnr + _LOSS[has_sh] + _LOSS_GROWS[has_sh] * (psnr - 30.0))
+            return bounded(psnr + _LOSS[has_sh] + _LOSS_GROWS[has_sh] * (psnr - 30.0))
         per_splat = goal.size_bytes / len(self.whole.model)
-        return _bounded(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
+        return bounded(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
 
     def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
         """Files near the goal of some numbers of splats, each of which says which to try next."""
@@ -101,7 +101,7 @@ class Moves:
             if left > (1.0 - _ALL_BUT) * splats:
                 break
             part = removal.fitted(left, allowed, seen)
-            fitted_psnr, banded_psnr = (seen(one) for one in (part.model, part.banded[0]))
+            fitted_psnr, banded_psnr = part.fitted_psnr, seen(part.banded[0])
             quality = start if goal.psnr is None else _finer(start, goal.psnr, banded_psnr)
             tries = self.codings.best(solver, part, quality)
             trial, before = tries[0], left
@@ -193,8 +193,4 @@ def _without(psnr: float, error: float) -> float:
 def _finer(quality: float, psnr: float, fitted_psnr: float) -> float:
     """The PSNR of attributes where what was removed has taken its share of the error already."""
     left = max(_LEAST_LEFT, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
-    return _bounded(quality + psnr_of_mse(left))
-
-
-def _bounded(quality: float) -> float:
-    return min(max(quality, QUALITIES[0]), QUALITIES[1])
+    return bounded(quality + psnr_of_mse(left))

@@ -11,10 +11,9 @@ from csplat_tools.optimise.exchange import BYTES_PER_DB
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
-__all__ = ["QUALITIES", "Goal", "Solver"]
+__all__ = ["Goal", "Solver", "bounded"]
 
-#: Between which the PSNR that each attribute keeps is looked for, dB.
-QUALITIES = (24.0, 110.0)
+_QUALITIES = (24.0, 110.0)  # dB, between which the PSNR that each attribute keeps is looked for
 
 _NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: what says well enough what a file on it would cost
 _CLOSE = Window(-0.35, 0.4, 0.05)  # what is taken for the best
@@ -24,14 +23,7 @@ _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are w
 _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
 _FEW, _SOME, _MANY = 3, 4, 6  # tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
-_BESIDE = (
-    -1.2,
-    -0.8,
-    -0.4,
-    0.4,
-    0.8,
-    1.2,
-)  # dB of precision beside what was found, where files jump
+_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was found, where files jump
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
 _PLATEAU = 1.5  # dB below the goal
@@ -113,19 +105,19 @@ class Solver:
         self._approach(trial.part, trial.coding, trial.quality, _CLOSE, tries, self.about)
         return self._nearest(trial.part, trial.coding)
 
-    def on(self, part: Part, coding: Coding, tries: int = _MANY) -> Trial | None:
+    def on(self, part: Part, coding: Coding) -> Trial | None:
         """The best file that keeps to the goal, of some splats and a coding of which there are files near it."""
         known = self._nearest(part, coding)
         assert known.quality is not None
         if self.goal.size_bytes is not None:
             start = known.quality - self.goal.above(known, self.slope(known))
-            self._approach(part, coding, start, _WITHIN, tries, self.goal.above, careful=True)
+            self._approach(part, coding, start, _WITHIN, _MANY, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         if part.refits:
             start = known.quality - self.about(known) - _MENDED
             self._approach(part, coding, start, _ON_REFITTED, _SOME, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
-        self._approach(part, coding, known.quality, _ON, tries, self.goal.above)
+        self._approach(part, coding, known.quality, _ON, _MANY, self.goal.above)
         best = self.goal.best(self.trials.of(part, coding))
         if best is None:
             return None
@@ -138,7 +130,7 @@ class Solver:
         found = best
         for step in _BESIDE if _jumps(self.trials.of(best.part, best.coding)) else ():
             assert best.quality is not None
-            trial = self.trials.make(best.part, best.coding, _bounded(best.quality + step), quick=True)
+            trial = self.trials.make(best.part, best.coding, bounded(best.quality + step), quick=True)
             if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
                 found = trial
         return found
@@ -202,7 +194,7 @@ class Solver:
             made = [trial for trial in made if not trial.is_careful]
         known = [(one.quality, above(one)) for one in made if one.quality is not None]
         slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
-        meet(measure, window, start=start, slope=slope, bounds=QUALITIES, tries=left, known=known)
+        meet(measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known)
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
         return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))
@@ -214,5 +206,6 @@ def _jumps(trials: Sequence[Trial]) -> bool:
     return any(after < before - _JUMP for before, after in pairwise(ordered))
 
 
-def _bounded(quality: float) -> float:
-    return min(max(quality, QUALITIES[0]), QUALITIES[1])
+def bounded(quality: float) -> float:
+    """A PSNR of attributes where it may be looked for, dB."""
+    return min(max(quality, _QUALITIES[0]), _QUALITIES[1])
