@@ -71,6 +71,8 @@ class Moves:
                 on = self.solver.on(trial.part, trial.coding)
                 on = self._of_more(trial) if on is None else on
                 found += [] if on is None else [on]
+        if found:
+            self.solver.beside(min(found, key=lambda trial: trial.size_bytes))
         self._presets(tried)
         best = self.solver.goal.best([trial for trial in self.solver.trials.made if self._may_be_written(trial)])
         if best is None:
@@ -142,10 +144,12 @@ class Moves:
 
     def _pays(self, trial: Trial, found: list[Trial]) -> bool:
         """Whether a file near the goal may be better on it than those that are there."""
-        if any(one.part is trial.part for one in found):
-            return False  # a coding that was expected to be better is there
         best = self.solver.goal.best(found)
-        return best is None or self.solver.cost(trial) < self.solver.cost(best) + _PAYS
+        if best is None:
+            return True
+        # Of the splats that a file holds another coding was expected to be better, until that file said what it costs.
+        known = any(one.part is trial.part for one in found)
+        return self.solver.cost(trial) < self.solver.cost(best) + (-_PAYS if known else _PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:
         """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""

@@ -23,6 +23,7 @@ _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are w
 _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
 _FEW, _SOME, _MANY = 3, 4, 6  # tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
+_ROUGH = 16  # levels of opacity: with fewer, files jump from one precision to the next
 _BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was found, where files jump
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
@@ -121,19 +122,24 @@ class Solver:
         best = self.goal.best(self.trials.of(part, coding))
         if best is None:
             return None
-        best = self._beside(best)
         packed = self.trials.make(part, coding, best.quality, quick=False)
         return packed if self.goal.is_met(packed) else None
 
-    def _beside(self, best: Trial) -> Trial:
-        """The smallest file that meets the goal at precisions beside one that does, where files jump between these."""
-        found = best
-        for step in _BESIDE if _jumps(self.trials.of(best.part, best.coding)) else ():
-            assert best.quality is not None
+    def beside(self, best: Trial) -> Trial:
+        """A smaller file on the goal of precisions beside that of one that is there, where files jump; or that one."""
+        made, levels = self.trials.of(best.part, best.coding), best.result.report.options["opacity_levels"]
+        if self.goal.size_bytes is not None or best.part.refits or not (levels < _ROUGH or _jumps(made)):
+            return best
+        assert best.quality is not None
+        draft = found = self.trials.make(best.part, best.coding, best.quality, quick=True)
+        for step in _BESIDE:
             trial = self.trials.make(best.part, best.coding, bounded(best.quality + step), quick=True)
             if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
                 found = trial
-        return found
+        if found is draft:
+            return best
+        packed = self.trials.make(found.part, found.coding, found.quality, quick=False)
+        return packed if self.goal.is_met(packed) else best
 
     def cost(self, trial: Trial) -> float:
         """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""
