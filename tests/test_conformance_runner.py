@@ -1,7 +1,6 @@
 """The runner against decoders that behave, and against some that do not."""
 
 import json
-import shutil
 import sys
 import xml.etree.ElementTree as ET  # what is parsed is our own
 from pathlib import Path
@@ -17,7 +16,6 @@ from csplat_tools.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
-JS_ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
 
 # Our decoder by the protocol, with a fault to order.
 FAULTY = """
@@ -84,16 +82,6 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets():
     assert [] == report.failures
     assert {"L1", "L2", "L3"} == set(report.levels())
     assert {"valid", "invalid"} <= {outcome.name.split("/")[0] for outcome in report.outcomes}
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
-@pytest.mark.skipif(not JS_ADAPTER.exists(), reason="only a checkout has the JavaScript decoder's tests")
-def test_the_javascript_decoder_passes_by_the_protocol():
-    choice = Choice(pattern="*/*ra[wtn]*", exact=True, profile="base")
-    report = run_command(f"node {JS_ADAPTER} {{input}} {{outdir}}", choice)
-
-    assert [] == report.failures
-    assert report.levels()["L3"]["checks"] > 2
 
 
 VALID_FAULTS = {

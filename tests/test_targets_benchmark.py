@@ -88,7 +88,9 @@ def known(now):
 def test_tables_state_bytes_psnr_and_seconds_of_both_builds_and_their_means():
     now = {"38 dB, every splat": row(2000, 38.0, seconds=4.0), "42 dB, every splat": row(8000, 42.0)}
     lines = [" ".join(line.split()) for line in tables(known(now), markdown=False).splitlines()]
-    assert "plane3 38 dB, every splat 4.0 2.0 0.500 38.00 38.00 1.0 4.0" in lines
+    assert "scene 38 42" in lines
+    assert "plane3 4.0 → 2.0 at 38.00, 0.500 8.0 → 8.0 at 42.00, 1.000" in lines
+    assert "plane3 1 → 4 1 → 1" in lines
     assert "dB, every splat 2 0.707 1.0 2.0 2.00" in lines
     assert "all targets 2 0.707 1.0 2.0 2.00" in lines
     assert "None of 4 results of searches is beaten by another file of its scene and build." in lines
@@ -97,7 +99,7 @@ def test_tables_state_bytes_psnr_and_seconds_of_both_builds_and_their_means():
 def test_tables_mark_what_no_two_files_say():
     now = {"38 dB, every splat": row(4000, 39.0)}
     text = tables(known(now), markdown=True)
-    assert "| 4.0 | 4.0 | ≈ 0.956 |" in text
+    assert "| 4.0 → 4.0 at 39.00, ≈ 0.956 |" in text
     assert "≈ by 4.5 % of the bytes per dB" in text
 
 
@@ -112,7 +114,7 @@ def test_tables_state_what_is_beaten_and_what_was_not_made():
     assert "| plane3 | now | 34 dB, every splat | 2.0 | 38.00 | fast | 1.0 | 39.00 |" in text
     assert "| small |" not in text.split("| beaten |")[1]  # a preset looks at no picture
     assert "| plane3 | now | 38 dB, every splat | out of reach |" in text
-    assert "| plane3 | 38 dB, every splat | 4.0 | - | - | 38.00 | - | 1.0 | - |" in text
+    assert "| plane3 | - → 2.0 at 38.00 | 4.0 → - | 8.0 → - |" in text
     assert not tables({}, markdown=True)
 
 

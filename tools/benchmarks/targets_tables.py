@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ def tables(known: Known, *, markdown: bool) -> str:
         known: by scene, what `targets.py` keeps of it.
         markdown: as a guide has it.
     """
-    every = (_targets_table, _means_table, _dominated_table, _failed_table)
+    every = (_bytes_tables, _seconds_tables, _means_table, _dominated_table, _failed_table)
     return "\n\n".join(part for part in (table(known, markdown=markdown) for table in every) if part)
 
 
@@ -95,22 +95,56 @@ def dominated(rows: Rows) -> dict[str, str]:
     return found
 
 
-def _targets_table(known: Known, *, markdown: bool) -> str:
-    lines = []
-    for scene, one in known.items():
-        before, now = (_rows(one, build) for build in _BUILDS)
-        for name in dict.fromkeys([*before, *now]):
-            pair, ratio = (before.get(name, {}), now.get(name, {})), at_equal_psnr(before, now, name)
-            sizes = [f"{row['bytes'] / 1e3:.1f}" if "bytes" in row else "-" for row in pair]
-            psnrs = [f"{row['psnr']:.2f}" if "psnr" in row else "-" for row in pair]
-            seconds = [f"{row['seconds']:.1f}" if "seconds" in row else "-" for row in pair]
-            share = "-" if ratio is None else f"{_GUESSED * ratio.guessed}{ratio.value:.3f}"
-            lines.append((scene, name, *sizes, share, *psnrs, *seconds))
-    header = ("scene", "file", "kB before", "now", "of it, same dB", "dB before", "now", "s before", "now")
-    table = laid_out(header, lines, markdown=markdown)
-    if any(line[4].startswith(_GUESSED) for line in lines):
-        table += f"\n\n{_GUESSED}by {100.0 * _BYTES_PER_DB:g} % of the bytes per dB: files of now lie on one side only."
-    return table
+def _bytes_tables(known: Known, *, markdown: bool) -> str:
+    """Of each kind of target a table of bytes, PSNRs and ratios, scenes by numbers."""
+
+    def cell(before: Rows, now: Rows, name: str) -> str:
+        sizes = " → ".join(_said(rows, name, lambda row: f"{row['bytes'] / 1e3:.1f}") for rows in (before, now))
+        ratio = at_equal_psnr(before, now, name)
+        share = "" if ratio is None else f", {_GUESSED * ratio.guessed}{ratio.value:.3f}"
+        return sizes + _said(now, name, lambda row: f" at {row['psnr']:.2f}", none="") + share
+
+    title = "kB before → now at dB now, and the share of the bytes before at the same dB"
+    text = _by_kind(known, title, cell, markdown=markdown)
+    if _GUESSED in text:
+        text += f"\n\n{_GUESSED}by {100.0 * _BYTES_PER_DB:g} % of the bytes per dB: files of now lie on one side only."
+    return text
+
+
+def _seconds_tables(known: Known, *, markdown: bool) -> str:
+    """The same of seconds."""
+
+    def cell(before: Rows, now: Rows, name: str) -> str:
+        return " → ".join(_said(rows, name, lambda row: f"{row['seconds']:.0f}") for rows in (before, now))
+
+    return _by_kind(known, "seconds before → now", cell, markdown=markdown)
+
+
+def _by_kind(known: Known, title: str, cell: Callable[[Rows, Rows, str], str], *, markdown: bool) -> str:
+    """A table for each kind of row that has a number, with a line for each scene."""
+    builds = {scene: tuple(_rows(one, build) for build in _BUILDS) for scene, one in known.items()}
+    names = dict.fromkeys(name for pair in builds.values() for rows in pair for name in rows)
+    texts = []
+    for kind in dict.fromkeys(kind_of(name) for name in names if kind_of(name) != name):
+        columns = sorted((name for name in names if kind_of(name) == kind), key=_number)
+        lines = [
+            (scene, *(cell(*pair, name) for name in columns))
+            for scene, pair in builds.items()
+            if any(name in rows for name in columns for rows in pair)
+        ]
+        header = ("scene", *(f"{_number(name):g}" for name in columns))
+        texts.append(f"{kind}: {title}\n\n{laid_out(header, lines, markdown=markdown)}")
+    return "\n\n".join(texts)
+
+
+def _number(name: str) -> float:
+    return next(float(word) for word in name.split() if word.replace(".", "", 1).isdigit())
+
+
+def _said(rows: Rows, name: str, say: Callable[[Mapping[str, Any]], str], *, none: str = "-") -> str:
+    """What is to be said of a file; `none` where there is none."""
+    row = dict(_files(rows)).get(name)
+    return none if row is None else say(row)
 
 
 def _means_table(known: Known, *, markdown: bool) -> str:
