@@ -147,9 +147,10 @@ class Moves:
         best = self.solver.goal.best(found)
         if best is None:
             return True
-        # Of the splats that a file holds another coding was expected to be better, until that file said what it costs.
-        known = any(one.part is trial.part for one in found)
-        return self.solver.cost(trial) < self.solver.cost(best) + (-_PAYS if known else _PAYS)
+        if any(one.part is trial.part for one in found):
+            # Another coding was expected to be better, until its file said what it costs. Fits are too dear to ask.
+            return not trial.part.refits and self.solver.cost(trial) < self.solver.cost(best) - _PAYS
+        return self.solver.cost(trial) < self.solver.cost(best) + _PAYS
 
     def _presets(self, tried: Sequence[Trial]) -> None:
         """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""
