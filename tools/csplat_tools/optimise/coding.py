@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ _SHARE_STEP = 4.0
 _SHARES = (1 / 4096, 1 / 8)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
+_NONE_DROPPED = 1.0  # the same without any: a file of no SH is the quickest to try
 _FIRST_TRIES, _TRIES = 4, 2  # files that bring a coding near the goal, at most
 _CLOSER = 3  # files that bring what seems best nearer still
 _GRADED = 1.0  # dB that grades are worth, about
@@ -105,19 +105,23 @@ class Codings:
         fixed = self.encoding.sh_degree
         return self.source.sh_degree if fixed is None else min(fixed, self.source.sh_degree)
 
-    def _degrees(self, solver: Solver) -> Iterator[int]:
+    def _degrees(self, solver: Solver) -> list[int]:
         """The fewest bands that hide what is missing from the goal, by what the scene itself shows without others."""
         wanted = solver.goal.psnr
         if wanted is None:
             wanted = max((trial.decided_psnr for trial in solver.trials.made), default=0.0)
-        for degree in range(self._degree):
+        found: set[int] = set()
+        for degree in reversed(range(self._degree)):
             if degree not in self._truncated:
                 self._truncated[degree] = solver.trials.decider.psnr(without_bands(self.source, degree))
             shown = self._truncated[degree]
-            if shown >= wanted + _DROPPED or (degree == 0 and shown > wanted + 1.0):
-                yield degree
+            if shown <= wanted + _NONE_DROPPED:
+                break  # fewer bands show less
             if shown >= wanted + _DROPPED:
-                break
+                found = {degree}
+            elif degree == 0:
+                found.add(degree)
+        return sorted(found)
 
 
 @dataclass(eq=False)
