@@ -105,6 +105,11 @@ class Fitted:
             banded, stays = self._left_out(error)
         return banded, stays
 
+    @cached_property
+    def psnr(self) -> float:
+        """Of what is quantised by the views that decide, dB."""
+        return self.seen(self.banded[0])
+
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
         """Quantise the geometry, fit colours to that, code all of it; quick is without the fit."""
         session, (start, stays) = self.session, self.banded

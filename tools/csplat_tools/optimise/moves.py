@@ -103,8 +103,7 @@ class Moves:
             if left > (1.0 - _ALL_BUT) * splats:
                 break
             part = removal.fitted(left, allowed, seen)
-            fitted_psnr, banded_psnr = part.fitted_psnr, seen(part.banded[0])
-            quality = start if goal.psnr is None else _finer(start, goal.psnr, banded_psnr)
+            quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality)
             trial, before = tries[0], left
             found += tries
@@ -116,10 +115,10 @@ class Moves:
                 continue
             if goal.psnr is not None:
                 # What bands that are left out cost is no matter of how many splats there are.
-                wanted = _without(solver.level(part), error_of_psnr(banded_psnr) - error_of_psnr(fitted_psnr))
-                left = removal.next_at_psnr(len(part.rows), fitted_psnr, wanted, slope)
+                wanted = _without(solver.level(part), error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
+                left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
-                left = removal.next_at_size(len(part.rows), fitted_psnr, trial.decided_psnr, slope)
+                left = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
             if abs(left - before) <= _SAME * before or min(found, key=solver.cost).part is not part:
                 break
         return found

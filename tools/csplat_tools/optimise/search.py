@@ -35,6 +35,7 @@ def meet(
     bounds: tuple[float, float],
     tries: int,
     known: Sequence[tuple[float, float]] = (),
+    flattest: float = _FLATTEST,
 ) -> list[tuple[float, float]]:
     """Try places until a value that grows with them lies in a window.
 
@@ -46,6 +47,7 @@ def meet(
         bounds: the least and the largest place.
         tries: how many at most.
         known: places and values from before; where there are some, `start` says nothing.
+        flattest: how much less steep than `slope` two trials may say that the value is.
 
     Returns:
         Places and values in the order in which they were tried, those known first; the last one lies in the window
@@ -55,7 +57,11 @@ def meet(
     if points and window.low <= points[-1][1] <= window.high:
         return points
     for _ in range(tries):
-        place = _next(points, window, slope, bounds) if points else min(max(start, bounds[0]), bounds[1])
+        place = (
+            _next(points, window, (slope, flattest * slope), bounds)
+            if points
+            else min(max(start, bounds[0]), bounds[1])
+        )
         if place is None:
             break
         value = measure(place)
@@ -65,8 +71,11 @@ def meet(
     return points
 
 
-def _next(points: list[tuple[float, float]], window: Window, slope: float, bounds: tuple[float, float]) -> float | None:
-    """Where to try next; None where a bound was tried, or values grow no more."""
+def _next(
+    points: list[tuple[float, float]], window: Window, slopes: tuple[float, float], bounds: tuple[float, float]
+) -> float | None:
+    """Where to try next, by the least and the expected slope; None where a bound was tried, or values grow no more."""
+    least, slope = slopes
     below = max((point for point in points if point[1] < window.low), default=None)
     above = min((point for point in points if point[1] > window.high), default=None)
     if below is not None and above is not None and above[0] > below[0]:
@@ -78,7 +87,7 @@ def _next(points: list[tuple[float, float]], window: Window, slope: float, bound
         seen = (value - points[-2][1]) / (place - points[-2][0])
         if value < window.low and all(_stalled(points[: len(points) - back], slope, bounds) for back in (0, 1)):
             return None  # it grows no more
-        slope = min(max(seen, _FLATTEST * slope), _STEEPEST * slope)
+        slope = min(max(seen, least), _STEEPEST * slope)
     wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])
     return None if any(wanted == tried for tried, _ in points) else wanted
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from csplat_tools.optimise.exchange import BYTES_PER_DB
+from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_of_psnr
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
@@ -18,16 +18,17 @@ _QUALITIES = (24.0, 110.0)  # dB, between which the PSNR that each attribute kee
 _NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: what says well enough what a file on it would cost
 _CLOSE = Window(-0.35, 0.4, 0.05)  # what is taken for the best
 _ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from one precision to the next
-_ON_REFITTED = Window(0.0, 0.2, 0.08)  # each try takes pictures
+_ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same of what quantisation does; each try takes pictures
 _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
 _MENDED = 0.5  # dB that a fit to quantised geometry mends, about
-_FEW, _SOME, _MANY = 3, 4, 6  # tries
+_FEW, _SOME, _MANY = 3, 5, 6  # tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
 _ROUGH = 16  # levels of opacity: with fewer, files jump from one precision to the next
 _BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was found, where files jump
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
 _PLATEAU = 1.5  # dB below the goal
+_EVEN = 0.5  # of the slope that is expected: what quantisation does is hardly less steep
 _GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
 
 
@@ -115,7 +116,7 @@ class Solver:
             self._approach(part, coding, start, _WITHIN, _MANY, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         if part.refits:
-            start = known.quality - self.about(known) - _MENDED
+            start = known.quality - _quantised(known, self.about(known) + _MENDED)
             self._approach(part, coding, start, _ON_REFITTED, _SOME, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         self._approach(part, coding, known.quality, _ON, _MANY, self.goal.above)
@@ -192,18 +193,34 @@ class Solver:
         *,
         careful: bool = False,
     ) -> None:
+        fewer = part.refits and self.goal.size_bytes is None
+
+        def measured(trial: Trial) -> float:
+            return _quantised(trial, above(trial)) if fewer else above(trial)
+
         def measure(quality: float) -> float:
-            return above(self.trials.make(part, coding, quality, quick=not careful))
+            return measured(self.trials.make(part, coding, quality, quick=not careful))
 
         made = self.trials.of(part, coding, careful=careful)
         if part.refits and not careful:
             made = [trial for trial in made if not trial.is_careful]
-        known = [(one.quality, above(one)) for one in made if one.quality is not None]
+        known = [(one.quality, measured(one)) for one in made if one.quality is not None]
         slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
-        meet(measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known)
+        more = {"flattest": _EVEN} if fewer else {}
+        meet(measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known, **more)
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
         return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))
+
+
+def _quantised(trial: Trial, above: float) -> float:
+    """By how many dB what quantisation does to some splats is better than a goal that their file is `above`.
+
+    What was removed errs at any precision; only the rest grows evenly with it, and bytes with that.
+    """
+    total, goal = error_of_psnr(trial.decided_psnr), error_of_psnr(trial.decided_psnr - above)
+    removed = min(error_of_psnr(trial.part.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
+    return 10.0 * math.log10((goal - removed) / (total - removed))
 
 
 def _jumps(trials: Sequence[Trial]) -> bool:

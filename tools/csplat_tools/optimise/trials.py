@@ -69,6 +69,11 @@ class Part(Protocol):
         ...
 
     @property
+    def psnr(self) -> float:
+        """Of these by the views that decide, dB; infinite where they are the source's."""
+        ...
+
+    @property
     def refits(self) -> bool:
         """Whether colours are fitted to the quantised geometry of a file: then it takes pictures to make."""
         ...
@@ -101,6 +106,7 @@ class Whole:
     importance: Weights | None
     measured: Importance | None
     progress: Progress | None
+    psnr: float = math.inf
     refits: bool = False
     gradable: bool = True
 
