@@ -57,11 +57,9 @@ def meet(
     if points and window.low <= points[-1][1] <= window.high:
         return points
     for _ in range(tries):
-        place = (
-            _next(points, window, (slope, flattest * slope), bounds)
-            if points
-            else min(max(start, bounds[0]), bounds[1])
-        )
+        place: float | None = min(max(start, bounds[0]), bounds[1])
+        if points:
+            place = _next(points, window, slope, flattest * slope, bounds)
         if place is None:
             break
         value = measure(place)
@@ -72,10 +70,9 @@ def meet(
 
 
 def _next(
-    points: list[tuple[float, float]], window: Window, slopes: tuple[float, float], bounds: tuple[float, float]
+    points: list[tuple[float, float]], window: Window, slope: float, least: float, bounds: tuple[float, float]
 ) -> float | None:
-    """Where to try next, by the least and the expected slope; None where a bound was tried, or values grow no more."""
-    least, slope = slopes
+    """Where to try next, by a slope that is expected and the least; None where a bound was tried, or nothing grows."""
     below = max((point for point in points if point[1] < window.low), default=None)
     above = min((point for point in points if point[1] > window.high), default=None)
     if below is not None and above is not None and above[0] > below[0]:
