@@ -195,6 +195,7 @@ def test_a_long_search_says_beforehand_how_long_it_takes(tmp_path, ply, monkeypa
     monkeypatch.setattr("csplat_tools.optimise.optimiser.expected_seconds", lambda *_, **__: 120.0)
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--preset", "fast", "--force")
     assert told in run(*words).stderr
+    assert told not in run(*words, "--quiet").stderr
     monkeypatch.setattr("csplat_tools.optimise.optimiser.expected_seconds", lambda *_, **__: 5.0)
     assert "this takes" not in run(*words).stderr
 
