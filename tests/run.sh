@@ -37,8 +37,10 @@ main() {
 
 step() {
     printf '\n== %s\n' "$1"
+    local began=$SECONDS
     shift
     "$@"
+    printf -- '-- %d s\n' $((SECONDS - began))
 }
 
 # have PROGRAM WHAT: false, with one loud line, where WHAT must be skipped; a failure where CI=true.

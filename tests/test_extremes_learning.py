@@ -31,10 +31,10 @@ from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.optimise import target as optimising
 from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.proof import prove
-from csplat_tools.simplify import Target, simplify
+from csplat_tools.simplify import simplify
+from csplat_tools.target import Target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
 from csplat_trainer.finetune import finetune, renders_of, split_views
@@ -75,7 +75,7 @@ def test_half_the_splats_keep_what_the_guide_says(name):
 def test_a_simplified_file_states_what_holds(name):
     source = learnt_from(name)
     views, options = find_view_set(source, count=10, size=(60, 45)), replace(FEW, adjust=False)
-    result = optimise(source, optimising.Target(keep=0.5), views, simplifying=options).result
+    result = optimise(source, Target(keep=0.5), views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     proof = prove(source, decoded, read_header(result.data), read_stated_errors(result.data), result.source_index)

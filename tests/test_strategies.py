@@ -337,7 +337,7 @@ def test_impossible_reductions_are_refused(make_model):
 
 def reducing(**words):
     nothing = dict.fromkeys(("prune_opacity", "kmeans", "residual_stages", "sh_degree", "threads"))
-    looking = Looking(words.pop("cameras", None), None, None, 160)
+    looking = Looking(words.pop("cameras", None), None, None, 40)
     return Reducing(**{**nothing, "distil_sh": False, "looking": looking, "seed": 0, **words})
 
 

@@ -31,9 +31,10 @@ model = SplatModel(**arrays)
 _SIMPLIFY = """
 from csplat_tools.extras import prepare_renderer
 prepare_renderer(quiet=True, simplify=True)
-from csplat_tools.simplify import SimplifyOptions, Target, simplify
+from csplat_tools.simplify import SimplifyOptions, simplify
+from csplat_tools.target import Target
 before = compiled()
-simplify(model, None, target=Target(0.5), options=SimplifyOptions(views=2, view_size=(32, 24)))
+simplify(model, None, target=Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24)))
 """
 _COMPARE = """
 warm_up(gradients=False, ssim=True, lpips=True)

@@ -44,7 +44,7 @@ from csplat_tools.extras import need_renderer
 from csplat_tools.importances import measured_importance
 from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.optimise.sensitivity import measuring_views
-from csplat_tools.optimise.target import Target
+from csplat_tools.target import Target
 from csplat_tools.views import BLACK, find_view_set
 
 __all__ = ["main"]

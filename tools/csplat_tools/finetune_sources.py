@@ -135,7 +135,8 @@ def _simplified(
     model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
 ) -> tuple[SplatModel, I64]:
     """A share of the splats, their colours fitted, and which they are."""
-    from csplat_tools.simplify import SimplifyOptions, Target, simplify
+    from csplat_tools.simplify import SimplifyOptions, simplify
+    from csplat_tools.target import Target
 
     if keep >= 1.0:
         return model, np.arange(len(model))

@@ -15,8 +15,8 @@ from csplat_tools.console import format_bytes, note
 from csplat_tools.convert import Encoder, Made, Report
 from csplat_tools.extras import prepare_renderer
 from csplat_tools.importances import read_importance, weights_of
-from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes
 from csplat_tools.parsing import parse_decibels
+from csplat_tools.target import Target, parse_max_error, parse_size_bytes
 
 if TYPE_CHECKING:
     from csplat_tools.views import DataOptions, ViewSet

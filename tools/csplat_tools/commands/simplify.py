@@ -123,12 +123,14 @@ def simplify(
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
     prepare_renderer(quiet=quiet, simplify=True)
-    from csplat_tools.simplify import SimplifyOptions, Target
+    from csplat_tools.simplify import SimplifyOptions
     from csplat_tools.simplify import simplify as simplified
+    from csplat_tools.target import Target
 
     colour = None if background is None else parse_colour(background)
     try:
-        target = Target(keep, target_psnr, None if max_loss is None else parse_decibels(max_loss))
+        loss = None if max_loss is None else parse_decibels(max_loss)
+        target = Target(target_psnr, None, loss, keep)
         options = SimplifyOptions(
             method=method,
             rounds=rounds,

@@ -14,7 +14,7 @@ from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.optimise.report import Optimised, Report
-from csplat_tools.optimise.target import Target
+from csplat_tools.target import Target
 
 __all__ = ["Bounded", "encode_within", "meet_bounds"]
 

@@ -72,7 +72,7 @@ class Moves:
                 on = self._of_more(trial) if on is None else on
                 found += [] if on is None else [on]
         if found:
-            self.solver.beside(min(found, key=lambda trial: trial.size_bytes))
+            self.solver.try_beside(min(found, key=lambda trial: trial.size_bytes))
         self._presets(tried)
         best = self.solver.goal.best([trial for trial in self.solver.trials.made if self._may_be_written(trial)])
         if best is None:

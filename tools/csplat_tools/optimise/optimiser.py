@@ -31,9 +31,9 @@ from csplat_tools.optimise.report import Optimised
 from csplat_tools.optimise.reporting import reported
 from csplat_tools.optimise.sensitivity import measured_for
 from csplat_tools.optimise.solving import Solver
-from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, Whole
 from csplat_tools.simplify.options import SimplifyOptions
+from csplat_tools.target import Target
 from csplat_tools.views import VIRTUAL, ViewSet, with_deciders
 
 __all__ = ["expected_seconds", "optimise"]

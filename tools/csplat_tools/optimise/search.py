@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Window", "meet"]
+__all__ = ["FLATTEST", "Window", "meet"]
 
-_STEEPEST, _FLATTEST = 4.0, 0.15  # of the slope that is expected; what two trials say may be noise
+#: Of the slope that is expected, the least that two trials are believed: what they say may be noise.
+FLATTEST = 0.15
+
+_STEEPEST = 4.0  # the most
 _STALLED = 0.03  # of the bounds; over a shorter way values that do not grow may be noise
 _INSIDE = 0.08  # of a bracket: a trial never lies nearer to its ends
 
@@ -35,7 +38,7 @@ def meet(
     bounds: tuple[float, float],
     tries: int,
     known: Sequence[tuple[float, float]] = (),
-    flattest: float = _FLATTEST,
+    flattest: float = FLATTEST,
 ) -> list[tuple[float, float]]:
     """Try places until a value that grows with them lies in a window.
 
@@ -95,4 +98,4 @@ def _stalled(points: list[tuple[float, float]], slope: float, bounds: tuple[floa
         return False
     (before, low), (place, high) = points[-2:]
     far = place - before >= _STALLED * (bounds[1] - bounds[0])
-    return far and high - low < _FLATTEST * slope * (place - before)
+    return far and high - low < FLATTEST * slope * (place - before)

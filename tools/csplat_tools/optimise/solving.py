@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_of_psnr
-from csplat_tools.optimise.search import Window, meet
+from csplat_tools.optimise.search import FLATTEST, Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
 __all__ = ["Goal", "Solver", "bounded"]
@@ -126,21 +126,20 @@ class Solver:
         packed = self.trials.make(part, coding, best.quality, quick=False)
         return packed if self.goal.is_met(packed) else None
 
-    def beside(self, best: Trial) -> Trial:
-        """A smaller file on the goal of precisions beside that of one that is there, where files jump; or that one."""
+    def try_beside(self, best: Trial) -> None:
+        """Where files jump, try precisions beside that of a file on the goal, and pack the smallest that is on it."""
         made, levels = self.trials.of(best.part, best.coding), best.result.report.options["opacity_levels"]
         if self.goal.size_bytes is not None or best.part.refits or not (levels < _ROUGH or _jumps(made)):
-            return best
+            return
         assert best.quality is not None
         draft = found = self.trials.make(best.part, best.coding, best.quality, quick=True)
         for step in _BESIDE:
             trial = self.trials.make(best.part, best.coding, bounded(best.quality + step), quick=True)
             if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
                 found = trial
-        if found is draft:
-            return best
-        packed = self.trials.make(found.part, found.coding, found.quality, quick=False)
-        return packed if self.goal.is_met(packed) else best
+        if found is not draft:
+            packed = self.trials.make(found.part, found.coding, found.quality, quick=False)
+            _ = packed.psnr  # only what was judged may be written
 
     def cost(self, trial: Trial) -> float:
         """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""
@@ -206,8 +205,10 @@ class Solver:
             made = [trial for trial in made if not trial.is_careful]
         known = [(one.quality, measured(one)) for one in made if one.quality is not None]
         slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
-        more = {"flattest": _EVEN} if fewer else {}
-        meet(measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known, **more)
+        flattest = _EVEN if fewer else FLATTEST
+        meet(
+            measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known, flattest=flattest
+        )  # fmt: skip
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
         return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))

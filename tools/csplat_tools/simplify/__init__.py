@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from csplat_tools.simplify.core import Simplified, simplify
-from csplat_tools.simplify.options import METHODS, SimplifyOptions, Target
+from csplat_tools.simplify.options import METHODS, SimplifyOptions
 
 __all__ = [
     "METHODS",
     "Simplified",
     "SimplifyOptions",
-    "Target",
     "simplify",
 ]

@@ -19,9 +19,10 @@ from csplat_render.metrics import PSNR_CAP
 from csplat_render.removal import Removal
 from csplat_render.virtual import scene_frame
 from csplat_tools.simplify.colours import Fitted, fit
-from csplat_tools.simplify.options import SimplifyOptions, Target
+from csplat_tools.simplify.options import SimplifyOptions
 from csplat_tools.simplify.order import Order, removal_order
 from csplat_tools.simplify.views import Measured, find_views
+from csplat_tools.target import Target
 from csplat_tools.views import ViewSet, find_view_set
 
 __all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "simplify"]
@@ -151,7 +152,7 @@ def simplify(
         source: the scene.
         views: what stays is fitted in those that teach; those that decide say how much may go. None for virtual ones,
             as many as it takes.
-        target: how many splats stay, or how good the result is to be.
+        target: a share of the splats, a PSNR or a loss against photographs.
         options: how to go about it.
         progress: is told the stages.
 
@@ -164,9 +165,11 @@ def simplify(
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
+    if target.size_bytes is not None or target.max_error:
+        raise InputError("sizes and largest errors are of files: wanted a share of the splats, a PSNR or a loss")
     if target.max_loss is not None and (views is None or not views.photographs):
         raise InputError("a loss against photographs wants photographs: name a data set")
-    left = None if target.keep is None else target.count(len(source))
+    left = None if target.keep is None else max(1, round(target.keep * len(source)))
     session = prepare(source, views, left, options, progress)
     start = time.perf_counter()
     if left is not None:
@@ -283,7 +286,7 @@ def _report(session: Session, result: Simplified, target: Target) -> dict[str, A
     if result.stays is not None:
         bands = {str(band + 1): int(np.count_nonzero(~result.stays[:, band])) for band in range(result.stays.shape[1])}
     return {
-        "target": {name: value for name, value in vars(target).items() if value is not None},
+        "target": target.as_json(),
         "method": options.method,
         "splats_before": len(source),
         "splats": len(result.model),

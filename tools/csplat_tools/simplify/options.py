@@ -1,51 +1,16 @@
-"""What is asked of a simplification, and how it goes about it."""
+"""How a simplification goes about it."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from csplat.errors import InputError
 from csplat_tools.views import VIEW_SIZE
 
-__all__ = ["METHODS", "SimplifyOptions", "Target"]
+__all__ = ["METHODS", "SimplifyOptions"]
 
 #: By what splats are chosen: exact errors measured anew after each round; once; and two that look at no picture.
 METHODS = ("rounds", "exact", "opacity", "opacity-area")
-
-
-@dataclass(frozen=True)
-class Target:
-    """When to stop; exactly one is given.
-
-    Attributes:
-        keep: share of the splats that stay, above 0, at most 1.
-        psnr: dB of the result against the source's renders, in the views that decide.
-        max_loss: dB that PSNR against photographs may fall, in the views that decide.
-
-    Raises:
-        InputError: none or several are given, or one is out of range.
-    """
-
-    keep: float | None = None
-    psnr: float | None = None
-    max_loss: float | None = None
-
-    def __post_init__(self) -> None:
-        given = [name for name in ("keep", "psnr", "max_loss") if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise InputError(f"{len(given)} targets, wanted one of keep, psnr and max_loss")
-        if self.keep is not None and not 0.0 < self.keep <= 1.0:
-            raise InputError(f"keep is {self.keep:g}, wanted a share above 0, at most 1")
-        if self.psnr is not None and not 0.0 < self.psnr <= 99.0:
-            raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most 99")
-        if self.max_loss is not None and not (math.isfinite(self.max_loss) and self.max_loss > 0.0):
-            raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted above 0")
-
-    def count(self, splats: int) -> int:
-        """How many of so many splats stay, one at least; for `keep`."""
-        assert self.keep is not None
-        return max(1, round(self.keep * splats))
 
 
 @dataclass(frozen=True)

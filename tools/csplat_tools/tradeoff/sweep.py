@@ -126,7 +126,7 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Re
 
 def _reach(setting: Setting, wanted: Wanted, progress: Report, **asked: Any) -> Made:
     from csplat_tools.optimise.optimiser import optimise
-    from csplat_tools.optimise.target import Target
+    from csplat_tools.target import Target
 
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
     found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)
