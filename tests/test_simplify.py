@@ -312,13 +312,13 @@ def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
-    words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--no-refit", "--views", 40, "--json")
-    result = invoke(*words, "--cameras", cameras)
+    words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--no-refit", "--cameras", cameras)
+    result = invoke(*words, "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     assert report["decided_psnr"] >= 30.0
     assert {"cameras": "cameras.json", "views": 10} == report["judged_by"]
-    assert report["views"]["used"] >= 25  # so few cameras judge alone; virtual ones teach, but those that are the same
+    assert report["views"]["used"] >= 150  # so few cameras judge alone; virtual ones teach, but those that are the same
 
 
 def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path):

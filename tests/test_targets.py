@@ -83,6 +83,9 @@ def test_other_bounds_are_refused(text, message):
         ({"psnr": float("nan")}, "above 0"),
         ({"max_loss": 0.0}, "above 0"),
         ({"keep": 1.5}, "at most 1"),
+        ({"keep": 0.0}, "above 0"),
+        ({"psnr": -1.0}, "above 0"),
+        ({"keep": 0.5, "psnr": 40.0}, "one of them"),
     ],
 )
 def test_a_target_is_one_thing_within_its_range(asked, message):

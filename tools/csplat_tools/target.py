@@ -69,6 +69,11 @@ class Target:
         """Whether pictures have to be rendered to meet it."""
         return any(getattr(self, name) is not None for name in _ASKED)
 
+    def count(self, splats: int) -> int:
+        """How many of so many splats stay, one at least; for `keep`."""
+        assert self.keep is not None
+        return max(1, round(self.keep * splats))
+
     def as_json(self) -> dict[str, Any]:
         """What is asked, by name."""
         said = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}

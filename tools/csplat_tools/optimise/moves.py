@@ -48,9 +48,9 @@ class Moves:
     removal: Removal | None
 
     @staticmethod
-    def kept(trials: Trials, removal: Removal, keep: float) -> Trial:
-        """The file of a share of the splats, at the precision that the options say."""
-        part = removal.fitted(max(1, round(keep * len(removal.source))), None, trials.decider.psnr)
+    def kept(trials: Trials, removal: Removal, left: int) -> Trial:
+        """The file of so many splats, at the precision that the options say."""
+        part = removal.fitted(left, None, trials.decider.psnr)
         return trials.make(part, Coding(None), None, quick=False)
 
     def best(self) -> Trial:

@@ -97,7 +97,7 @@ def optimise(
     decider = views.decider(source, threads=encoding.threads)
     trials, sensitivity_views = Trials(encoding, judge, decider, photographs), 0
     if target.keep is not None and removal is not None:
-        found = Moves.kept(trials, removal, target.keep)
+        found = Moves.kept(trials, removal, target.count(len(source)))
     else:
         goal = goal_of(target, source, photographs)
         measured, sensitivity_views = measured_for(

@@ -205,9 +205,9 @@ class Solver:
             made = [trial for trial in made if not trial.is_careful]
         known = [(one.quality, measured(one)) for one in made if one.quality is not None]
         slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
-        flattest = _EVEN if fewer else FLATTEST
         meet(
-            measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known, flattest=flattest
+            measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known,
+            flattest=_EVEN if fewer else FLATTEST,
         )  # fmt: skip
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:

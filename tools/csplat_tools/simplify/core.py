@@ -169,7 +169,7 @@ def simplify(
         raise InputError("sizes and largest errors are of files: wanted a share of the splats, a PSNR or a loss")
     if target.max_loss is not None and (views is None or not views.photographs):
         raise InputError("a loss against photographs wants photographs: name a data set")
-    left = None if target.keep is None else max(1, round(target.keep * len(source)))
+    left = None if target.keep is None else target.count(len(source))
     session = prepare(source, views, left, options, progress)
     start = time.perf_counter()
     if left is not None:
