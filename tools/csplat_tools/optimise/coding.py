@@ -96,8 +96,8 @@ class Codings:
             if self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
                 for degree in self._degrees(solver):
                     tried.add(Coding("none", degree=0) if degree == 0 else replace(tried.best, degree=degree))
-            if self.gradable and part.gradable:
-                tried.add(replace(tried.best, graded=False, adaptive=None), finer=_GRADED)
+        if self.gradable and part.gradable:
+            tried.add(replace(tried.best, graded=False, adaptive=None), finer=_GRADED)
         return tried.ordered()
 
     @property

@@ -37,7 +37,7 @@ _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may t
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
 _BAND_STEPS = 8  # of a fit after bands were left out
 _STEPS = 4  # of a fit that begins where another one ended
-_SENSITIVITY_VIEWS = 40  # that say how precise the splats have to be
+_SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
 
 @dataclass(eq=False)
@@ -181,9 +181,9 @@ class Fitted:
     @cached_property
     def _measured(self) -> Importance:
         """How much they depend on all else, too."""
-        session = self.session
+        session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
-            self.model, evenly(session.views.used, _SENSITIVITY_VIEWS), background=session.options.background,
+            self.model, evenly(session.views.used, count), background=session.options.background,
             threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
         return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)

@@ -28,6 +28,7 @@ _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantis
 _WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
 _PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
 _FAR = 0.03  # of the bytes
+_BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
 _PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
 
 
@@ -95,7 +96,7 @@ class Moves:
     def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
         """Files near the goal of some numbers of splats, each of which says which to try next."""
         solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
-        slope, found, seen = solver.slope(whole), list[Trial](), solver.trials.decider.psnr
+        slope, found, seen = self._slope_of_counts(whole), list[Trial](), solver.trials.decider.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole)
@@ -122,6 +123,15 @@ class Moves:
             if abs(left - before) <= _SAME * before or min(found, key=solver.cost).part is not part:
                 break
         return found
+
+    def _slope_of_counts(self, whole: Trial) -> float:
+        """What a decibel costs where it decides how many splats stay.
+
+        The more of SH a file needs, the less the next splat takes beside those that matter more: it has fewer bands.
+        """
+        above = (self.solver.goal.psnr or whole.decided_psnr) - _BANDS_GROW[0]
+        has_sh = whole.coding.sh != "none"
+        return self.solver.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
 
     def _of_more(self, trial: Trial) -> Trial | None:
         """A file on the goal of more splats, where those of a trial turned out to be too few for any precision."""
