@@ -175,8 +175,7 @@ class Moves:
             if _is_asked(name, self.codings.encoding.preset) and _PRESETS[0] <= expected <= _PRESETS[1]:
                 encoding = replace(self.codings.encoding, preset=name)
                 plainly = Coding(None, graded=False)
-                made = self.solver.trials.make(self.whole, plainly, None, quick=False, encoding=encoding)
-                _ = made.psnr
+                self.solver.trials.make(self.whole, plainly, None, quick=False, encoding=encoding).let_judge()
 
     def _out_of_reach(self) -> str:
         goal, made = self.solver.goal, self.solver.trials.made

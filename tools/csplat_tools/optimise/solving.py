@@ -138,8 +138,7 @@ class Solver:
             if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
                 found = trial
         if found is not draft:
-            packed = self.trials.make(found.part, found.coding, found.quality, quick=False)
-            _ = packed.psnr  # only what was judged may be written
+            self.trials.make(found.part, found.coding, found.quality, quick=False).let_judge()
 
     def cost(self, trial: Trial) -> float:
         """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""

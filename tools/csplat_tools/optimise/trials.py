@@ -156,8 +156,12 @@ class Trial:
 
     @property
     def is_judged(self) -> bool:
-        """Whether somebody asked for it yet."""
+        """Whether the views that judge looked at it yet."""
         return "errors" in vars(self)
+
+    def let_judge(self) -> None:
+        """Have them look at it: only then may it be written for a PSNR."""
+        _ = self.errors
 
     @property
     def is_packed(self) -> bool:
