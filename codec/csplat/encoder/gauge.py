@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 __all__ = ["fix_gauge"]
 
 F32 = NDArray[np.float32]
+Columns = tuple[F32, F32, F32, F32]
 
 
 def fix_gauge(quats: F32, scales: F32) -> tuple[F32, F32]:
@@ -30,7 +31,6 @@ def fix_gauge(quats: F32, scales: F32) -> tuple[F32, F32]:
     a, b, c = (np.ascontiguousarray(scales[:, i]) for i in range(3))
     # Half turns about (x+y), (y+z), (x+y) exchange two axes and keep the rotation proper. Right products with
     # (0, 1, 1, 0) and (0, 0, 1, 1); their length, sqrt 2 each, is taken out by the last normalisation.
-    root = np.float32(np.sqrt(0.5))
     for axes in ((0, 1), (1, 2), (0, 1)):
         first, second = (a, b) if axes == (0, 1) else (b, c)
         swap = first < second
@@ -41,7 +41,7 @@ def fix_gauge(quats: F32, scales: F32) -> tuple[F32, F32]:
         else:
             b, c = high, low
             turned = (-(y + z), y - z, w - x, w + x)
-        w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, (w, x, y, z), strict=True))
+        w, x, y, z = _exchanged(swap, turned, (w, x, y, z))
     w, x, y, z = _largest_first(w, x, y, z)
     length = np.sqrt(w * w + x * x + y * y + z * z)
     np.copysign(length, w, out=length)
@@ -50,7 +50,14 @@ def fix_gauge(quats: F32, scales: F32) -> tuple[F32, F32]:
     return rotation, np.stack([a, b, c])
 
 
-def _largest_first(w: F32, x: F32, y: F32, z: F32) -> tuple[F32, F32, F32, F32]:
+def _exchanged(swap: NDArray[np.bool_], turned: Columns, kept: Columns) -> Columns:
+    """The turned rotation, at unit length, where axes are exchanged, and the one that was elsewhere."""
+    root = np.float32(np.sqrt(0.5))
+    w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
+    return w, x, y, z
+
+
+def _largest_first(w: F32, x: F32, y: F32, z: F32) -> Columns:
     """Multiply from the right by 1, i, j or k so that the component of largest magnitude becomes w."""
     aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
     x_leads = ax > np.maximum(aw, np.maximum(ay, az))
