@@ -139,6 +139,9 @@ def thread_count(threads: int | None) -> Iterator[int]:
     with LOCK:
         before = int(numba.get_num_threads())
         count = before if threads is None else min(threads, available_threads())
+        if count == before:
+            yield count
+            return
         numba.set_num_threads(count)
         try:
             yield count
