@@ -100,7 +100,7 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator) -> Clo
     offsets = _rotate(model.quats[index].astype(np.float64), rng.standard_normal((count, 3)) * s)
     # Mass over the number of points that a splat expects: chance · sums[-1] / count.
     return Cloud(
-        points=model.means[index].astype(np.float64) + offsets,
+        points=np.asfortranarray(model.means[index].astype(np.float64) + offsets),  # `_project` takes columns
         masses=chance[index] * (sums[-1] / count),
         sizes=np.sqrt(areas[index]),
     )

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -78,9 +79,13 @@ def search(
             error[part] = (norm - 2.0 * best) * 4.0**shift
 
     workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
-    with one_blas_thread(), ThreadPoolExecutor(workers) as pool:
-        jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
-        list(pool.map(work, jobs))
+    jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
+    with one_blas_thread():
+        if workers == 1:  # to start a thread takes longer than a small search
+            work(jobs[0])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(work, jobs))
     return index, error
 
 
@@ -200,6 +205,7 @@ def one_blas_thread() -> Iterator[None]:
             control[1](before)
 
 
+@cache
 def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
     core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
     beside = Path(np.__file__).parent.parent / "numpy.libs"
