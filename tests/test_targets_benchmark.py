@@ -106,13 +106,15 @@ def test_tables_mark_what_no_two_files_say():
 def test_tables_state_what_is_beaten_and_what_was_not_made():
     now = {
         "small": row(3000, 38.0),
+        "keep 0.7": row(2500, 38.0),
         "34 dB, every splat": row(2000, 38.0),
         "fast": row(1000, 39.0),
         "38 dB, every splat": {"error": "out of reach"},
     }
     text = tables(known(now), markdown=True)
     assert "| plane3 | now | 34 dB, every splat | 2.0 | 38.00 | fast | 1.0 | 39.00 |" in text
-    assert "| small |" not in text.split("| beaten |")[1]  # a preset looks at no picture
+    for chosen in ("small", "keep 0.7"):  # by whoever asked for them
+        assert f"| {chosen} |" not in text.split("| beaten |")[1]
     assert "| plane3 | now | 38 dB, every splat | out of reach |" in text
     assert "| plane3 | - → 2.0 at 38.00 | 4.0 → - | 8.0 → - |" in text
     assert not tables({}, markdown=True)

@@ -174,7 +174,8 @@ def _dominated_table(known: Known, *, markdown: bool) -> str:
     for scene, one in known.items():
         for build in one["builds"]:
             rows = _rows(one, build)
-            searched = {name for name, _ in _files(rows) if kind_of(name) != name}  # presets look at no picture
+            # Presets look at no picture, and of a share of the splats nothing is left to choose.
+            searched = {name for name, _ in _files(rows) if kind_of(name) not in (name, "keep")}
             count += len(searched)
             for name, other in dominated(rows).items():
                 if name in searched:

@@ -105,10 +105,10 @@ class Fitted:
             banded, stays = self._left_out(error)
         return banded, stays
 
-    @cached_property
+    @property
     def psnr(self) -> float:
         """Of what is quantised by the views that decide, dB."""
-        return self.seen(self.banded[0])
+        return self._banded_psnr  # a cached property of this name would not be the protocol's for pyright
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
         """Quantise the geometry, fit colours to that, code all of it; quick is without the fit."""
@@ -133,6 +133,10 @@ class Fitted:
         if trial is not None and trial.is_careful:
             figures["check_psnr"] = round(self._check_psnr, 3)
         return {"simplified": {**said, **figures}}
+
+    @cached_property
+    def _banded_psnr(self) -> float:
+        return self.seen(self.banded[0])
 
     @cached_property
     def _fitted(self) -> SplatModel:

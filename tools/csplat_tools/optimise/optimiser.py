@@ -88,7 +88,10 @@ def optimise(
     removal = None
     if not _all_stay(target, encoding, keep_all=keep_all):
         options = replace(simplifying or SimplifyOptions(), background=views.background, threads=encoding.threads)
-        removal = Removal(source, views, options, grades=not inside, progress=progress, psnr=target.psnr)
+        left = None if target.keep is None else target.count(len(source))
+        removal = Removal(
+            source, views, options, grades=not inside, progress=progress, psnr=target.psnr, left=left
+        )  # fmt: skip
     photographs = None
     if target.max_loss is not None:
         if not views.photographs:
@@ -96,8 +99,8 @@ def optimise(
         photographs = views.photograph_decider(threads=encoding.threads)
     decider = views.decider(source, threads=encoding.threads)
     trials, sensitivity_views = Trials(encoding, judge, decider, photographs), 0
-    if target.keep is not None and removal is not None:
-        found = Moves.kept(trials, removal, target.count(len(source)))
+    if removal is not None and removal.left is not None:
+        found = Moves.kept(trials, removal, removal.left)
     else:
         goal = goal_of(target, source, photographs)
         measured, sensitivity_views = measured_for(

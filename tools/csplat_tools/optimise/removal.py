@@ -46,6 +46,7 @@ class Removal:
         grades: what is left may be sorted into grades.
         progress: is told the stages.
         psnr: that is looked for, dB: far below it no order is needed; `None`: some other target is.
+        left: splats that are to stay, if that is asked: the order is made for so many.
     """
 
     source: SplatModel
@@ -54,6 +55,7 @@ class Removal:
     grades: bool
     progress: Progress | None
     psnr: float | None
+    left: int | None = None
     _session: Session | None = field(default=None, init=False)
 
     @property
@@ -61,7 +63,7 @@ class Removal:
         """What all numbers of splats share."""
         if self._session is None:
             allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
-            self._session = prepare(self.source, self.views, None, self.options, self.progress, allowed=allowed)
+            self._session = prepare(self.source, self.views, self.left, self.options, self.progress, allowed=allowed)
         return self._session
 
     @property

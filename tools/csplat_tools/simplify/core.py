@@ -32,6 +32,7 @@ I64 = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
 _TRIES = 3  # fits on the way to a target PSNR
+_AGREE_ON = 0.5  # of the splats, at least, where views have to agree: where little goes, fits want as many of them
 _BANDS_WORTH = 1.0  # dB that absent SH bands may cost; a fit that loses more has failed
 
 
@@ -119,7 +120,7 @@ def prepare(
         source, background=options.background, count=options.views, size=options.view_size, seed=options.seed
     )
     options = replace(options, background=around.background)
-    gone = 0.5 if left is None else 1.0 - left / len(source)
+    gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
     found = find_views(source, around, gone, size=options.view_size, threads=options.threads, progress=progress)
     draw = renderer(source, around.background, threads=options.threads)
     wanted = [draw(camera).rgb for camera in found.used]

@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _LEAST_SHARE = 0.05  # of the splats that stay, at the end of an order that is made to be cut anywhere
-_ROUND_SHARE = 0.75  # of what is left stays after each round of such an order
+_ROUND_SHARE = 0.85  # of what is left stays after each round of such an order: what hid a splat may have gone
 
 
 @dataclass(frozen=True)
