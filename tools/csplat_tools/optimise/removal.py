@@ -29,7 +29,8 @@ _FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated
 _MOST_REMOVED = 0.7  # of the error that a PSNR allows
 _LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
 _MENDED = 4.0  # dB that a fit makes removal err by less, about
-_FAR = 20.0  # times the error that a PSNR allows: no fit mends so much
+_FAR = 1.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
+_FARTHER = 4.0  # times the error of an order, where that was too little
 _CALIBRATIONS = 3
 _AGREED = 1.15  # times the error that was predicted
 _NOTHING = 1e-12
@@ -150,14 +151,14 @@ class Removal:
                 return int(left[best])
 
     def _goes_on(self) -> bool:
-        """Let the order go on to half of what it leaves; false where it goes no further."""
-        session, before = self.session, len(self.session.order.rows)
-        least = (len(self.source) - before) // 2
+        """Let the order go on until removal errs by several times as much; false where it goes no further."""
+        session, before = self.session, self.session.order
         order = removal_order(
-            self.source, session.views, session.options, None, self.progress, least=least, start=session.order
-        )
+            self.source, session.views, session.options, None, self.progress,
+            enough=_FARTHER * float(before.errors.sum()), start=before,
+        )  # fmt: skip
         self._session = replace(session, order=order)
-        return len(order.rows) > before
+        return len(order.rows) > len(before.rows)
 
     def _error(self, left: int) -> float:
         """Mean squared error of the removal of all but so many, as predicted."""

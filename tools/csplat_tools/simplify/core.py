@@ -16,7 +16,6 @@ from csplat.model import SplatModel
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.removal import Removal
 from csplat_render.virtual import scene_frame
 from csplat_tools.simplify.colours import Fitted, fit
 from csplat_tools.simplify.options import SimplifyOptions
@@ -127,16 +126,10 @@ def prepare(
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    order = removal_order(source, found, options, left, progress, least=_count_within(found.removal, allowed))
+    order = removal_order(source, found, options, left, progress, enough=allowed * found.removal.value_count)
     seconds["rounds"] = time.perf_counter() - start
     inside = around.virtual and scene_frame(source).kind == "surrounding"
     return Session(source, options, around, found, wanted, order, checked, seconds, inside)
-
-
-def _count_within(removal: Removal, allowed: float) -> int:
-    """Splats whose removal, all by itself, would add up to more than an error."""
-    errors = np.sort(np.where(removal.seen, removal.error, 0.0))
-    return len(errors) - int(np.searchsorted(np.cumsum(errors), allowed * removal.value_count))
 
 
 def simplify(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -66,7 +67,7 @@ def removal_order(
     left: int | None,
     progress: Callable[[str, float], None] | None = None,
     *,
-    least: int = 0,
+    enough: float = math.inf,
     start: Order | None = None,
 ) -> Order:
     """Find out in which order splats go.
@@ -77,7 +78,7 @@ def removal_order(
         options: method, rounds.
         left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.
-        least: such an order ends where so many are left.
+        enough: such an order ends with the round in which the sum of all errors exceeds this.
         start: goes on from there.
     """
     count = len(model)
@@ -92,7 +93,7 @@ def removal_order(
     if start is not None:
         gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
         rows = np.delete(rows, start.rows)
-    for target in _targets(count, options, left, least, len(rows)):
+    for target in _targets(count, options, left, len(rows)):
         if gone:
             removal = measure_removal(
                 model.select(rows), views.used, background=options.background, threads=options.threads,
@@ -107,14 +108,16 @@ def removal_order(
         errors.append(np.maximum(keys[order], 0.0))
         rounds.append(Round(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
         rows = np.delete(rows, order)
+        if left is None and sum(one.predicted for one in rounds) > enough:
+            break
     if not gone:
         return Order(np.zeros(0, np.int64), np.zeros(0), ())
     return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
 
 
-def _targets(count: int, options: SimplifyOptions, left: int | None, least: int, now: int) -> list[int]:
+def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
     """How many splats are left after each round, each time fewer."""
-    last = max(1, least, round(count * _LEAST_SHARE)) if left is None else left
+    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
     if options.method == "exact":
         targets = [last]
     elif left is not None:
