@@ -509,6 +509,22 @@ def test_a_filter_that_finds_nothing_fails():
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
 
 
+def test_a_command_imports_itself_alone():
+    code = (
+        "import sys; from csplat_tools.app import app\n"
+        "app(['info', '--help'], standalone_mode=False)\n"
+        "print(*(name for name in sys.modules if name.startswith('csplat_tools.commands.')), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "csplat_tools.commands.info\n" == done.stderr
+
+
+def test_a_misspelt_command_is_told_which_was_meant():
+    result = invoke("enocde")
+    assert 2 == result.exit_code
+    assert "'encode'" in result.stderr
+
+
 @pytest.mark.parametrize("command", ["encode", "decode", "info", "verify", "lint", "compare", "render", "conformance"])
 def test_help_gives_an_example(command):
     text = call(command, "--help")

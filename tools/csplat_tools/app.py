@@ -1,33 +1,68 @@
-"""The commands together: what `csplat` runs."""
+"""The commands together: what `csplat` runs. Each is imported when it is wanted, which is half of the time to start."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_group
 
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
-from csplat_tools.commands.compare import compare
-from csplat_tools.commands.conformance_encoder import conformance
-from csplat_tools.commands.decode import decode
-from csplat_tools.commands.encode import encode
-from csplat_tools.commands.finetune import finetune
-from csplat_tools.commands.info import info
-from csplat_tools.commands.lint import lint
-from csplat_tools.commands.render import render
-from csplat_tools.commands.sensitivity import sensitivity
-from csplat_tools.commands.simplify import simplify
-from csplat_tools.commands.tradeoff import tradeoff
-from csplat_tools.commands.train import train
-from csplat_tools.commands.verify import verify
-from csplat_tools.commands.view import export_html, view
 from csplat_tools.console import say
 
 __all__ = ["app"]
 
+#: Commands as `--help` lists them, and the modules of `csplat_tools.commands` that define them.
+_MODULES = {
+    "encode": "encode",
+    "decode": "decode",
+    "info": "info",
+    "verify": "verify",
+    "lint": "lint",
+    "compare": "compare",
+    "tradeoff": "tradeoff",
+    "render": "render",
+    "simplify": "simplify",
+    "sensitivity": "sensitivity",
+    "train": "train",
+    "finetune": "finetune",
+    "view": "view",
+    "export-html": "view",
+    "conformance": "conformance_encoder",
+}
+
+
+class _Commands(TyperGroup):
+    """Looks commands up in `_MODULES`. Owns those that were imported."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  # typer's
+        return list(_MODULES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  # typer's
+        # A name that is none is compared with all of them, to say which one may be meant.
+        for name in {cmd_name} & _MODULES.keys() or _MODULES:
+            if name not in self.commands:
+                self.commands[name] = _imported(name)
+        return self.commands.get(cmd_name)
+
+
+def _imported(name: str) -> Any:
+    """The command of a name, or the group of commands."""
+    found = getattr(import_module(f"csplat_tools.commands.{_MODULES[name]}"), name.replace("-", "_"))
+    alone = typer.Typer(rich_markup_mode="rich")
+    if isinstance(found, typer.Typer):
+        alone.add_typer(found, name=name)
+    else:
+        alone.command(name)(found)
+    return get_group(alone).commands[name]
+
+
 app = typer.Typer(
     name="csplat",
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -58,20 +93,3 @@ def root(
       csplat info scene.csplat
       csplat decode scene.csplat scene.ply
     """
-
-
-app.command()(encode)
-app.command()(decode)
-app.command()(info)
-app.command()(verify)
-app.command()(lint)
-app.command()(compare)
-app.command()(tradeoff)
-app.command()(render)
-app.command()(simplify)
-app.command()(sensitivity)
-app.command()(train)
-app.command()(finetune)
-app.command()(view)
-app.command("export-html")(export_html)
-app.add_typer(conformance, name="conformance")
