@@ -26,6 +26,7 @@ from csplat_render.virtual import scene_frame
 from csplat_tools.importances import measured_importance
 from csplat_tools.optimise import optimiser
 from csplat_tools.optimise.optimiser import expected_seconds, optimise
+from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.trials import Trials, spread_of
 from csplat_tools.proof import prove
@@ -179,6 +180,23 @@ def test_bounds_hold_beside_a_psnr_and_all_splats_stay(scene):
     assert 300 == found.report.splats
 
 
+def test_bounds_of_sh_hold_where_pictures_need_none(scene):
+    found = within(scene, psnr=18.0, max_error={"sh1": 1e-2})
+    assert 1e-2 >= found.result.report.errors["sh1"][0] == found.report.reached["sh1"]
+
+
+@pytest.mark.parametrize("measure", ["opacities", "covariance"])
+def test_bounds_that_no_number_keeps_are_refused(scene, measure):
+    with pytest.raises(InputError, match=f"no lattice keeps the error of {measure}"):
+        within(scene, max_error={measure: 1e-310}, size_bytes=10**6)
+
+
+def test_so_few_splats_are_fitted_as_are_asked_for(scene):
+    removal = Removal(scene, around(scene), SMALL, grades=False, progress=None, psnr=30.0)
+    part = removal.fitted(3, None, lambda _: 20.0)
+    assert 3 == len(part.rows)
+
+
 @pytest.mark.extremes
 @pytest.mark.parametrize("name", ["one splat", "exploded", "all transparent", "float32 limits"])
 def test_extreme_scenes_meet_a_psnr(name):
@@ -321,11 +339,13 @@ def test_no_view_that_judges_decides_or_teaches(crowded, photographed, monkeypat
     assert poses(views.judges) == judges
 
 
-def test_whoever_judges_does_not_choose_the_file_of_a_size(crowded):
-    views = around(crowded)
-    others = replace(views, judges=camera_sequence(crowded, 6, (64, 48), seed=7))
-    one, other = (within(crowded, these, size_bytes=2000) for these in (views, others))
+@pytest.mark.parametrize("kind", ["size", "loss"])
+def test_whoever_judges_does_not_choose_the_file_of_a_size_or_a_loss(crowded, photographed, kind):
+    views, goal = (around(crowded), {"size_bytes": 2000}) if kind == "size" else (photographed, {"max_loss": 1.0})
+    judges = camera_sequence(crowded, 6, (64, 48), seed=7) if kind == "size" else views.judges[::2]
+    one, other = (within(crowded, these, **goal) for these in (views, replace(views, judges=judges)))
     assert one.report.psnr != other.report.psnr
+    assert 1 == sum(trial["psnr"] is not None for trial in one.report.tried)
     for name in ("means", "opacities", "sh0", "shN"):  # a file says its own PSNR, which differs
         assert np.array_equal(*(getattr(decode(found.result.data), name) for found in (one, other))), name
 

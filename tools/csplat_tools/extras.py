@@ -56,9 +56,9 @@ def need_trainer(*, plots: bool = False) -> None:
         InputError: a package is not installed.
     """
     for module, package in _PHOTOGRAPHS:
-        _need(module, package, "train")
+        _need(module, package)
     if plots:
-        _need("matplotlib", None, "train")
+        _need("matplotlib", None)
 
 
 def need_pictures() -> None:
@@ -98,8 +98,8 @@ def _warm_up_adam() -> None:
     adam_step(Parameters.starting_at(values), values, dict.fromkeys(values, 0.0))
 
 
-def _need(module: str, package: str | None = None, extra: str = "render") -> None:
+def _need(module: str, package: str | None = None) -> None:
     try:
         import_module(module)
     except ModuleNotFoundError as error:
-        raise InputError(f"this needs {package or error.name or module}: pip install 'csplat[{extra}]'") from None
+        raise InputError(f"this needs {package or error.name or module}: pip install 'csplat[render]'") from None

@@ -18,6 +18,7 @@ _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "m
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 _NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _IN_UNITS = "means"  # the one measure that is a length
+_LOSSES = (0.001, 60.0)  # dB
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Target:
     Attributes:
         psnr: dB of its renders against the source's at least; the smallest file that reaches them is looked for.
         size_bytes: its size at most; the best picture within it is looked for.
-        max_loss: dB that its PSNR against photographs may be below the source's; the smallest such file.
+        max_loss: dB that its PSNR against photographs may be below the source's, 0.001 to 60; the smallest such file.
         keep: share of the splats that stay, above 0, at most 1, at the precision of the preset.
         max_error: by measure of the format (means in scene units, covariance relative, opacities, sh0, sh1, sh2, sh3),
             the largest error of any splat.
@@ -54,8 +55,8 @@ class Target:
             raise InputError(f"the target size is {self.size_bytes} bytes, wanted 1 or more")
         if self.psnr is not None and not 0.0 < self.psnr <= PSNR_CAP:
             raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most {PSNR_CAP:g}")
-        if self.max_loss is not None and not (math.isfinite(self.max_loss) and self.max_loss > 0.0):
-            raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted above 0")
+        if self.max_loss is not None and not _LOSSES[0] <= self.max_loss <= _LOSSES[1]:
+            raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted {_LOSSES[0]:g} to {_LOSSES[1]:g}")
         if self.keep is not None and not 0.0 < self.keep <= 1.0:
             raise InputError(f"the share of the splats is {self.keep:g}, wanted above 0, at most 1")
         for name, bound in self.max_error.items():

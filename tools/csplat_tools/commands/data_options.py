@@ -42,6 +42,6 @@ def data_options(
     pixels = None if size is None else parse_size(size)
     if data is not None:
         return DataOptions(data, pixels, images, test_every, near)
-    if (size, images, test_every, near) != (None, None, None, None):
-        raise typer.BadParameter("--size, --images, --test-every and --near are for the photographs of --data")
+    if (size, images, test_every, near, split) != (None, None, None, None, SPLITS[0]):
+        raise typer.BadParameter("--size, --images, --test-every, --near and --split are for the photographs of --data")
     return None

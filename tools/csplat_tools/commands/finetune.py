@@ -61,7 +61,10 @@ def finetune(
         ),
     ] = None,
     views: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views that teach.")
+        int,
+        typer.Option(
+            metavar="N", min=1, rich_help_panel=_LIKE, help="With --self: virtual views that teach; 16 more do."
+        ),
     ] = 480,
     view_size: Annotated[
         str, typer.Option(metavar="WxH", rich_help_panel=_LIKE, help="With --self: of the virtual views.")

@@ -37,7 +37,7 @@ def sensitivity(
         typer.Option(
             metavar="FILE.json",
             rich_help_panel=_VIEWS,
-            help="Your own cameras; of 40 or more not those that judge in other commands.",
+            help="Your own cameras; of 40 or more those that teach in other commands.",
         ),
     ] = None,
     views: Annotated[

@@ -145,10 +145,10 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
         if name == "means":
             chosen["position_error"] = bound
         elif name == "opacities":
-            chosen["opacity_levels"] = _within(math.ceil(1.0 / bound), 1, 65535)
+            chosen["opacity_levels"] = _levels_within(1.0 / bound, 1, 65535)
         elif name == "covariance":
             chosen["scale_step"] = min(max(0.4 * bound, 1e-6), 1e3)
-            chosen["quat_levels"] = _within(math.ceil(4.0 / bound), 8, 32767)
+            chosen["quat_levels"] = _levels_within(4.0 / bound, 8, 32767)
         else:
             step = min(max(_AIM * bound, 1e-6), 1e3)
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
@@ -162,7 +162,7 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
         bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")
         if encoding.sh_degree is not None and encoding.sh_degree < min(bounded, source.sh_degree):
             raise InputError(f"SH degree {encoding.sh_degree} leaves out sh{bounded}, whose error is bounded")
-        chosen.update(sh_coding="scalar", adaptive=0.0)
+        chosen.update(sh_coding="scalar", adaptive=0.0, sh_degree=encoding.sh_degree or source.sh_degree)
     return replace(encoding, **chosen)
 
 
@@ -196,6 +196,11 @@ def _levels(levels: int | None, factor: float) -> int:
 
 def _family(name: str) -> str:
     return "sh" if name in ("sh1", "sh2", "sh3") else name
+
+
+def _levels_within(levels: float, low: int, high: int) -> int:
+    """So many levels, rounded up; bounds near 0 ask for more than there are numbers."""
+    return math.ceil(min(max(levels, low), high))
 
 
 def _within(value: int, low: int, high: int) -> int:

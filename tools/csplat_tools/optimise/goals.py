@@ -22,7 +22,7 @@ def goal_of(target: Target, source: SplatModel, photographs: Judge | None) -> Go
         photographs: that decide what a loss is; without them there is none.
     """
     if target.max_loss is None or photographs is None:
-        return Goal(target.psnr, target.size_bytes)
+        return Goal(target.psnr, target.size_bytes, max_error=target.max_error)
     reached = photographs.psnr(source)
     # Photographs are missed by far more than what may be lost: a file's own error is a small share of what they say.
     slope = 1.0 - 10.0 ** (-target.max_loss / 10.0)

@@ -109,10 +109,13 @@ class Moves:
             trial, before = tries[0], left
             found += tries
             if math.isinf(solver.cost(trial)):
-                if len(part.rows) > left or left == 1:
-                    break  # nobody saw the others
                 # None of them is small enough for a size, or good enough for a PSNR.
-                left = int(left * (_FEWER if goal.size_bytes is not None else 1.0 / _FEWER))
+                if goal.size_bytes is None:
+                    left = _more(left)
+                elif len(part.rows) > left or left == 1:
+                    break  # nobody saw the others
+                else:
+                    left = int(left * _FEWER)
                 continue
             if goal.psnr is not None:
                 # What bands that are left out cost is no matter of how many splats there are.
@@ -135,7 +138,7 @@ class Moves:
 
     def _of_more(self, trial: Trial) -> Trial | None:
         """A file on the goal of more splats, where those of a trial turned out to be too few for any precision."""
-        left = int(trial.splats / _FEWER)
+        left = _more(trial.splats)
         all_stay = trial.part is self.whole or left > (1.0 - _ALL_BUT) * len(self.whole.model)
         if self.removal is None or self.solver.goal.psnr is None or all_stay:
             return None
@@ -195,6 +198,11 @@ class Moves:
 def _is_asked(name: str, preset: str) -> bool:
     """Whether a preset's file may be one of a search that was asked for with a preset: `fast` is for who wants that."""
     return name == preset if "fast" in (name, preset) else True
+
+
+def _more(splats: int) -> int:
+    """A number of splats to try where so many are too few."""
+    return math.ceil(splats / _FEWER)
 
 
 def _without(psnr: float, error: float) -> float:

@@ -114,6 +114,7 @@ def optimise(
         remarks=[_INSIDE] * (inside and found.splats < len(source)), encodes=files + len(trials.made),
         seconds=round(time.perf_counter() - start, 3), photographs=photo, sensitivity_views=sensitivity_views,
         removal_views=0 if removal is None else removal.view_count,
+        reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return Optimised(found.result, report)
 

@@ -77,7 +77,14 @@ class Removal:
 
     def fitted(self, left: int, allowed: float | None, seen: Seen) -> Fitted:
         """So many splats, or those that no view saw if they are more; see `Fitted`."""
-        gone = min(len(self.source) - left, len(self.session.order.rows))
+        gone = len(self.source) - left
+        if gone > len(self.session.order.rows):
+            session = self.session
+            order = removal_order(
+                self.source, session.views, session.options, left, self.progress, start=session.order
+            )  # fmt: skip
+            self._session = replace(session, order=order)
+        gone = min(gone, len(self.session.order.rows))
         return Fitted(self.session, gone, allowed, seen, self.grades, self.progress)
 
     def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_of_psnr
@@ -41,12 +41,14 @@ class Goal:
         size_bytes: of the file, at most.
         photo_psnr: dB against photographs, beside `psnr`.
         photo_slope: by what that grows with every dB of `psnr`, about: little, where a file's own error is little.
+        max_error: largest errors of splats by measure, at most; a file that exceeds one is no result.
     """
 
     psnr: float | None = None
     size_bytes: int | None = None
     photo_psnr: float | None = None
     photo_slope: float = 1.0
+    max_error: Mapping[str, float] = field(default_factory=dict)
 
     def above(self, trial: Trial, slope: float = BYTES_PER_DB) -> float:
         """By how many dB a file is better than what is looked for; of a size, by how many its bytes are more."""
@@ -63,6 +65,9 @@ class Goal:
 
     def is_met(self, trial: Trial) -> bool:
         """Whether a file keeps to it."""
+        errors = trial.result.report.errors
+        if any(errors[name][0] > most for name, most in self.max_error.items() if name in errors):
+            return False
         above = self.above(trial)
         return above <= 0.0 if self.size_bytes is not None else above >= 0.0
 
@@ -172,6 +177,8 @@ class Solver:
 
         Errors of removal more so than others: so it is not the same for all splats and for some.
         """
+        if not self.goal.is_judged:
+            return self.goal.psnr or 0.0
         made = [trial for trial in self.trials.made if trial.part is part]
         judged = [trial for trial in made if trial.is_judged] or made[:1]
         nearest = min(judged, key=lambda trial: abs(trial.psnr - (self.goal.psnr or 0.0)))

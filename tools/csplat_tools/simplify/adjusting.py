@@ -1,7 +1,7 @@
 """Opacities and scales of what stays, moved towards what the source looks like by gradient descent.
 
 Where splats have gone, their neighbours have to cover more: opacity and extent decide that, and no linear problem does.
-Centres and rotations stay: moved by the same steps they follow the views that decide and lose on others.
+Centres and rotations stay: moved by the same steps they follow the views that teach and lose on others.
 """
 
 from __future__ import annotations

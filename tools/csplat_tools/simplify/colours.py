@@ -46,9 +46,6 @@ def fit(
     wanted: Sequence[F32],
     options: SimplifyOptions,
     *,
-    error: float | None = None,
-    centre: SplatModel | None = None,
-    fixed: bool = False,
     progress: Progress | None = None,
 ) -> Fitted:
     """Fit colours; adjust opacities and scales; set bands to zero; after each of the two fit colours once more.
@@ -58,13 +55,9 @@ def fit(
         cameras: the views.
         wanted: what the source looks like there.
         options: whether to fit, to adjust and to choose bands, steps, background.
-        error: squared error over these views that the scene is to end with, by which bands are measured; None for
-            what is left after the fits.
-        centre: the scene to whose colours the ridge pulls; the same as `model` if left out.
-        fixed: opacities and scales may not be adjusted.
         progress: is told how much is done.
     """
-    goal = _coefficients(model if centre is None else centre)
+    goal = _coefficients(model)
     errors: list[tuple[float, ...]] = []
 
     def fitted(scene: SplatModel, steps: int, free: Mask | None) -> SplatModel:
@@ -77,7 +70,7 @@ def fit(
 
     if options.refit:
         model = fitted(model, options.steps, None)
-    if options.refit and options.adjust and not fixed:
+    if options.refit and options.adjust:
         rms = (max(0.0, errors[-1][-1]) / sum(picture.size for picture in wanted)) ** 0.5
         moved = adjust(model, cameras, wanted, options, error=rms, progress=progress)
         moved = fitted(moved, _SECOND_STEPS, None)
@@ -86,7 +79,7 @@ def fit(
         return Fitted(model, None, tuple(errors))
     removal = measure_removal(model, cameras, background=options.background, threads=options.threads, progress=progress)
     left = min(one[-1] for one in errors) if errors else 0.0
-    stays = band_mask(removal, (left if error is None else error) / max(1, len(model)))
+    stays = band_mask(removal, left / max(1, len(model)))
     if not stays.all():
         model = without(model, stays)
         if options.refit:
@@ -109,7 +102,8 @@ def refitted(
 
     Args:
         model: geometry, and the colours to start from.
-        cameras, wanted, options, centre, progress: as for `fit`.
+        cameras, wanted, options, progress: as for `fit`.
+        centre: the scene to whose colours the ridge pulls.
         steps: at most.
         free: [N, (d + 1)²], which coefficients may change; None for all.
     """

@@ -16,7 +16,6 @@ from csplat.model import SplatModel
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.virtual import scene_frame
 from csplat_tools.simplify.colours import Fitted, fit
 from csplat_tools.simplify.options import SimplifyOptions
 from csplat_tools.simplify.order import Order, removal_order
@@ -67,8 +66,6 @@ class Session:
         order: of removal.
         checked: judges by views that were not used.
         seconds: by stage.
-        inside: virtual views of surroundings teach, which do not stand where cameras do: they may say what is left
-            out, but not how precise the rest has to be.
     """
 
     source: SplatModel
@@ -79,7 +76,6 @@ class Session:
     order: Order
     checked: Judge
     seconds: dict[str, float]
-    inside: bool
 
     def pruned(self, gone: int) -> I64:
         """Source splats that are left when the first `gone` of the order are removed."""
@@ -128,8 +124,7 @@ def prepare(
     start = time.perf_counter()
     order = removal_order(source, found, options, left, progress, enough=allowed * found.removal.value_count)
     seconds["rounds"] = time.perf_counter() - start
-    inside = around.virtual and scene_frame(source).kind == "surrounding"
-    return Session(source, options, around, found, wanted, order, checked, seconds, inside)
+    return Session(source, options, around, found, wanted, order, checked, seconds)
 
 
 def simplify(

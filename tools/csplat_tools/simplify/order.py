@@ -20,7 +20,7 @@ __all__ = ["Order", "Round", "removal_order"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_LEAST_SHARE = 0.05  # of the splats that stay, at the end of an order that is made to be cut anywhere
+_LEAST_SHARE = 0.01  # of the splats that stay, at the end of an order that is made to be cut anywhere
 _ROUND_SHARE = 0.85  # of what is left stays after each round of such an order: what hid a splat may have gone
 
 
@@ -74,7 +74,7 @@ def removal_order(
 
     Args:
         model: the source.
-        views: cameras to decide by, and what they say of the source.
+        views: cameras that teach, and what they say of the source.
         options: method, rounds.
         left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.

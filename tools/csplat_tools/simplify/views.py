@@ -37,10 +37,10 @@ _SETTLED = 0.005  # share of the splats that the check views alone show, below w
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Cameras to decide by, others to check by, and what the ones to decide by say.
+    """Cameras that teach, others to check by, and what those that teach say.
 
     Attributes:
-        used: they decide.
+        used: they teach.
         check: they were kept aside.
         removal: of the source, measured from `used`.
         gap: dB by which the error that is predicted for the share that is to go is larger in `check` than in `used`.
@@ -65,8 +65,8 @@ def find_views(
 
     Args:
         model: the source.
-        views: virtual ones are taken batch by batch until no new splats appear and they agree with the deciding ones;
-            of others all.
+        views: virtual ones are taken batch by batch until no new splats appear and they agree with some that are
+            kept apart; of others all, and those that decide check.
         gone: share of the splats that is to go; what is predicted for it has to agree.
         size: of the pictures; the user's cameras keep their shape and are never enlarged.
         threads: how many; None for all.
@@ -81,7 +81,7 @@ def find_views(
 
     if not views.teaches or not views.decides:
         found = len(views.teaches) + len(views.decides)
-        raise InputError(f"{found} cameras, wanted 2 at least: one to decide by, one to check by")
+        raise InputError(f"{found} cameras, wanted 2 at least: one that teaches, one that decides")
     every, check = reduced(views.teaches, size), reduced(views.decides, size)
     if views.virtual:
         # What was taught is to hold elsewhere; whether it does, views of the same kind say.

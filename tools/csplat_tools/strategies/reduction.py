@@ -37,7 +37,7 @@ class Reduction:
         sh_degree: bands above it go; None: all stay.
         distil: the bands that stay are fitted to renders of the source; otherwise they are as they were.
         kmeans: which attributes are clustered; None: none is.
-        views: virtual views to distil by, one in eight of them to check by.
+        views: virtual views to distil by, and 16 more; one in eight of all checks.
         seed: of the virtual views.
         threads: how many; None for all. The result does not depend on it.
 

@@ -24,6 +24,7 @@ from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
 from csplat_tools.tradeoff.setting import Setting
 from csplat_tools.tradeoff.showing import WorstView
 from csplat_tools.tradeoff.sweep import Candidate
+from csplat_tools.views import evenly
 
 __all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer"]
 
@@ -77,7 +78,7 @@ class Measurer:
         views = setting.views
         self._judge = views.judge(setting.source, threads=threads)
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
-        places = np.linspace(0, len(views.judges) - 1, min(TIMED_VIEWS, len(views.judges))).round().astype(int)
+        places = evenly(range(len(views.judges)), TIMED_VIEWS)
         self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
         self.source_modes = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()

@@ -11,13 +11,14 @@ from csplat_tools.tradeoff.options import Wanted
 from csplat_tools.tradeoff.points import Made
 from csplat_tools.tradeoff.setting import Setting
 from csplat_tools.views import ViewSet, find_view_set
+from csplat_tools.views.viewset import pose
 from csplat_trainer.finetune import FinetuneOptions, Moment
 
 __all__ = ["tune_file"]
 
 
 def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Report) -> Made:
-    """Make the file that `csplat finetune` makes with its usual options.
+    """Make the file that `csplat finetune` makes with its usual options, but for which virtual views decide.
 
     Args:
         setting: photographs teach where there are some, else the scene's own renders from virtual cameras.
@@ -46,8 +47,8 @@ def _tuning_views(setting: Setting) -> ViewSet:
     """Those of `csplat finetune`: of photographs, all teach that do not judge; of virtual views, there are more."""
     views = setting.views
     if views.photographs:
-        judging = {id(camera) for camera in views.judges}
-        teaches = [one.camera for one in views.photographs if id(one.camera) not in judging]
+        judging = {pose(camera) for camera in views.judges}
+        teaches = [one.camera for one in views.photographs if pose(one.camera) not in judging]
         return replace(views, teaches=teaches, decides=())
     if views.virtual:
         more = find_view_set(setting.source, background=views.background, count=VIEWS, size=VIEW_SIZE)

@@ -2,7 +2,7 @@
 
 | views | teach | decide | judge |
 |---|---|---|---|
-| virtual | `count` small ones, all around | twelve like those of `psnr` | the eight of `psnr` |
+| virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
 | data set | training photographs | every 8th of those | held-out photographs |
@@ -15,8 +15,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TrainedOn
@@ -24,7 +22,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.extras import need_photographs
-from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence
+from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence, evenly
 from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
 
 if TYPE_CHECKING:
@@ -86,7 +84,8 @@ def find_view_set(
         cameras: a camera file, relative to the scene's origin.
         data: instead: a data set.
         background: behind everything; `None`: what the scene says it was trained in front of, else black.
-        count: virtual views that teach, and as many more as check what they taught; 0: no virtual ones teach or decide.
+        count: virtual views that teach; 16 more do, too, which a removal keeps apart to check what the others taught.
+            0: no virtual ones teach or decide.
         size, seed: of virtual views.
         aside: how many views decide; `None`: as many as the table says.
         split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
@@ -134,11 +133,10 @@ def _of_file(
         teaches, decides = (_without(judging, part) for part in _virtual(source, *virtual, aside))
     else:
         every = range(0, len(given), _JUDGE_EVERY)
-        places = {every[place] for place in _evenly(len(every), _MOST_JUDGES)}
-        judges, rest = _parted(given, places)
+        judges, rest = _parted(given, evenly(every, _MOST_JUDGES))
         decides, teaches = _apart(rest, aside)
     return ViewSet(
-        Path(path).name, colour, teaches, decides, judges, virtual=few, origin=source.origin, notes=tuple(notes)
+        _named_file(path), colour, teaches, decides, judges, virtual=few, origin=source.origin, notes=tuple(notes)
     )
 
 
@@ -162,7 +160,7 @@ def _of_data(
         more.append(f"{len(train) - len(apart)} training photographs stand where others judge, and are left out")
     decides, teaches = _apart(apart, aside)
     return ViewSet(
-        Path(data.path).resolve().name, colour, teaches, decides, [one.camera for one in test], [*train, *test],
+        _named_file(data.path), colour, teaches, decides, [one.camera for one in test], [*train, *test],
         origin=source.origin, notes=(*found.report, *notes, *more),
     )  # fmt: skip
 
@@ -193,6 +191,12 @@ def _colour(
         return said.background, []
     note = "the scene does not say in front of what it was trained: black is behind it, --background changes that"
     return BLACK, [note] if photographs else []
+
+
+def _named_file(path: str) -> str:
+    """The name of a file or a folder, which is not that of virtual views."""
+    name = Path(path).resolve().name
+    return f"./{name}" if name == VIRTUAL else name
 
 
 def _named(colour: Colour) -> str:
@@ -236,8 +240,3 @@ def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Ca
 def _without(judging: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
     """Those that stand where none judges."""
     return [one for one in cameras if pose(one) not in judging]
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    """At most so many of so many places, spread evenly."""
-    return [round(place) for place in np.linspace(0, count - 1, min(count, most))]

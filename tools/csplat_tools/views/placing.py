@@ -1,4 +1,4 @@
-"""Virtual cameras to decide by: many, small, spread evenly at any count; and a user's own, made as small.
+"""Virtual cameras that teach: many, small, spread evenly at any count; and a user's own, made as small.
 
 Many small pictures overfit less than few large ones of as many pixels.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,9 @@ from csplat_render.virtual import FIELD_OF_VIEW, Frame, scene_frame
 __all__ = ["CHECKS", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
 
 F64 = NDArray[np.float64]
+T = TypeVar("T")
 
-#: Width and height of the pictures that decide, in pixels.
+#: Width and height of the virtual pictures that teach, in pixels.
 VIEW_SIZE = (240, 180)
 
 #: Virtual views beside those that are asked for: whether what these taught holds elsewhere, they say.
@@ -116,7 +118,7 @@ def _in_surroundings(frame: Frame, number: int, point: F64, K: F64, size: tuple[
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
-def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """So many of some cameras at most, spread over their order."""
-    places = np.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().astype(int)
-    return [cameras[i] for i in places]
+def evenly(those: Sequence[T], most: int) -> list[T]:
+    """So many of those at most, spread over their order."""
+    places = np.linspace(0, len(those) - 1, min(most, len(those))).round().astype(int)
+    return [those[i] for i in places]

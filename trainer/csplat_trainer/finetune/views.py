@@ -1,4 +1,4 @@
-"""What fine-tuning looks at: photographs, or renders of the source; some of them to learn from, some to judge by."""
+"""What fine-tuning looks at: photographs, or renders of the source; some of them to learn from, some to decide by."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Views to learn from, views to judge by, and the colour behind all of them.
+    """Views to learn from, views to decide by, and the colour behind all of them.
 
     Attributes:
         train: at least one.
@@ -71,7 +71,7 @@ class Views:
 
     def __post_init__(self) -> None:
         if not self.train or not self.validation:
-            raise InputError("fine-tuning wants at least one view to learn from and one to judge by")
+            raise InputError("fine-tuning wants at least one view to learn from and one to decide by")
 
     @property
     def digest(self) -> str:
@@ -82,26 +82,26 @@ class Views:
 
     @property
     def kept_aside(self) -> bool:
-        """Whether the views to judge by are not learnt from."""
+        """Whether the views to decide by are not learnt from."""
         return not any(one is other for one in self.validation for other in self.train)
 
 
 def split_views(views: Sequence[View], background: F32, aside: int = 0) -> Views:
-    """Say which views teach and which judge.
+    """Say which views teach and which decide.
 
     A scene fits the pictures that it was trained on better than any others. Those of them that are kept aside look
-    worse with every step, whatever is gained elsewhere; so by default all teach, and some of them judge.
+    worse with every step, whatever is gained elsewhere; so by default all teach, and some of them decide.
 
     Args:
         views: in the order of their taking.
         background: [3], behind all of them.
-        aside: how many judge and do not teach: pictures that the scene was not trained on, or renders of it. 0: none.
+        aside: how many decide and do not teach: pictures that the scene was not trained on, or renders of it. 0: none.
 
     Raises:
         InputError: there are not as many views.
     """
     if aside >= len(views):
-        raise InputError(f"{aside} of {len(views)} views to judge by leave none to learn from")
+        raise InputError(f"{aside} of {len(views)} views to decide by leave none to learn from")
     count = aside or min(len(views), _JUDGES)
     judges = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
     teachers = [view for number, view in enumerate(views) if not aside or number not in judges]
