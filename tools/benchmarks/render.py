@@ -163,7 +163,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--pairs", type=float, default=3e8, help="splats times pixels for the twin; 0: none; default: %(default)g"
     )
-    parser.add_argument("--markdown", action="store_true", help="print the table as the README has it")
+    parser.add_argument("--markdown", action="store_true", help="print the table as FIGURES.md has it")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers there too")
     parser.add_argument("--cache", type=Path, default=ROOT / "out" / "scenes", help="where scenes are made")
     return parser.parse_args()

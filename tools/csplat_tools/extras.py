@@ -55,10 +55,9 @@ def need_trainer(*, plots: bool = False) -> None:
     Raises:
         InputError: a package is not installed.
     """
-    for module, package in _PHOTOGRAPHS:
-        _need(module, package)
+    need_photographs()
     if plots:
-        _need("matplotlib", None)
+        need_plots()
 
 
 def need_pictures() -> None:

@@ -277,7 +277,7 @@ def encode(
     takes minutes; --keep-all leaves all splats as they are and is sooner.
     --preset fast and --max-error leave them, too. Splats are fitted in views
     that teach, files compared in views that decide, and the result is scored
-    in views that judge: they say how precise it has to be, and choose nothing.
+    in views that judge; for --target-psnr these say how precise it has to be.
 
     Examples:
       csplat encode scene.ply scene.csplat

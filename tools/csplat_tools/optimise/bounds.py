@@ -145,10 +145,10 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
         if name == "means":
             chosen["position_error"] = bound
         elif name == "opacities":
-            chosen["opacity_levels"] = _levels_within(1.0 / bound, 1, 65535)
+            chosen["opacity_levels"] = _within(1.0 / bound, 1, 65535)
         elif name == "covariance":
             chosen["scale_step"] = min(max(0.4 * bound, 1e-6), 1e3)
-            chosen["quat_levels"] = _levels_within(4.0 / bound, 8, 32767)
+            chosen["quat_levels"] = _within(4.0 / bound, 8, 32767)
         else:
             step = min(max(_AIM * bound, 1e-6), 1e3)
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
@@ -198,10 +198,6 @@ def _family(name: str) -> str:
     return "sh" if name in ("sh1", "sh2", "sh3") else name
 
 
-def _levels_within(levels: float, low: int, high: int) -> int:
-    """So many levels, rounded up; bounds near 0 ask for more than there are numbers."""
-    return math.ceil(min(max(levels, low), high))
-
-
-def _within(value: int, low: int, high: int) -> int:
-    return min(max(value, low), high)
+def _within(value: float, low: int, high: int) -> int:
+    """Rounded up; bounds near 0 ask for more levels than there are numbers."""
+    return math.ceil(min(max(value, low), high))

@@ -79,11 +79,7 @@ class Removal:
         """So many splats, or those that no view saw if they are more; see `Fitted`."""
         gone = len(self.source) - left
         if gone > len(self.session.order.rows):
-            session = self.session
-            order = removal_order(
-                self.source, session.views, session.options, left, self.progress, start=session.order
-            )  # fmt: skip
-            self._session = replace(session, order=order)
+            self._extend(left, math.inf)
         gone = min(gone, len(self.session.order.rows))
         return Fitted(self.session, gone, allowed, seen, self.grades, self.progress)
 
@@ -159,13 +155,17 @@ class Removal:
 
     def _goes_on(self) -> bool:
         """Let the order go on until removal errs by several times as much; false where it goes no further."""
-        session, before = self.session, self.session.order
+        before = self.session.order
+        self._extend(None, _FARTHER * float(before.errors.sum()))
+        return len(self.session.order.rows) > len(before.rows)
+
+    def _extend(self, left: int | None, enough: float) -> None:
+        """Let the order go on, see `removal_order`."""
+        session = self.session
         order = removal_order(
-            self.source, session.views, session.options, None, self.progress,
-            enough=_FARTHER * float(before.errors.sum()), start=before,
-        )  # fmt: skip
+            self.source, session.views, session.options, left, self.progress, enough=enough, start=session.order
+        )
         self._session = replace(session, order=order)
-        return len(order.rows) > len(before.rows)
 
     def _error(self, left: int) -> float:
         """Mean squared error of the removal of all but so many, as predicted."""
