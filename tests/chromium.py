@@ -24,7 +24,7 @@ from typing import Any
 
 import pytest
 
-from csplat_tools.webroot import web_files
+from csplat_tools.present.webroot import web_files
 
 ROOT = Path(__file__).resolve().parent.parent
 SERVED = ("tools/viewer", "codec/js")

@@ -15,8 +15,8 @@ from csplat.encoder import Draft, Frozen
 from csplat_render.judge import Judge, Look
 from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.simplify import Simplified, SimplifyOptions, simplify
-from csplat_tools.target import Target
+from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+from csplat_tools.optimise.target import Target
 from csplat_trainer.data import DataSet
 from csplat_trainer.finetune import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
 from csplat_trainer.loop import train

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from csplat import decode, read_ply, write_ply
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
-from csplat_tools.app import app
-from csplat_tools.commands.encode import encode as encode_command
+from csplat_tools.cli.app import app
+from csplat_tools.cli.encode import encode as encode_command
 
 PROGRAM = [sys.executable, "-m", "csplat_tools"]
 
@@ -511,12 +511,13 @@ def test_a_filter_that_finds_nothing_fails():
 
 def test_a_command_imports_itself_alone():
     code = (
-        "import sys; from csplat_tools.app import app\n"
+        "import sys; from csplat_tools.cli.app import app\n"
         "app(['info', '--help'], standalone_mode=False)\n"
-        "print(*(name for name in sys.modules if name.startswith('csplat_tools.commands.')), file=sys.stderr)"
+        "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "csplat_tools.commands.info\n" == done.stderr
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console")}
+    assert {"csplat_tools.cli.info"} == set(done.stderr.split()) - shared
 
 
 def test_a_misspelt_command_is_told_which_was_meant():

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat_tools.app import app
-from csplat_tools.attributes import attribute_errors
-from csplat_tools.models import LoadedModel, load_model
+from csplat_tools.cli.app import app
+from csplat_tools.files.scenes import LoadedModel, load_model
+from csplat_tools.inspect.attributes import attribute_errors
 from csplat_tools.views import comparison_cameras
 
 

@@ -24,8 +24,8 @@ from csplat_conformance.encoders.judge import judge_stream
 from csplat_conformance.encoders.matching import pair
 from csplat_conformance.process import run_program
 from csplat_conformance.report import Status
-from csplat_tools.app import app
-from csplat_tools.pairs import measure_pairs
+from csplat_tools.cli.app import app
+from csplat_tools.inspect.pairs import measure_pairs
 
 ROOT = Path(__file__).resolve().parent.parent
 INPUTS = {one.name: one for one in all_inputs()}
@@ -359,7 +359,7 @@ def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
     def absent(**_):
         raise InputError("this needs numba: pip install 'csplat[render]'")
 
-    monkeypatch.setattr("csplat_tools.commands.conformance_encoder.prepare_renderer", absent)
+    monkeypatch.setattr("csplat_tools.cli.conformance_encoder.prepare_renderer", absent)
     result = invoke("--filter", "*/degree_0")
 
     assert 0 == result.exit_code

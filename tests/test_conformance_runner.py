@@ -12,7 +12,7 @@ from csplat.errors import InputError
 from csplat_conformance.manifest import load
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice, parse_levels, run_builtin, run_command
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"

@@ -12,7 +12,7 @@ from csplat.decoder import decode_scene, read_options, read_stated_errors
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
-from csplat_tools.proof import prove
+from csplat_tools.inspect.proof import prove
 
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from csplat import encode, read_ply
 from csplat.errors import CsplatError
-from csplat_tools.app import app
-from csplat_tools.selfcontained import export_page, module_graph
-from csplat_tools.webroot import PAGE, web_files
+from csplat_tools.cli.app import app
+from csplat_tools.present.export import export_page, module_graph
+from csplat_tools.present.webroot import PAGE, web_files
 
 SIZE = (200, 160)
 
@@ -196,8 +196,8 @@ def test_the_page_can_go_to_a_pipe(sample_path):
 
 
 def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path):
-    import csplat_tools.webroot
+    import csplat_tools.present.webroot
 
-    monkeypatch.setattr(csplat_tools.webroot, "__file__", str(tmp_path / "a" / "b" / "webroot.py"))
+    monkeypatch.setattr(csplat_tools.present.webroot, "__file__", str(tmp_path / "a" / "b" / "webroot.py"))
     with pytest.raises(CsplatError, match="install csplat again"):
         export_page(b"", "scene.csplat")

@@ -27,7 +27,7 @@ from csplat.ply import lint_ply
 from csplat_render import render
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.proof import prove
+from csplat_tools.inspect.proof import prove
 
 pytestmark = pytest.mark.extremes
 

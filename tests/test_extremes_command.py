@@ -15,7 +15,7 @@ pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[re
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
 from csplat import read_ply
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.extremes
 

@@ -31,10 +31,10 @@ from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual import virtual_cameras
+from csplat_tools.inspect.proof import prove
 from csplat_tools.optimise.optimiser import optimise
-from csplat_tools.proof import prove
-from csplat_tools.simplify import simplify
-from csplat_tools.target import Target
+from csplat_tools.optimise.simplify import simplify
+from csplat_tools.optimise.target import Target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
 from csplat_trainer.finetune import finetune, renders_of, split_views

@@ -6,8 +6,8 @@ from typer.testing import CliRunner
 
 from csplat import write_ply
 from csplat.errors import InputError
-from csplat_tools.app import app
-from csplat_tools.film import _durations, check_film, is_film, write_film
+from csplat_tools.cli.app import app
+from csplat_tools.present.film import _durations, check_film, is_film, write_film
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
 Image = pytest.importorskip("PIL.Image", reason="films need pillow: pip install 'csplat[render]'")

@@ -23,9 +23,9 @@ from csplat.errors import InputError
 from csplat_render import render
 from csplat_render.cameras import save_cameras
 from csplat_render.rasterise import Rasteriser, Splats
-from csplat_tools.app import app
-from csplat_tools.commands.finetune import finetune as finetune_command
-from csplat_tools.finetune_report import ply_splat_bytes
+from csplat_tools.cli.app import app
+from csplat_tools.cli.finetune import finetune as finetune_command
+from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views
 from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin
@@ -429,7 +429,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
         model = decode(data)
         return replace(model, sh0=model.sh0 + np.float32(1e-6))
 
-    monkeypatch.setattr("csplat_tools.finetuning.decode", wrong)
+    monkeypatch.setattr("csplat_tools.training.finetune.decode", wrong)
     out = tmp_path / "s.csplat"
     result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1)
     assert "holds other sh0 than were tuned" in str(result.exception)

@@ -104,7 +104,7 @@ def test_what_rounding_loses_is_foretold():
     from captures import cameras, shell
 
     from csplat_render import render
-    from csplat_tools.importances import measured_importance
+    from csplat_tools.optimise.sensitivity import measured_importance
 
     scene, views = shell(0), cameras(12)
     options = EncodeOptions(attribute_psnr=58)
@@ -362,7 +362,7 @@ def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
 def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, grades):
     from typer.testing import CliRunner
 
-    from csplat_tools.app import app
+    from csplat_tools.cli.app import app
 
     csplat.write_ply(tmp_path / "scene.ply", model)
     np.save(tmp_path / "weights.npy", np.ones(COUNT, np.float32))

@@ -23,15 +23,15 @@ from csplat.model import SplatModel
 from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
-from csplat_tools.importances import measured_importance
+from csplat_tools.inspect.proof import prove
 from csplat_tools.optimise import optimiser
 from csplat_tools.optimise.optimiser import expected_seconds, optimise
 from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.search import Window, meet
+from csplat_tools.optimise.sensitivity import measured_importance
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trials, spread_of
-from csplat_tools.proof import prove
-from csplat_tools.simplify import SimplifyOptions
-from csplat_tools.target import Target
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, comparison_cameras, find_view_set, with_deciders
 from csplat_tools.views.viewset import pose
 from csplat_trainer.pictures import Picture

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from csplat import EncodeOptions, encode, write_ply
 from csplat.errors import InputError
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
@@ -19,7 +19,7 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 # Importing them needs what is looked for above.
 from csplat_render import render  # noqa: E402
 from csplat_render.cameras import intrinsics, look_at, relative_to  # noqa: E402
-from csplat_tools.compare_files import compare_files  # noqa: E402
+from csplat_tools.inspect.compare import compare_files  # noqa: E402
 from csplat_tools.views import DataOptions  # noqa: E402
 from csplat_trainer.evaluate import photograph_judge  # noqa: E402
 from csplat_trainer.pictures import Picture  # noqa: E402
@@ -191,8 +191,8 @@ def no_compiling(monkeypatch):
     def refuse(*_, **__):
         pytest.fail("the renderer was compiled before the inputs were looked at")
 
-    monkeypatch.setattr("csplat_tools.commands.compare.prepare_renderer", refuse)
-    monkeypatch.setattr("csplat_tools.commands.render.prepare_renderer", refuse)
+    monkeypatch.setattr("csplat_tools.cli.compare.prepare_renderer", refuse)
+    monkeypatch.setattr("csplat_tools.cli.render.prepare_renderer", refuse)
     monkeypatch.setattr("csplat_render.warmup.warm_up", refuse)
 
 

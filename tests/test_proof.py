@@ -10,10 +10,10 @@ from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
-from csplat_tools.match import UNDECIDED, UNMATCHED, match
-from csplat_tools.pairs import differences, measure_pairs
-from csplat_tools.proof import prove
-from csplat_tools.reading import describe_file
+from csplat_tools.inspect.matching import UNDECIDED, UNMATCHED, match
+from csplat_tools.inspect.pairs import differences, measure_pairs
+from csplat_tools.inspect.proof import prove
+from csplat_tools.inspect.reading import describe_file
 
 
 def moved(model, rng, sigma=1e-3):

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from csplat import EncodeOptions, encode, write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_tools.app import app
-from csplat_tools.parsing import parse_colour, parse_size
-from csplat_tools.pictures import check_folder, panels, picture_names, to_bytes
+from csplat_tools.cli.app import app
+from csplat_tools.cli.parsing import parse_colour, parse_size
+from csplat_tools.files.pictures import check_folder, panels, picture_names, to_bytes
 
 
 @pytest.fixture
@@ -183,9 +183,9 @@ def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, 
 
 def test_the_program_starts_without_the_extra_packages():
     code = (
-        "import sys; from csplat_tools.app import app\n"
+        "import sys; from csplat_tools.cli.app import app\n"
         "app(['--help'], standalone_mode=False)\n"  # which imports every command
-        "assert 'csplat_tools.commands.render' in sys.modules\n"
+        "assert 'csplat_tools.cli.render' in sys.modules\n"
         "loaded = {'numba', 'PIL', 'scipy', 'matplotlib', 'torch'} & set(sys.modules)\n"
         "sys.exit(' '.join(loaded) or 0)"
     )

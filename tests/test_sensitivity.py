@@ -17,7 +17,7 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.twin import Decisions, render_exact
 from csplat_render.virtual import scene_frame
-from csplat_tools.importances import weights_of
+from csplat_tools.files.importance import weights_of
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 

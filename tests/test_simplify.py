@@ -18,15 +18,15 @@ from csplat.ply import read_ply, write_ply
 from csplat_render.cameras import save_cameras
 from csplat_render.judge import Judge, renderer
 from csplat_render.removal import Removal, measure_removal
-from csplat_tools.app import app
-from csplat_tools.parsing import parse_decibels
-from csplat_tools.simplify import SimplifyOptions, simplify
-from csplat_tools.simplify.adjusting import adjust
-from csplat_tools.simplify.bands import band_mask, free_coefficients, without
-from csplat_tools.simplify.order import removal_order
-from csplat_tools.simplify.views import find_views, removal_keys
-from csplat_tools.target import Target
+from csplat_tools.cli.app import app
+from csplat_tools.cli.parsing import parse_decibels
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.simplify.adjusting import adjust
+from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.optimise.simplify.order import removal_order
+from csplat_tools.optimise.target import Target
 from csplat_tools.views import camera_sequence, find_view_set, reduced
+from csplat_tools.views.agreeing import find_views, removal_keys
 from csplat_trainer.evaluate import photograph_judge
 from csplat_trainer.pictures import Picture
 

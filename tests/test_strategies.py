@@ -12,9 +12,10 @@ from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.measure import covariance_errors, measure_errors
 from csplat.errors import InputError
-from csplat_tools.proof import prove
-from csplat_tools.reducing import Reducing
-from csplat_tools.strategies import (
+from csplat_tools.cli.reducing import Reducing
+from csplat_tools.cli.targeting import Looking
+from csplat_tools.inspect.proof import prove
+from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
     Reduction,
@@ -25,7 +26,6 @@ from csplat_tools.strategies import (
     prune_opacity,
     reduce_model,
 )
-from csplat_tools.targeting import Looking
 
 
 @pytest.fixture
@@ -380,7 +380,7 @@ def test_words_that_say_nothing_are_refused(words, message):
 
 def test_pruning_and_clustering_want_no_renderer():
     code = (
-        "import sys, json; from csplat_tools.reducing import Reducing; import csplat_tools.strategies;"
+        "import sys, json; from csplat_tools.cli.reducing import Reducing; import csplat_tools.study;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

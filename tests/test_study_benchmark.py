@@ -28,7 +28,7 @@ from study_tables import MIB, PUBLISHED  # noqa: E402
 
 import study  # noqa: E402
 from csplat_render.metrics import psnr  # noqa: E402 - wants what is looked for above; so do all below
-from csplat_tools.strategies import Reduction  # noqa: E402
+from csplat_tools.study import Reduction  # noqa: E402
 
 BLACK = (0.0, 0.0, 0.0)
 

@@ -11,9 +11,9 @@ from csplat import EncodeOptions, decode, write_ply
 from csplat.encoder import encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 from csplat_tools.optimise.bounds import encode_within, meet_bounds
-from csplat_tools.target import Target, parse_max_error, parse_size_bytes
+from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 

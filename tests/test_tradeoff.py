@@ -23,8 +23,8 @@ from csplat._spec import CHUNK_CODEBOOK
 from csplat.decoder import read_header
 from csplat.errors import InputError
 from csplat_render.cameras import save_cameras
-from csplat_tools.app import app
-from csplat_tools.models import without_bands
+from csplat_tools.cli.app import app
+from csplat_tools.files.scenes import without_bands
 from csplat_tools.tradeoff.fetching import fetched_bytes
 from csplat_tools.tradeoff.measuring import StageClock
 from csplat_tools.tradeoff.options import Wanted, parse_numbers, parse_words

@@ -12,7 +12,7 @@ from csplat.errors import InputError
 from csplat.training import TrainedOn
 from csplat_render.cameras import intrinsics, orbit
 from csplat_render.rasterise import Rasteriser
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions

@@ -14,7 +14,7 @@ from captures import as_colmap, photograph, photograph_object, shell
 
 from csplat import read_ply
 from csplat.training import TrainedOn
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 
 SIZE = (24, 20)
 

@@ -18,9 +18,9 @@ from interrupts import heed_interrupts
 
 from csplat import EncodeOptions, decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
-from csplat_tools.serving import byte_range, open_server
-from csplat_tools.viewing import open_scene, view_wishes
-from csplat_tools.webroot import web_files
+from csplat_tools.present.server import byte_range, open_server
+from csplat_tools.present.viewing import open_scene, view_wishes
+from csplat_tools.present.webroot import web_files
 
 SIZE = 1000
 

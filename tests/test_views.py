@@ -21,7 +21,7 @@ from csplat.ply import read_ply
 from csplat.training import TRAINING, TrainedOn
 from csplat_render.cameras import resized, save_cameras
 from csplat_render.judge import renderer
-from csplat_tools.app import app
+from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
 from csplat_trainer.evaluate import evaluate

@@ -29,10 +29,10 @@ arrays["quats"] = np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (40, 1))
 model = SplatModel(**arrays)
 """
 _SIMPLIFY = """
-from csplat_tools.extras import prepare_renderer
+from csplat_tools.files.extras import prepare_renderer
 prepare_renderer(quiet=True, simplify=True)
-from csplat_tools.simplify import SimplifyOptions, simplify
-from csplat_tools.target import Target
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.target import Target
 before = compiled()
 simplify(model, None, target=Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24)))
 """

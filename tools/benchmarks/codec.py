@@ -23,8 +23,8 @@ from peers import CAP_SECONDS, compress_general, find_splat_transform, run_timed
 from scenes import ROOT, Scene, find_scenes
 
 from csplat.decoder import read_header
-from csplat_tools.console import format_table
-from csplat_tools.layout import describe
+from csplat_tools.files.console import format_table
+from csplat_tools.inspect.layout import describe
 
 _CHILD = Path(__file__).with_name("child.py")
 _PRESETS = ("fast", "balanced", "small")

@@ -19,7 +19,7 @@ from typing import Any
 
 from machine import describe_machine
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _PICTURES = "import numpy as np; x = np.random.default_rng(0).random((48, 64, 3)); y = 0.9 * x\n"
 _TRAINING = """

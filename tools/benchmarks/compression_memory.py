@@ -24,7 +24,7 @@ __all__ = ["measure_memory", "with_splats"]
 
 def main() -> None:
     """Run `csplat finetune` with the words of the command line."""
-    from csplat_tools.app import app
+    from csplat_tools.cli.app import app
 
     before = reset_peak()
     app(["finetune", *sys.argv[1:]], standalone_mode=False)

@@ -22,11 +22,11 @@ from csplat.ply import read_ply
 from csplat_render.judge import renderer
 from csplat_render.lpips import Lpips
 from csplat_render.removal import measure_removal
-from csplat_tools.finetune_report import judge_models
-from csplat_tools.finetune_sources import Chosen, choose_splats, training_views
-from csplat_tools.finetuning import Clock
-from csplat_tools.importances import measure_views
-from csplat_tools.layout import describe
+from csplat_tools.inspect.layout import describe
+from csplat_tools.optimise.sensitivity import measure_views
+from csplat_tools.training.choosing import Chosen, choose_splats, training_views
+from csplat_tools.training.finetune import Clock
+from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.finetune import FinetuneOptions, Views, finetune
 from csplat_trainer.report import save_picture, side_by_side

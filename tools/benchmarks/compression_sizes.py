@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen, Held
-from csplat_tools.finetune_report import ply_splat_bytes
+from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.finetune.rate import colour_integers_of
 
 __all__ = ["Book", "books_of", "coded_colour_bytes", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]

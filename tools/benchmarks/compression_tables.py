@@ -10,7 +10,7 @@ from typing import Any
 from printing import laid_out
 
 from csplat.files import atomic_writer
-from csplat_tools.finetune_report import ply_splat_bytes
+from csplat_tools.training.report import ply_splat_bytes
 
 __all__ = ["plot_curve", "tables"]
 

@@ -18,7 +18,7 @@ from dataset_protocols import (
     published_splats,
 )
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 __all__ = ["HEADER", "means_table", "notes", "one_line", "scenes_table"]
 

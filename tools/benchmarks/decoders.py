@@ -28,8 +28,8 @@ from scenes import ROOT
 from csplat import EncodeOptions, decoder, encode, read_ply
 from csplat._spec import ERROR_UNSUPPORTED, PROFILE_ARCHIVE
 from csplat.errors import CsplatError
-from csplat_tools.console import format_table
-from csplat_tools.inout import is_csplat
+from csplat_tools.files.console import format_table
+from csplat_tools.files.streams import is_csplat
 
 _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
 _PRESETS = "fast,balanced,small"

@@ -40,11 +40,10 @@ from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
-from csplat_tools.extras import need_renderer
-from csplat_tools.importances import measured_importance
+from csplat_tools.files.extras import need_renderer
 from csplat_tools.optimise.optimiser import optimise
-from csplat_tools.optimise.sensitivity import measuring_views
-from csplat_tools.target import Target
+from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
+from csplat_tools.optimise.target import Target
 from csplat_tools.views import BLACK, find_view_set
 
 __all__ = ["main"]

@@ -30,9 +30,8 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
-from csplat_tools.importances import measured_importance
-from csplat_tools.models import without_bands
-from csplat_tools.optimise.sensitivity import measuring_views
+from csplat_tools.files.scenes import without_bands
+from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"

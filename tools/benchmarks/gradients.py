@@ -35,7 +35,7 @@ from scenes import DATA, ROOT, find_scenes
 from csplat.ply import read_ply
 from csplat_render.arrays import Splats
 from csplat_render.cameras import load_cameras
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _SCENES = "donut,horse,jacket,plane3,lego60k,fox60k_noreg,fox120k"
 _SPLATS = 9

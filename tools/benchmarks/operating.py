@@ -27,9 +27,9 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.judge import Judge
-from csplat_tools.models import without_bands
+from csplat_tools.files.scenes import without_bands
 from csplat_tools.optimise.optimiser import optimise
-from csplat_tools.target import Target
+from csplat_tools.optimise.target import Target
 from csplat_tools.tradeoff.fetching import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras, find_view_set
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 __all__ = ["laid_out"]
 

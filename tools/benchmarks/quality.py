@@ -30,7 +30,7 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
-from csplat_tools.extras import need_renderer
+from csplat_tools.files.extras import need_renderer
 from csplat_tools.views import comparison_cameras
 
 __all__ = ["decoded_presets"]

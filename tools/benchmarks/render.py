@@ -35,7 +35,7 @@ from csplat.ply import read_ply
 from csplat_render import Camera, render
 from csplat_render.rasterise import Rasteriser
 from csplat_render.warmup import warm_up
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _SCENES = "lego60k,fox120k,lego@90k,fox@90k,lego@500k,fox@500k"
 #: Name of a line, mode, antialiased.

@@ -31,8 +31,8 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
-from csplat_tools.extras import need_renderer
-from csplat_tools.importances import Measured, measure_scene
+from csplat_tools.files.extras import need_renderer
+from csplat_tools.optimise.sensitivity import Measured, measure_scene
 from csplat_tools.views import BLACK, DataOptions, comparison_cameras, find_view_set
 from csplat_trainer.sensitivity_file import read_sensitivity
 

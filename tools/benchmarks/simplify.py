@@ -38,12 +38,12 @@ from csplat_render.rasterise import Rasteriser
 from csplat_render.refit import ColourOperator
 from csplat_render.removal import measure_removal, removal_exact
 from csplat_render.virtual import FIELD_OF_VIEW, scene_frame, virtual_cameras
-from csplat_tools.simplify import SimplifyOptions
-from csplat_tools.simplify.colours import fit
-from csplat_tools.simplify.core import prepare
-from csplat_tools.simplify.order import removal_order
-from csplat_tools.simplify.views import Measured, find_views
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.simplify.colours import fit
+from csplat_tools.optimise.simplify.order import removal_order
+from csplat_tools.optimise.simplify.simplify import prepare
 from csplat_tools.views import BLACK, VIEW_SIZE, ViewSet, camera_sequence, find_view_set, with_deciders
+from csplat_tools.views.agreeing import Measured, find_views
 
 _SCENES = "plane3,lego60k,fox120k,fox60k_noreg,donut,jacket,statue"
 _METHODS = ("opacity", "opacity-area", "exact", "rounds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 __all__ = ["tables"]
 

@@ -13,8 +13,8 @@ from study_scenes import Subject
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
-from csplat_tools.layout import describe
-from csplat_tools.strategies import (
+from csplat_tools.inspect.layout import describe
+from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
     Reduction,

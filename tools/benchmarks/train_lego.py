@@ -20,7 +20,7 @@ from typing import Any
 
 from machine import describe_machine
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _HEADER = ("splats", "SH", "PSNR mean, dB", "pooled", "covered", "SSIM", "LPIPS", "train, s", "ms/step", "peak, MB")
 

@@ -25,7 +25,7 @@ from child import peak_bytes, reset_peak
 from machine import describe_machine
 from scenes import DATA
 
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _ROWS = "1000:200x200,20000:200x200,100000:400x400,500000:640x480"
 _STAGES = ("forward", "loss", "backward", "Adam", "other")

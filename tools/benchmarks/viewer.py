@@ -33,9 +33,9 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.camera import Camera
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.console import format_table
-from csplat_tools.serving import open_server
-from csplat_tools.viewing import open_scene
+from csplat_tools.files.console import format_table
+from csplat_tools.present.server import open_server
+from csplat_tools.present.viewing import open_scene
 
 _SIZES = (100_000, 500_000, 1_000_000)
 _SOURCES = ("fox120k", "donut")

@@ -27,7 +27,7 @@ from csplat.ply import read_ply
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
-from csplat_tools.console import format_table
+from csplat_tools.files.console import format_table
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,object_id,statue,donut,jacket,horse,angel,st-peter"
 _LIMIT = 1.0  # dB between given and own cameras

@@ -1,6 +1,27 @@
-"""`python -m csplat_tools` is `csplat`."""
+"""`csplat`: where the installed script, and `python -m csplat_tools`, begin."""
 
-from csplat_tools.cli import main
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+
+def main() -> None:
+    """Run the program.
+
+    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one.
+    """
+    try:
+        from csplat_tools.cli.app import app
+
+        app(prog_name="csplat")
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        sys.exit(_INTERRUPTED)
+
 
 if __name__ == "__main__":
     main()

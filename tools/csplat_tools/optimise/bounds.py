@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_tools.files.console import Progress
 from csplat_tools.optimise.report import Optimised, Report
-from csplat_tools.target import Target
+from csplat_tools.optimise.target import Target
 
 __all__ = ["Bounded", "encode_within", "meet_bounds"]
-
-Progress = Callable[[str, float], None]
 
 _TRIES = 12
 _NEAR = 0.9  # of a bound that is good enough; below it a coarser step is tried

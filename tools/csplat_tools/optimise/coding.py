@@ -9,7 +9,7 @@ import numpy as np
 
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat.model import SplatModel
-from csplat_tools.models import without_bands
+from csplat_tools.files.scenes import without_bands
 from csplat_tools.optimise.solving import Solver
 from csplat_tools.optimise.trials import Coding, Part, Trial
 

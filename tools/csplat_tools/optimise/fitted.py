@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
 from csplat.model import SplatModel
 from csplat_render.removal import Removal, measure_removal
+from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import error_of_psnr
+from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.optimise.simplify.colours import fit, refitted
+from csplat_tools.optimise.simplify.simplify import Session
 from csplat_tools.optimise.trials import Trial
-from csplat_tools.simplify.bands import band_mask, free_coefficients, without
-from csplat_tools.simplify.colours import fit, refitted
-from csplat_tools.simplify.core import Session
 from csplat_tools.views import evenly
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -28,7 +29,6 @@ __all__ = ["Fitted"]
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Progress = Callable[[str, float], None]
 Seen = Callable[[SplatModel], float]
 
 _GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 of plane3 take 3 % more with grades

@@ -8,7 +8,7 @@ from csplat.model import SplatModel
 from csplat_render.judge import Judge
 from csplat_render.metrics import PSNR_CAP
 from csplat_tools.optimise.solving import Goal
-from csplat_tools.target import Target
+from csplat_tools.optimise.target import Target
 
 __all__ = ["goal_of", "loss_as_psnr"]
 

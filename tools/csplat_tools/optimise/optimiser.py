@@ -9,7 +9,6 @@ whether they are better. Nothing is tried that is not expected to pay.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +21,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
+from csplat_tools.files.console import Progress
 from csplat_tools.optimise.bounds import meet_bounds
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.goals import goal_of
@@ -30,17 +30,15 @@ from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.report import Optimised
 from csplat_tools.optimise.reporting import reported
 from csplat_tools.optimise.sensitivity import measured_for
+from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.solving import Solver
+from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, Whole
-from csplat_tools.simplify.options import SimplifyOptions
-from csplat_tools.target import Target
 from csplat_tools.views import VIRTUAL, ViewSet, with_deciders
 
 __all__ = ["expected_seconds", "optimise"]
 
 Weights = NDArray[Any] | Importance
-Progress = Callable[[str, float], None]
-
 _INSIDE = (
     "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
     " --data, or --cameras with 40 of them, would decide by yours, --keep-all leaves all"

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import LEAST_QUANTISED, error_at_size, error_of_psnr, log_bytes_at_error
 from csplat_tools.optimise.fitted import Fitted
-from csplat_tools.simplify.core import Session, prepare
-from csplat_tools.simplify.options import SimplifyOptions
-from csplat_tools.simplify.order import removal_order
+from csplat_tools.optimise.simplify.options import SimplifyOptions
+from csplat_tools.optimise.simplify.order import removal_order
+from csplat_tools.optimise.simplify.simplify import Session, prepare
 from csplat_tools.views import ViewSet
 
 __all__ = ["Removal"]
 
 F64 = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 Cost = Callable[[F64, F64], F64]
 Seen = Callable[[SplatModel], float]
 

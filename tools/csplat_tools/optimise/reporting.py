@@ -8,8 +8,8 @@ from typing import Any
 
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.report import Report
+from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, spread_of
-from csplat_tools.target import Target
 
 __all__ = ["reported"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -16,13 +16,12 @@ from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance
 from csplat.model import SplatModel
 from csplat_render.judge import Judge
 from csplat_render.metrics import psnr_of_mse
+from csplat_tools.files.console import Progress
 
 __all__ = ["Coding", "Part", "Trial", "Trials", "Whole", "spread_of"]
 
 F64 = NDArray[np.float64]
 Weights = NDArray[Any] | Importance
-Progress = Callable[[str, float], None]
-
 _ENTRIES = (16, 8192)  # of a codebook that is chosen here, at least and at most
 _QUICK_EFFORT = 10  # of files that are compared: half of the time of the highest goes into the last per cent
 

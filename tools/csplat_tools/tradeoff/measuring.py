@@ -17,8 +17,8 @@ from csplat.model import SplatModel
 from csplat_render.cameras import relative_to
 from csplat_render.judge import renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
-from csplat_tools.console import Report
-from csplat_tools.layout import describe
+from csplat_tools.files.console import Progress
+from csplat_tools.inspect.layout import describe
 from csplat_tools.tradeoff.fetching import fetched_bytes
 from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
 from csplat_tools.tradeoff.setting import Setting
@@ -46,7 +46,7 @@ class StageClock:
         self._lock = threading.Lock()
         self._last = time.perf_counter()
 
-    def listening(self, report: Report) -> Report:
+    def listening(self, report: Progress) -> Progress:
         """Pass calls on, and note when they come. What passes before a stage is at 0 is not its own."""
 
         def told(stage: str, done: float) -> None:
@@ -83,7 +83,7 @@ class Measurer:
         self.source_modes = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
 
-    def measure(self, candidate: Candidate, progress: Report) -> Point:
+    def measure(self, candidate: Candidate, progress: Progress) -> Point:
         """Make a file and measure it.
 
         Raises:

@@ -93,12 +93,12 @@ def parse_numbers(text: str) -> tuple[float, ...]:
 
 
 def parse_sizes(text: str) -> tuple[int, ...]:
-    """Bytes from `2MB,800kB`, see `csplat_tools.target.parse_size_bytes`.
+    """Bytes from `2MB,800kB`, see `csplat_tools.optimise.target.parse_size_bytes`.
 
     Raises:
         InputError: one is no size.
     """
-    from csplat_tools.target import parse_size_bytes
+    from csplat_tools.optimise.target import parse_size_bytes
 
     return tuple(dict.fromkeys(parse_size_bytes(word) for word in parse_words(text)))
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from csplat_tools.inout import write_bytes
-from csplat_tools.pictures import check_folder
+from csplat_tools.files.pictures import check_folder
+from csplat_tools.files.streams import write_bytes
 from csplat_tools.tradeoff.page import make_page
 from csplat_tools.tradeoff.plots import PLOTS, draw_plot
 from csplat_tools.tradeoff.running import Tradeoff

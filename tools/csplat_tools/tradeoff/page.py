@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from csplat_tools.console import format_bytes
+from csplat_tools.files.console import format_bytes
 from csplat_tools.tradeoff.measuring import DECODE_RUNS
 from csplat_tools.tradeoff.page_parts import SCRIPT, STYLE, policy
 from csplat_tools.tradeoff.plots import draw_plot

@@ -8,7 +8,7 @@ from typing import Any
 
 from csplat.errors import CsplatError, InputError
 from csplat_render.jit import thread_count
-from csplat_tools.console import Report, format_bytes, note, progress_bar
+from csplat_tools.files.console import Progress, format_bytes, note, progress_bar
 from csplat_tools.tradeoff.machine import describe_machine
 from csplat_tools.tradeoff.measuring import DECODE_RUNS, Measurer
 from csplat_tools.tradeoff.options import Wanted
@@ -124,7 +124,7 @@ def measure_tradeoff(setting: Setting, wanted: Wanted, *, quiet: bool = True) ->
             note(f"{len(tried)} files to make and to measure: about {_duration(sum(costs))}")
         points = list[Point | Failure]()
         with progress_bar(quiet=quiet) as bar:
-            report: Report = bar or (lambda _stage, _done: None)
+            report: Progress = bar or (lambda _stage, _done: None)
             for number, candidate in enumerate(tried):
                 report("the sweep", sum(costs[:number]) / sum(costs))
                 points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
@@ -145,7 +145,7 @@ def estimated_seconds(kind: str, setting: Setting, wanted: Wanted, modes: dict[s
     return 0.5 + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
 
 
-def _measured(measurer: Measurer, candidate: Candidate, progress: Report) -> Point | Failure:
+def _measured(measurer: Measurer, candidate: Candidate, progress: Progress) -> Point | Failure:
     try:
         return measurer.measure(candidate, progress)
     except CsplatError as error:

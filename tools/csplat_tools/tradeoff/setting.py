@@ -12,7 +12,7 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance
-from csplat_tools.inout import STANDARD_STREAM, ply_path
+from csplat_tools.files.streams import STANDARD_STREAM, ply_path
 from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = ["Setting", "read_setting"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat_render.metrics import psnr
-from csplat_tools.pictures import panels
+from csplat_tools.files.pictures import panels
 from csplat_tools.tradeoff.points import Shown
 
 __all__ = ["AMPLIFICATION", "WorstView", "as_data_uri"]

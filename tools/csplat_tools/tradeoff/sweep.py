@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.model import SplatModel
-from csplat_tools.console import Report, format_bytes
+from csplat_tools.files.console import Progress, format_bytes
 from csplat_tools.tradeoff.options import Wanted
 from csplat_tools.tradeoff.points import Made
 from csplat_tools.tradeoff.setting import Setting
 
 if TYPE_CHECKING:
-    from csplat_tools.strategies import Reduction
+    from csplat_tools.study import Reduction
 
 __all__ = ["Candidate", "candidates"]
 
@@ -36,7 +36,7 @@ class Candidate:
 
     name: str
     family: str
-    make: Callable[[Report], Made]
+    make: Callable[[Progress], Made]
     is_partial: bool = False
     cost: str | None = None
 
@@ -69,7 +69,7 @@ def _precisions(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     """Bands, splats and values taken away by simple rules; what looks at pictures comes last."""
-    from csplat_tools.strategies import Reduction, parse_kmeans
+    from csplat_tools.study import Reduction, parse_kmeans
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> Candidate:
         how = replace(reduction, threads=wanted.threads)
@@ -109,12 +109,12 @@ def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
         yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(tune_file, setting, wanted, keep))
 
 
-def _encode(source: SplatModel, options: EncodeOptions, progress: Report) -> Made:
+def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> Made:
     return _made(encode_with_report(source, options, progress=progress))
 
 
-def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Report) -> Made:
-    from csplat_tools.strategies import encode_reduced
+def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Progress) -> Made:
+    from csplat_tools.study import encode_reduced
 
     return _made(
         encode_reduced(
@@ -124,9 +124,9 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Re
     )  # fmt: skip
 
 
-def _reach(setting: Setting, wanted: Wanted, progress: Report, **asked: Any) -> Made:
+def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -> Made:
     from csplat_tools.optimise.optimiser import optimise
-    from csplat_tools.target import Target
+    from csplat_tools.optimise.target import Target
 
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
     found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from csplat_tools.console import format_bytes, format_table
+from csplat_tools.files.console import format_bytes, format_table
 from csplat_tools.tradeoff.points import Partial, Point
 from csplat_tools.tradeoff.running import Tradeoff
 

@@ -5,11 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 from csplat.encoder import EncodeOptions
-from csplat_tools.console import Report
-from csplat_tools.finetuning import BYTE_COST, LEARNING_FACTOR, SHAPE_ENTRIES, VIEW_SIZE, VIEWS, Clock, begin, tune
+from csplat_tools.files.console import Progress
 from csplat_tools.tradeoff.options import Wanted
 from csplat_tools.tradeoff.points import Made
 from csplat_tools.tradeoff.setting import Setting
+from csplat_tools.training.finetune import (
+    BYTE_COST,
+    LEARNING_FACTOR,
+    SHAPE_ENTRIES,
+    VIEW_SIZE,
+    VIEWS,
+    Clock,
+    begin,
+    tune,
+)
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
 from csplat_trainer.finetune import FinetuneOptions, Moment
@@ -17,7 +26,7 @@ from csplat_trainer.finetune import FinetuneOptions, Moment
 __all__ = ["tune_file"]
 
 
-def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Report) -> Made:
+def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> Made:
     """Make the file that `csplat finetune` makes with its usual options, but for which virtual views decide.
 
     Args:
@@ -27,7 +36,7 @@ def tune_file(setting: Setting, wanted: Wanted, keep: float | None, progress: Re
         progress: is told the stages.
 
     Raises:
-        CsplatError: as `csplat_tools.finetuning.begin` and `tune`.
+        CsplatError: as `csplat_tools.training.finetune.begin` and `tune`.
     """
     itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)

@@ -21,7 +21,7 @@ from csplat.training import TrainedOn
 from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.extras import need_photographs
+from csplat_tools.files.extras import need_photographs
 from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence, evenly
 from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
 

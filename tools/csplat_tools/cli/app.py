@@ -1,0 +1,95 @@
+"""The commands together: what `csplat` runs. Each is imported when it is wanted: all take half a second."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+from typer.main import get_group
+
+import csplat
+from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat_tools.files.console import say
+
+__all__ = ["app"]
+
+#: Commands as `--help` lists them, and the modules of `csplat_tools.cli` that define them.
+_MODULES = {
+    "encode": "encode",
+    "decode": "decode",
+    "info": "info",
+    "verify": "verify",
+    "lint": "lint",
+    "compare": "compare",
+    "tradeoff": "tradeoff",
+    "render": "render",
+    "simplify": "simplify",
+    "sensitivity": "sensitivity",
+    "train": "train",
+    "finetune": "finetune",
+    "view": "view",
+    "export-html": "view",
+    "conformance": "conformance_encoder",
+}
+
+
+class _Commands(TyperGroup):
+    """Looks commands up in `_MODULES`. Owns those that were imported."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  # typer's
+        return list(_MODULES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  # typer's
+        # A name that is none is compared with all of them, to say which one may be meant.
+        for name in {cmd_name} & _MODULES.keys() or _MODULES:
+            if name not in self.commands:
+                self.commands[name] = _imported(name)
+        return self.commands.get(cmd_name)
+
+
+def _imported(name: str) -> Any:
+    """The command of a name, or the group of commands."""
+    found = getattr(import_module(f"csplat_tools.cli.{_MODULES[name]}"), name.replace("-", "_"))
+    alone = typer.Typer(rich_markup_mode="rich")
+    if isinstance(found, typer.Typer):
+        alone.add_typer(found, name=name)
+    else:
+        alone.command(name)(found)
+    return get_group(alone).commands[name]
+
+
+app = typer.Typer(
+    name="csplat",
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        say(f"csplat {csplat.__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions of program and format."),
+    ] = False,
+) -> None:
+    """csplat: 3D Gaussian splats, compressed.
+
+    Status 0: done. 1: refused or failed, with one line on standard error.
+    2: the command line is wrong.
+
+    Examples:
+      csplat encode scene.ply scene.csplat
+      csplat info scene.csplat
+      csplat decode scene.csplat scene.ply
+    """

@@ -1,0 +1,187 @@
+"""`csplat compare`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from csplat_tools.cli.console import guarded
+from csplat_tools.cli.data_options import Images, Size, Split, TestEvery, data_options
+from csplat_tools.cli.parsing import parse_colour, parse_mode
+from csplat_tools.files.console import format_table, note, progress_bar, say, say_json
+from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.inspect.attributes import AttributeErrors
+from csplat_tools.inspect.compare import FileComparison, compare_files
+
+__all__ = ["compare"]
+
+_PAIRING = {
+    "index": "pairs from the source index",
+    "order": "pairs by their order",
+    "search": "pairs found within the stated errors",
+}
+
+
+@guarded
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
+    cameras: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.json", help="Cameras, instead of virtual ones; of 40 or more every fourth, 24 at most."
+        ),
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(metavar="DATA", help="Or the cameras of a data set; its photographs judge A and B, too."),
+    ] = None,
+    split: Split = "test",
+    size: Size = None,
+    images: Images = None,
+    test_every: TestEvery = None,
+    source_index: Annotated[
+        str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
+    ] = None,
+    pictures: Annotated[
+        str | None, typer.Option(metavar="FOLDER", help="Write A, B and their difference, side by side, for each view.")
+    ] = None,
+    amplify: Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Of the differences shown.")] = 10.0,
+    lpips: Annotated[
+        str | None,
+        typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`."),
+    ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="R,G,B", help="Behind the scene: black, but with --data or --cameras as in training."),
+    ] = None,
+    mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
+    force: Annotated[bool, typer.Option("--force", help="Replace existing pictures.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything, for programs.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Compare a scene with its source: sizes, errors of the splats, and pictures.
+
+    `psnr` is that of the squared error pooled over all pixels and channels of
+    eight 640x480 views around A in front of black, or of the views given; 99
+    at most. The same error scores 10 dB more from four times as far away:
+    compare only numbers from the same cameras and background; white flatters
+    all of them. With --data the held-out photographs judge A and B as well.
+    Needs the packages of the render extra.
+
+    Examples:
+      csplat compare scene.ply scene.csplat
+      csplat compare scene.ply scene.csplat --data capture --lpips auto
+      csplat compare scene.ply scene.csplat --pictures differences
+      csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
+    """
+    if cameras is not None and data is not None:
+        raise typer.BadParameter("wanted one of --cameras and --data")
+    colour = None if background is None else parse_colour(background)
+    chosen = parse_mode(mode)
+    shots = data_options(data, size, images, test_every, split=split)
+    with progress_bar(quiet=quiet) as progress:
+        compared = compare_files(
+            a,
+            b,
+            cameras=cameras,
+            data=shots,
+            split=split,
+            source_index=source_index,
+            lpips=lpips,
+            pictures=pictures,
+            amplification=amplify,
+            background=colour,
+            mode=chosen,
+            force=force,
+            prepare=partial(prepare_renderer, quiet=quiet, ssim=True, lpips=lpips is not None),
+            progress=progress,
+        )
+    for line in () if quiet else compared.notes:
+        note(line)
+    if as_json:
+        say_json(compared.as_json())
+    else:
+        say(_format(compared, Path(a).name, Path(b).name))
+    if pictures is not None and not quiet:
+        note(f"{len(compared.quality.each)} files in {pictures}")
+
+
+def _format(compared: FileComparison, a: str, b: str) -> str:
+    parts = [_sizes(compared, a, b)]
+    if compared.attributes is None:
+        parts.append("errors of the splats are not known: which is which, `encode --source-index` writes down")
+    else:
+        parts.append(_attributes(compared.attributes))
+    parts.append(_quality(compared))
+    if compared.photographs is not None:
+        parts.append(_photographs(compared.photographs))
+    parts.append(f"{compared.seconds:.1f} s")
+    return "\n\n".join(parts)
+
+
+def _sizes(compared: FileComparison, a: str, b: str) -> str:
+    rows = []
+    for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
+        count = len(one.model)
+        per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
+        rows.append((name, one.size_bytes, count, one.model.sh_degree, per_splat))
+    table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
+    ratio = compared.ratio
+    return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
+
+
+def _attributes(attributes: AttributeErrors) -> str:
+    rows = [(name, f"{largest:.4g}", f"{rms:.4g}") for name, (largest, rms) in attributes.errors.items()]
+    remark = _PAIRING[attributes.pairing]
+    if attributes.unmatched:
+        remark += f"; {attributes.unmatched} splats of B have none in A"
+    return format_table(("error", "max", "rms"), rows) + f"\n{remark}"
+
+
+def _quality(compared: FileComparison) -> str:
+    quality = compared.quality
+    rows = [
+        ("psnr", f"{quality.psnr:.2f} dB"),
+        ("psnr_mean", f"{quality.psnr_mean:.2f} dB"),
+        ("psnr_worst", f"{quality.psnr_worst:.2f} dB"),
+    ]
+    if quality.psnr_covered is not None:
+        rows.append(("psnr_covered", f"{quality.psnr_covered:.2f} dB"))
+    if quality.ssim is not None:
+        rows.append(("ssim", f"{quality.ssim:.5f}"))
+    if quality.lpips is not None:
+        rows.append(("lpips", f"{quality.lpips:.5f}"))
+    if quality.cover is not None:
+        rows.append(("cover", f"{100.0 * quality.cover:.1f} %"))
+    lines = [format_table(("pictures", _cameras(compared)), rows)]
+    lines += _ignored(compared)
+    if compared.a.model.antialiased != compared.b.model.antialiased:
+        lines.append(f"only {'A' if compared.a.model.antialiased else 'B'} is antialiased, and was rendered so")
+    return "\n".join(lines)
+
+
+def _photographs(scores: dict[str, Any]) -> str:
+    rows = []
+    for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
+        a, b = scores["a"][name], scores["b"][name]
+        if a is not None and b is not None:
+            rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
+    header = (f"against {scores['a']['views']} {scores['split']} photographs", "A", "B", "B - A")
+    return format_table(header, rows)
+
+
+def _cameras(compared: FileComparison) -> str:
+    views = len(compared.quality.each)
+    return f"{views} virtual views" if compared.cameras == "virtual" else f"{views} views of {compared.cameras}"
+
+
+def _ignored(compared: FileComparison) -> list[str]:
+    return [
+        f"{count} splats of {name} hold NaN or infinities and are not drawn"
+        for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)
+        if count
+    ]

@@ -1,0 +1,266 @@
+"""PLY to .csplat and back: what `csplat encode` and `csplat decode` do, apart from the command line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import Limits, decode
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
+from csplat.errors import InputError
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_tools.files.console import Progress
+from csplat_tools.files.importance import read_importance, weights_of
+from csplat_tools.files.scenes import without_bands
+from csplat_tools.files.streams import mapped_csplat, ply_path, write_array, write_bytes, write_model
+from csplat_trainer.sensitivity_file import StoredSensitivity
+
+__all__ = [
+    "Encoded",
+    "Encoder",
+    "Made",
+    "SceneFacts",
+    "decode_file",
+    "encode_file",
+    "findings_as_json",
+    "limits_for",
+]
+
+_ONE_GRADE = (
+    "all splats are of one grade: weights alone do not say how precise they have to be, nor do virtual views inside of"
+    " surroundings; `csplat sensitivity` from cameras does"
+)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A file, and what whoever made it has to say.
+
+    Attributes:
+        result: of the encoder.
+        key: under which name a report has `said`.
+        said: what was looked for, tried and chosen, JSON-compatible.
+    """
+
+    result: EncodeResult
+    key: str = ""
+    said: Mapping[str, Any] = field(default_factory=dict)
+
+
+#: Makes a file of a scene.
+Encoder = Callable[[SplatModel, EncodeOptions, Progress | None], Made]
+
+_SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What a PLY may not say of its scene; `None` keeps what it says.
+
+    Attributes:
+        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
+        licence: goes into the metadata.
+    """
+
+    coordinate_system: str | None = None
+    unit_metres: float | None = None
+    antialiased: bool | None = None
+    licence: str | None = None
+
+    def applied(self, model: SplatModel) -> SplatModel:
+        """Return the model with these facts."""
+        changes: dict[str, Any] = {
+            name: value
+            for name in ("coordinate_system", "unit_metres", "antialiased")
+            if (value := getattr(self, name)) is not None
+        }
+        if self.licence is not None:
+            changes["metadata"] = {**model.metadata, "licence": self.licence}
+        return replace(model, **changes) if changes else model
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """What an encoding took and gave.
+
+    Attributes:
+        made: the file.
+        findings: what lint noticed in the PLY.
+        source_bytes: size of the PLY.
+        seconds: reading, encoding and writing.
+    """
+
+    made: Made
+    findings: tuple[Finding, ...]
+    source_bytes: int
+    seconds: float
+
+    @property
+    def result(self) -> EncodeResult:
+        """Of the encoder."""
+        return self.made.result
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        report = self.result.report
+        count = report.splat_count
+        return {
+            "splats": count,
+            "size_bytes": report.size_bytes,
+            "source_bytes": self.source_bytes,
+            "ratio": self.source_bytes / report.size_bytes,
+            "bytes_per_splat": report.size_bytes / count if count else None,
+            "tiles": report.tile_count,
+            "seconds": round(self.seconds, 3),
+            "defects": findings_as_json(self.findings),
+            "notes": list(report.notes),
+            "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
+            "options": report.options,
+            **({self.made.key: dict(self.made.said)} if self.made.key else {}),
+        }
+
+
+def encode_file(
+    source: str,
+    target: str,
+    options: EncodeOptions,
+    *,
+    facts: SceneFacts | None = None,
+    strict: bool = False,
+    importance: str | None = None,
+    prune_unseen: bool = False,
+    source_index: str | None = None,
+    encoder: Encoder | None = None,
+    progress: Progress | None = None,
+) -> Encoded:
+    """Read a PLY, encode it, write the file.
+
+    Args:
+        source: a PLY, or `-`.
+        target: the file to write, or `-`. Whether it may be replaced has been settled before.
+        options: of the encoder; `keep_extra` holds for reading too.
+        facts: what the PLY does not say.
+        strict: refuse what would be repaired.
+        importance: a .npy file with one weight per splat of the PLY as read, or what `csplat sensitivity` wrote.
+        prune_unseen: leave out the splats that no view of the sensitivities saw.
+        source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
+        encoder: does more than to encode; `importance` is not for it.
+        progress: is told the stages.
+
+    Raises:
+        CsplatError: the PLY or the options cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    start = time.perf_counter()
+    findings: list[Finding] = []
+    if progress is not None:
+        progress("reading", 0.0)
+    with ply_path(source) as path:
+        model = read_ply(path, strict=strict, keep_extra=options.keep_extra, report=findings)
+        source_bytes = path.stat().st_size
+    if progress is not None:
+        progress("reading", 1.0)
+    model = (facts or SceneFacts()).applied(model)
+    if encoder is not None:
+        made = encoder(model, options, progress)
+    else:
+        made = Made(_encoded(model, options, importance, prune_unseen, progress))
+    write_bytes(target, made.result.data)
+    if source_index is not None:
+        write_array(source_index, made.result.source_index)
+    return Encoded(made, tuple(findings), source_bytes, time.perf_counter() - start)
+
+
+def _encoded(
+    model: SplatModel, options: EncodeOptions, importance: str | None, prune_unseen: bool, progress: Progress | None
+) -> EncodeResult:
+    found = None if importance is None else read_importance(importance, model)
+    stored = found if isinstance(found, StoredSensitivity) else None
+    if prune_unseen and stored is None:
+        raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
+    weights = None if found is None else weights_of(found, model)
+    notes = _unheeded(options, weights)
+    if not prune_unseen or stored is None or stored.seen.all():
+        return _noted(encode_with_report(model, options, importance=weights, progress=progress), *notes)
+    rows = np.flatnonzero(stored.seen)
+    if not len(rows):
+        raise InputError(f"{importance}: no view saw any splat; nothing would be left")
+    said = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
+    result = encode_with_report(
+        model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
+        origin=Origin(len(model), rows), said={"pruned": said}, progress=progress,
+    )  # fmt: skip
+    if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
+        missed = (
+            f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
+            " them: `csplat sensitivity` with more views misses fewer"
+        )
+        notes = (*notes, missed)
+    return _noted(result, *notes)
+
+
+def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance | None) -> tuple[str, ...]:
+    """What an importance does not say, though it is asked for."""
+    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.curvatures is not None):
+        return ()
+    return (_ONE_GRADE,)
+
+
+def _noted(result: EncodeResult, *notes: str) -> EncodeResult:
+    """The same, with sentences for the user."""
+    return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))
+
+
+def decode_file(
+    source: str,
+    target: str,
+    *,
+    sh_degree: int | None = None,
+    absolute: bool = False,
+    max_splats: int | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Read a .csplat file, write a PLY.
+
+    Args:
+        source: the file, or `-`.
+        target: the PLY to write, or `-`. Whether it may be replaced has been settled before.
+        sh_degree: leave out the bands above.
+        absolute: add the origin and write doubles.
+        max_splats: budget; the default is the decoder's.
+        progress: called with the stage's name and the share done.
+
+    Raises:
+        CsplatError: the file is not valid, or too large.
+        OSError: a file cannot be read or written.
+    """
+    report = progress or (lambda _stage, _done: None)
+    report("decoding", 0.0)
+    with mapped_csplat(source) as data:
+        # All bands, even if not all are wanted: the digest is that of the whole file.
+        model = decode(data, limits=limits_for(max_splats))
+    if sh_degree is not None:
+        model = without_bands(model, sh_degree)
+    report("decoding", 1.0)
+    report("writing", 0.0)
+    write_model(target, model, absolute=absolute)
+    report("writing", 1.0)
+
+
+def limits_for(max_splats: int | None) -> Limits:
+    """Return the decoder's budgets, or what that many splats can take."""
+    if max_splats is None:
+        return Limits()
+    return Limits(splats=max_splats, bytes=max(Limits().bytes, max_splats * _SPLAT_BYTES_MAX))
+
+
+def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
+    """Return findings as JSON-compatible values."""
+    return [{"id": one.id, "kind": one.kind, "count": one.count, "text": one.text} for one in findings]

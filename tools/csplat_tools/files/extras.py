@@ -1,0 +1,104 @@
+"""What a plain install leaves out, and one line that says how to get it."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+from csplat.errors import InputError
+from csplat_tools.files.console import note
+
+__all__ = ["need_photographs", "need_pictures", "need_plots", "need_renderer", "need_trainer", "prepare_renderer"]
+
+_PHOTOGRAPHS = (
+    ("numba", None),
+    ("scipy", None),
+    ("PIL", "pillow"),
+)  # what reading and rendering them needs
+
+
+def need_renderer() -> None:
+    """Import what rendering needs: better absent now than after the minutes that reading may take.
+
+    Raises:
+        InputError: numba is not installed.
+    """
+    _need("numba")
+
+
+def prepare_renderer(*, quiet: bool, simplify: bool = False, ssim: bool = False, lpips: bool = False) -> None:
+    """Compile the renderer, or load what was compiled before; say so on a terminal if it takes its time.
+
+    Args:
+        quiet: say nothing.
+        simplify: what simplification runs too.
+        ssim: what SSIM runs too.
+        lpips: what LPIPS runs too.
+
+    Raises:
+        InputError: numba is not installed.
+    """
+    need_renderer()
+    from csplat_render.warmup import warm_up
+
+    announce = None if quiet or not sys.stderr.isatty() else note
+    others = [_warm_up_adam] if simplify else []
+    warm_up(announce, gradients=simplify, simplify=simplify, ssim=ssim, lpips=lpips, others=others)
+
+
+def need_trainer(*, plots: bool = False) -> None:
+    """Import what training on the CPU needs: torch is not among it.
+
+    Args:
+        plots: what drawing needs, too.
+
+    Raises:
+        InputError: a package is not installed.
+    """
+    need_photographs()
+    if plots:
+        need_plots()
+
+
+def need_pictures() -> None:
+    """Import what writing pictures needs.
+
+    Raises:
+        InputError: pillow is not installed.
+    """
+    _need("PIL", "pillow")
+
+
+def need_plots() -> None:
+    """Import what drawing plots needs.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    _need("matplotlib")
+
+
+def need_photographs() -> None:
+    """Import what reading data sets needs.
+
+    Raises:
+        InputError: a package is not installed.
+    """
+    for module, package in _PHOTOGRAPHS:
+        _need(module, package)
+
+
+def _warm_up_adam() -> None:
+    import numpy as np
+
+    from csplat_trainer.parameters import Parameters, adam_step
+
+    values = {"quats": np.zeros((0, 4), np.float32), "logits": np.zeros(1, np.float32)}
+    adam_step(Parameters.starting_at(values), values, dict.fromkeys(values, 0.0))
+
+
+def _need(module: str, package: str | None = None) -> None:
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(f"this needs {package or error.name or module}: pip install 'csplat[render]'") from None

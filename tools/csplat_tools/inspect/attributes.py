@@ -1,0 +1,108 @@
+"""How far the splats of one scene lie from those of another, where it is known or can be found which is which."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_tools.files.scenes import LoadedModel
+from csplat_tools.inspect.matching import match
+from csplat_tools.inspect.pairs import measure_pairs
+from csplat_tools.inspect.proof import lattice_radii
+
+__all__ = ["AttributeErrors", "attribute_errors"]
+
+Pairing = Literal["index", "order", "search"]
+
+_NEAR = 0.01  # of the scene's spread: splats of one order are nearer to each other, shuffled ones far from it
+
+
+@dataclass(frozen=True)
+class AttributeErrors:
+    """Errors of pairs of splats.
+
+    Attributes:
+        pairing: how the pairs are known. `index`: from a source index. `order`: both scenes hold as many splats, and
+            the centres say that the order is the same. `search`: a source splat within the errors that the file
+            states, which need not be the one that it was.
+        matched: splats of the other scene that have a partner; only these are measured.
+        unmatched: those that have none.
+        errors: largest and rms error by measure, in the order of the registry.
+    """
+
+    pairing: Pairing
+    matched: int
+    unmatched: int
+    errors: dict[str, tuple[float, float]]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values; what overflowed is `null`."""
+        return {
+            "pairing": self.pairing,
+            "matched": self.matched,
+            "unmatched": self.unmatched,
+            "errors": {
+                name: {"max": _finite(largest), "rms": _finite(rms)} for name, (largest, rms) in self.errors.items()
+            },
+        }
+
+
+def attribute_errors(
+    source: LoadedModel,
+    other: LoadedModel,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Callable[[str, float], None] | None = None,
+) -> AttributeErrors | None:
+    """Measure the errors of a scene's splats against those of its source.
+
+    Args:
+        source: the scene it was made from.
+        other: what became of it.
+        source_index: [N] integers, which source splat each splat of `other` is. `None`: not known.
+        progress: is told how far a search has come.
+
+    Returns:
+        The errors; `None` where it cannot be found out which splat is which.
+
+    Raises:
+        InputError: `source_index` is not one index of a source splat for each splat of `other`.
+    """
+    ours, theirs = source.model, other.model
+    if source_index is not None:
+        return AttributeErrors("index", len(theirs), 0, measure_pairs(ours, theirs, source_index))
+    if _same_order(ours, theirs):
+        return AttributeErrors("order", len(theirs), 0, measure_pairs(ours, theirs, np.arange(len(theirs))))
+    stated, header = other.stated_errors, other.header
+    if header is None or stated is None or stated.refitted or ours.origin != theirs.origin or not len(theirs):
+        return None
+    bounds = {record.measure: record.max for record in stated.records}
+    if not bounds.keys() >= {"means", "opacities", "sh0"}:
+        return None
+    found = match(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    matched = np.flatnonzero(found >= 0)
+    if not len(matched):
+        return None
+    errors = measure_pairs(ours, theirs.select(matched), found[matched])
+    return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
+
+
+def _same_order(source: SplatModel, other: SplatModel) -> bool:
+    """Whether splat i of one stands for splat i of the other: of a shuffled scene half the splats are far off."""
+    if len(source) != len(other) or not len(source):
+        return False
+    means = source.means.astype(np.float64)
+    shift = np.subtract(other.origin, source.origin)
+    distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
+    spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
+    return float(np.median(distances)) <= _NEAR * spread
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,195 @@
+"""Two files compared in everything: what `csplat compare` does, apart from the command line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat_render.judge import Judge, OnView
+from csplat_render.lpips import load_lpips
+from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_tools.files.extras import need_pictures, need_renderer
+from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
+from csplat_tools.files.scenes import LoadedModel, load_model
+from csplat_tools.files.streams import read_array
+from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors
+from csplat_tools.views import Colour, DataOptions, find_view_set
+
+__all__ = ["USUAL_WEIGHTS", "FileComparison", "compare_files"]
+
+F32 = NDArray[np.float32]
+
+#: Instead of a file of LPIPS weights: look for them where they usually are.
+USUAL_WEIGHTS = "auto"
+
+
+@dataclass(frozen=True, eq=False)
+class FileComparison:
+    """What was found out about two files.
+
+    Attributes:
+        a: the source.
+        b: what became of it.
+        attributes: errors of its splats; `None` where it cannot be found out which splat is which.
+        quality: what pictures say.
+        ignored: splats of A that were not drawn because they hold NaN or infinities.
+        cameras: where they were taken from: the name of a camera file or of a data set, or `virtual`.
+        photographs: what A's and B's pictures score against the photographs of a data set, as `Scores` says, by the
+            keys `split`, `a` and `b`; `None` where there is no data set.
+        background, mode: of the pictures.
+        notes: what the user should know of the views.
+        seconds: reading, matching, rendering and writing.
+    """
+
+    a: LoadedModel
+    b: LoadedModel
+    attributes: AttributeErrors | None
+    quality: Scores
+    ignored: int
+    cameras: str
+    photographs: dict[str, Any] | None
+    background: Colour
+    mode: str
+    notes: tuple[str, ...]
+    seconds: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times B is smaller than A."""
+        return self.a.size_bytes / self.b.size_bytes
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        return {
+            "a": self.a.as_json(),
+            "b": self.b.as_json(),
+            "ratio": self.ratio,
+            "attributes": None if self.attributes is None else self.attributes.as_json(),
+            "cameras": self.cameras,
+            "background": list(self.background),
+            "mode": self.mode,
+            "photographs": self.photographs,
+            **self.quality.as_json(),
+            "ignored": {"a": self.ignored, "b": self.quality.ignored},
+            "views": [
+                {name: getattr(one, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
+                for one in self.quality.each
+            ],
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def compare_files(
+    a: str,
+    b: str,
+    *,
+    cameras: str | None = None,
+    data: DataOptions | None = None,
+    split: str = "test",
+    source_index: str | None = None,
+    lpips: str | None = None,
+    pictures: str | None = None,
+    amplification: float = 10.0,
+    background: Colour | None = None,
+    mode: str = "standard",
+    force: bool = False,
+    prepare: Callable[[], object] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> FileComparison:
+    """Compare a file with its source.
+
+    Args:
+        a: the source, PLY or .csplat.
+        b: what became of it, PLY or .csplat.
+        cameras: a camera file, of which those cameras are taken that judge; the virtual cameras of A if left out.
+        data: instead: views of a data set, whose photographs judge A and B, too.
+        split: which of its photographs.
+        source_index: a .npy file, which splat of A each splat of B is.
+        lpips: a file of LPIPS weights, or `auto` for the usual places; it is not computed if left out.
+        pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
+        amplification: of the difference.
+        background: red, green, blue, 0..1; if left out black for virtual cameras, else as `find_view_set` says.
+        mode: of the renderer.
+        force: existing pictures may be replaced.
+        prepare: is called when all that is named has been read and checked, before the first picture.
+        progress: is told the stages.
+
+    Raises:
+        CsplatError: a file is not valid, or exists; or no photograph judges; or the renderer is not installed.
+        OSError: a file cannot be read or written.
+    """
+    start = time.perf_counter()
+    need_renderer()
+    if pictures is not None:
+        need_pictures()
+    if a == b == "-":
+        raise InputError("A and B cannot both be standard input")
+    if cameras is not None and data is not None:
+        raise InputError("wanted cameras of a file or of a data set, not both")
+    distance = None if lpips is None else load_lpips(None if lpips == USUAL_WEIGHTS else lpips)
+    rows = None if source_index is None else read_array(source_index)
+    source, other = load_model(a), load_model(b)
+    views = find_view_set(source.model, cameras=cameras, data=data, background=background, count=0, split=split)
+    if not views.judges:
+        raise InputError(f"{views.name} has no {split} pictures")
+    by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
+    viewers: list[OnView] = []
+    if pictures is not None:
+        names = picture_names([camera.image for camera in views.judges])
+        viewers.append(_Sheets(pictures, names, by_photographs, amplification, force=force))
+    errors = attribute_errors(source, other, rows, progress=progress)
+    if prepare is not None:
+        prepare()
+    judges = None if by_photographs is None else _Both(by_photographs, distance)
+    viewers += [] if judges is None else [judges]
+    judge = views.judge(source.model, mode=mode, background=background)
+    quality = judge.scores(other.model, lpips=distance, on_view=_all_of(viewers), progress=progress)
+    return FileComparison(
+        source, other, errors, quality, judge.look(0).ignored, views.name,
+        None if judges is None else {"split": split, **judges.as_json()},
+        views.background, mode, views.notes, time.perf_counter() - start,
+    )  # fmt: skip
+
+
+class _Both:
+    """Scores A's and B's pictures against the photographs."""
+
+    def __init__(self, judge: Judge, distance: Distance | None) -> None:
+        self._judge, self._distance = judge, distance
+        self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        for each, seen in zip(self._each.values(), (a, b), strict=True):
+            each.append(self._judge.score(number, seen, lpips=self._distance))
+
+    def as_json(self) -> dict[str, Any]:
+        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
+
+
+class _Sheets:
+    """Writes one PNG per view, named as its photograph."""
+
+    def __init__(
+        self, folder: str, names: Sequence[str], photographs: Judge | None, amplification: float, *, force: bool
+    ) -> None:
+        self._files = [f"{name}.png" for name in names]
+        self._target = check_folder(folder, self._files, force=force)
+        self._photographs, self._amplification = photographs, amplification
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        shown = None if self._photographs is None else self._photographs.look(number).picture
+        write_png(self._target / self._files[number], panels(a, b, self._amplification, shown))
+
+
+def _all_of(viewers: Sequence[OnView]) -> OnView:
+    def show(number: int, a: F32, b: F32) -> None:
+        for viewer in viewers:
+            viewer(number, a, b)
+
+    return show

@@ -1,0 +1,180 @@
+"""Find for each decoded splat a source splat within given bounds, where nobody wrote down which one it was.
+
+Source splats are sorted by the cell of a grid over centre, opacity and green; cells are twice as wide as the bounds, so
+a splat's partner lies in its own cell or, along each axis, in the nearer neighbour. Most are found in the first of the
+32 cells. Memory is a few numbers per splat, beside blocks of fixed size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_tools.inspect.pairs import differences
+
+__all__ = ["UNDECIDED", "UNMATCHED", "allowed", "match"]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U64 = NDArray[np.uint64]
+
+UNMATCHED = -1  #: no source splat lies within the bounds
+UNDECIDED = -2  #: more candidates than were looked at
+
+_AXES = 5  # x, y, z, alpha, green
+_BLOCK = 1 << 16  # splats at a time
+_PAIR_BLOCK = 4096  # pairs whose SH is compared at a time
+_CANDIDATES_MAX = 1000  # of one cell: scenes of equals would take for ever
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+
+
+def allowed(measure: str, bound: float) -> float:
+    """What a measured error may reach: the bound, and what float64 rounding adds to it."""
+    return bound * (1.0 + 1e-9) + (1e-12 if measure == "covariance" else 0.0)
+
+
+def match(
+    source: SplatModel,
+    decoded: SplatModel,
+    bounds: Mapping[str, float],
+    radii: F64,
+    *,
+    candidates_max: int = _CANDIDATES_MAX,
+    progress: Callable[[str, float], None] | None = None,
+) -> I64:
+    """Find partners.
+
+    Args:
+        source: M splats, with the origin of `decoded`.
+        decoded: N splats.
+        bounds: largest error by measure, `means` and `opacities` and `sh0` among them; measures that are
+            not named are not looked at.
+        radii: [N], how near the partner's centre is expected; where there is none, the search goes on up to the bound.
+        candidates_max: how many splats of one cell are looked at for one partner.
+        progress: is told how much is done.
+
+    Returns:
+        [N] index of a source splat within the bounds, or `UNMATCHED`, or `UNDECIDED`.
+    """
+    found = np.full(len(decoded), UNMATCHED, np.int64)
+    if not len(source):
+        return found
+    bound = allowed("means", bounds["means"])
+    levels = _levels(radii, bound)
+    for radius in [*np.unique(levels[levels < bound]), bound]:
+        rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
+        grid = _Grid(source, float(radius), bounds) if len(rows) else None
+        for start in range(0, len(rows), _BLOCK):
+            if grid is not None:
+                part = rows[start : start + _BLOCK]
+                found[part] = _search(grid, source, decoded, part, bounds, candidates_max)
+            if progress is not None:
+                progress("matching splats", float(np.count_nonzero(found >= 0)) / len(found))
+    return found
+
+
+def _levels(radii: F64, bound: float) -> F64:
+    """Round radii up to powers of two, so that there are few grids; none is beyond the bound."""
+    with np.errstate(divide="ignore"):
+        exponents = np.ceil(np.log2(radii))
+    rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, -1000.0)), bound)
+    return rounded
+
+
+class _Grid:
+    """The source splats sorted by the hash of their cells."""
+
+    def __init__(self, source: SplatModel, radius: float, bounds: Mapping[str, float]) -> None:
+        margin = 1.0 + 1e-6  # rounding of the cells
+        self.widths = [2.0 * radius * margin] * 3
+        self.widths += [2.0 * allowed(name, bounds[name]) * margin for name in ("opacities", "sh0")]
+        keys = np.empty(len(source), np.uint64)
+        for start in range(0, len(source), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            cells = self.cells(source, rows)
+            keys[rows] = _hash([own for own, _ in cells])
+        self.order: I64 = np.argsort(keys, kind="stable")
+        self.keys: U64 = keys[self.order]
+
+    def cells(self, model: SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
+        """Per axis: the cell of each splat, and the neighbour that is nearer."""
+        columns = [*model.means[rows].T, model.opacities[rows], model.sh0[rows, 1]]
+        return [_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)]
+
+
+def _cells(values: F64, width: float) -> tuple[F64, F64]:
+    if width == 0.0:
+        return values, values  # equal or not
+    with np.errstate(over="ignore"):
+        scaled = values / width
+    own = np.floor(scaled)
+    with np.errstate(invalid="ignore"):
+        return own, np.where(scaled - own < 0.5, own - 1.0, own + 1.0)
+
+
+def _hash(cells: list[F64]) -> U64:
+    """Mix the bits of the cells. Equal hashes of unequal cells only cost a comparison."""
+    mixed = np.zeros(len(cells[0]), np.uint64)
+    for cell in cells:
+        mixed ^= (cell + 0.0).view(np.uint64)  # -0 becomes 0
+        mixed *= _MIX
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
+
+
+def _search(
+    grid: _Grid,
+    source: SplatModel,
+    decoded: SplatModel,
+    rows: I64,
+    bounds: Mapping[str, float],
+    candidates_max: int,
+) -> I64:
+    found = np.full(len(rows), UNMATCHED, np.int64)
+    cells = grid.cells(decoded, rows)
+    for probe in range(1 << _AXES):
+        left = np.flatnonzero(found == UNMATCHED)
+        if not len(left):
+            break
+        keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
+        first = np.searchsorted(grid.keys, keys, "left")
+        last = np.searchsorted(grid.keys, keys, "right")
+        for nth in range(candidates_max + 1):
+            more = first + nth < last
+            left, first, last = left[more], first[more], last[more]
+            if not len(left):
+                break
+            if nth == candidates_max:
+                found[left] = UNDECIDED
+                break
+            candidates = grid.order[first + nth]
+            good = _within(source, decoded, candidates, rows[left], bounds)
+            found[left[good]] = candidates[good]
+            left, first, last = left[~good], first[~good], last[~good]
+    return found
+
+
+def _within(
+    source: SplatModel, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
+) -> NDArray[np.bool_]:
+    """Which pairs lie within the bounds; SH and covariance are looked at only where the rest does."""
+    near = np.abs(decoded.opacities[decoded_rows].astype(np.float64) - source.opacities[source_rows])
+    good = near <= allowed("opacities", bounds["opacities"])
+    moved = decoded.means[decoded_rows].astype(np.float64) - source.means[source_rows]
+    good &= np.einsum("ij,ij->i", moved, moved) <= allowed("means", bounds["means"]) ** 2 * (1.0 + 1e-9)
+    good &= (
+        np.abs(decoded.sh0[decoded_rows].astype(np.float64) - source.sh0[source_rows]).max(axis=1)
+        <= allowed("sh0", bounds["sh0"])
+    )  # fmt: skip
+    pairs = np.flatnonzero(good)
+    for start in range(0, len(pairs), _PAIR_BLOCK):
+        part = pairs[start : start + _PAIR_BLOCK]
+        errors = differences(source, decoded, source_rows[part], decoded_rows[part])
+        for name, bound in bounds.items():
+            if name in errors:
+                good[part] &= np.abs(errors[name]).max(axis=1) <= allowed(name, bound)
+    return good

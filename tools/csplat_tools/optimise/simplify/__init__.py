@@ -1,0 +1,13 @@
+"""Model only what a scene requires: fewer splats, their colours fitted anew, fewer SH bands."""
+
+from __future__ import annotations
+
+from csplat_tools.optimise.simplify.options import METHODS, SimplifyOptions
+from csplat_tools.optimise.simplify.simplify import Simplified, simplify
+
+__all__ = [
+    "METHODS",
+    "Simplified",
+    "SimplifyOptions",
+    "simplify",
+]

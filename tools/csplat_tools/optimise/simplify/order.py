@@ -1,0 +1,129 @@
+"""Which splats go, in which order: by the exact error of their removal, measured anew round after round."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel
+from csplat_render.cloud import surface_areas
+from csplat_render.removal import measure_removal
+from csplat_tools.optimise.simplify.options import SimplifyOptions
+from csplat_tools.views.agreeing import Measured, removal_keys
+
+__all__ = ["Order", "Round", "removal_order"]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_LEAST_SHARE = 0.01  # of the splats that stay, at the end of an order that is made to be cut anywhere
+_ROUND_SHARE = 0.85  # of what is left stays after each round of such an order: what hid a splat may have gone
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round.
+
+    Attributes:
+        removed: how many splats went.
+        largest: the largest error of one of them, as a sum over pixels, channels and views.
+        predicted: sum of their errors.
+    """
+
+    removed: int
+    largest: float
+    predicted: float
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """In which order splats go.
+
+    Attributes:
+        rows: [G] int64, source splats, the first to go first; those that never go are not among them.
+        errors: [G], error of each one's removal when its round came; 0 where the method does not know.
+        rounds: what each round took.
+    """
+
+    rows: I64
+    errors: F64
+    rounds: tuple[Round, ...]
+
+    def kept(self, splat_count: int, gone: int) -> I64:
+        """Source splats that are left when `gone` are removed, ascending."""
+        stays = np.ones(splat_count, bool)
+        stays[self.rows[:gone]] = False
+        return np.flatnonzero(stays)
+
+
+def removal_order(
+    model: SplatModel,
+    views: Measured,
+    options: SimplifyOptions,
+    left: int | None,
+    progress: Callable[[str, float], None] | None = None,
+    *,
+    enough: float = math.inf,
+    start: Order | None = None,
+) -> Order:
+    """Find out in which order splats go.
+
+    Args:
+        model: the source.
+        views: cameras that teach, and what they say of the source.
+        options: method, rounds.
+        left: splats that are to stay; None for an order that may be cut anywhere.
+        progress: is told how much is done.
+        enough: such an order ends with the round in which the sum of all errors exceeds this.
+        start: goes on from there.
+    """
+    count = len(model)
+    if options.method in ("opacity", "opacity-area"):
+        keys = model.opacities.astype(np.float64)
+        if options.method == "opacity-area":
+            keys = keys * surface_areas(model)
+        rows = np.argsort(keys, kind="stable")
+        return Order(rows, np.zeros(count), ())
+    rows, removal = np.arange(count), views.removal
+    gone, errors, rounds = list[I64](), list[F64](), list[Round]()
+    if start is not None:
+        gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
+        rows = np.delete(rows, start.rows)
+    for target in _targets(count, options, left, len(rows)):
+        if gone:
+            removal = measure_removal(
+                model.select(rows), views.used, background=options.background, threads=options.threads,
+                progress=progress,
+            )  # fmt: skip
+        keys = removal_keys(model.select(rows), removal, keep_unseen=options.keep_unseen)
+        order = np.argsort(keys, kind="stable")[: len(rows) - target]
+        order = order[np.isfinite(keys[order])]
+        if not len(order):
+            break
+        gone.append(rows[order])
+        errors.append(np.maximum(keys[order], 0.0))
+        rounds.append(Round(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
+        rows = np.delete(rows, order)
+        if left is None and sum(one.predicted for one in rounds) > enough:
+            break
+    if not gone:
+        return Order(np.zeros(0, np.int64), np.zeros(0), ())
+    return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
+
+
+def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
+    """How many splats are left after each round, each time fewer."""
+    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
+    if options.method == "exact":
+        targets = [last]
+    elif left is not None:
+        targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
+    else:
+        targets = [now]
+        while targets[-1] > last:
+            targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
+    return sorted({target for target in targets if target < now}, reverse=True)

@@ -1,0 +1,201 @@
+"""Pictures of a scene in a folder, or as a film: what `csplat render` does, apart from the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_render import Camera, render
+from csplat_render.cameras import load_cameras, resized
+from csplat_render.virtual import orbit_cameras
+from csplat_tools.files.extras import need_pictures, need_renderer
+from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
+from csplat_tools.files.streams import check_output, write_array
+from csplat_tools.present.film import check_film, write_film
+from csplat_tools.views import DataOptions, find_view_set
+
+__all__ = ["Rendered", "find_cameras", "render_film", "render_folder"]
+
+F32 = NDArray[np.float32]
+
+_DEFAULT_SIZE = (640, 480)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Pictures that were written.
+
+    Attributes:
+        files: in the order of the cameras.
+        ignored_count: splats that no picture shows because they hold NaN or infinities.
+    """
+
+    files: tuple[Path, ...]
+    ignored_count: int
+
+
+def find_cameras(
+    model: SplatModel,
+    path: str | None = None,
+    orbit_count: int | None = None,
+    data: DataOptions | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    split: str = "test",
+) -> list[Camera]:
+    """Get the cameras that a command line names: a file's, those of an orbit, or a data set's.
+
+    Args:
+        model: the scene to orbit around; a data set's cameras are brought to its origin.
+        path: of a camera file.
+        orbit_count: how many cameras on a circle.
+        data: a data set, whose size counts, not `size`.
+        size: width and height of the pictures; the file's own, or 640 by 480, if left out.
+        split: of a data set: which of its cameras.
+
+    Raises:
+        InputError: not exactly one of the three is given; the file or the set is none; a picture of that size would be
+            distorted.
+    """
+    if (path is None) + (orbit_count is None) + (data is None) != 2:
+        raise InputError("wanted the cameras: a file of them, a number for an orbit, or a data set")
+    if path is not None:
+        cameras = load_cameras(path)
+        return cameras if size is None else [resized(camera, *size) for camera in cameras]
+    if data is not None:
+        cameras = list(find_view_set(model, data=data, count=0, split=split).judges)
+        if not cameras:
+            raise InputError(f"{data.path} has no {split} pictures")
+        return cameras
+    assert orbit_count is not None
+    return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE))
+
+
+def render_folder(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    folder: str,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    mode: str = "standard",
+    depth: bool = False,
+    alpha: bool = False,
+    force: bool = False,
+    prepare: Callable[[], object] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Rendered:
+    """Render a scene and write NAME.png for each camera.
+
+    Args:
+        model: the scene.
+        cameras: where to stand. The pictures take the names of their photographs, or numbers.
+        folder: where the files go; it is made if need be.
+        background: red, green, blue, 0..1.
+        mode: `exact`, `standard` or `fast`.
+        depth: write NAME.depth.npy too, [H, W] float32: how far along the camera's axis what is seen there lies on
+            average, scene units; 0 where nothing is.
+        alpha: write NAME.alpha.png too, 255 where nothing of the background shows.
+        force: existing files may be replaced.
+        prepare: is called when the folder is found to be fit, before the first picture.
+        progress: is told how much is done.
+
+    Raises:
+        InputError: a file exists; or the renderer is not installed.
+        OSError: a file cannot be written.
+    """
+    need_renderer()
+    need_pictures()
+    names = picture_names([camera.image for camera in cameras])
+    endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
+    is_new = not Path(folder).exists()
+    target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
+    files, ignored = [], 0
+    with _removed_if_empty(target if is_new else None):
+        if prepare is not None:
+            prepare()
+        for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+            if progress is not None:
+                progress("rendering", number / len(cameras))
+            result = render(model, camera, background=background, mode=mode)
+            ignored = max(ignored, result.ignored)
+            files.append(target / f"{name}.png")
+            write_png(files[-1], to_bytes(result.rgb))
+            if alpha:
+                files.append(target / f"{name}.alpha.png")
+                write_png(files[-1], to_bytes(result.alpha))
+            if depth:
+                files.append(target / f"{name}.depth.npy")
+                write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
+    if progress is not None:
+        progress("rendering", 1.0)
+    return Rendered(tuple(files), ignored)
+
+
+def render_film(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    path: str,
+    *,
+    fps: float,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    mode: str = "standard",
+    force: bool = False,
+    prepare: Callable[[], object] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Rendered:
+    """Render a scene into one animated file.
+
+    Args:
+        model: the scene.
+        cameras: where to stand, at least one, with pictures of one size.
+        path: of the file; its ending tells the format, see `film`.
+        fps: pictures per second.
+        background, mode, prepare, progress: see `render_folder`.
+        force: an existing file may be replaced.
+
+    Raises:
+        InputError: the file exists, or cannot hold these pictures; or the renderer is not installed.
+        OSError: it cannot be written.
+    """
+    need_renderer()
+    need_pictures()
+    check_output(path, force=force)
+    check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
+    if prepare is not None:
+        prepare()
+    frames, ignored = [], 0
+    for number, camera in enumerate(cameras):
+        if progress is not None:
+            progress("rendering", number / len(cameras))
+        result = render(model, camera, background=background, mode=mode)
+        ignored = max(ignored, result.ignored)
+        frames.append(to_bytes(result.rgb))
+    if progress is not None:
+        progress("rendering", 1.0)
+    write_film(path, frames, fps)
+    return Rendered((Path(path),), ignored)
+
+
+@contextmanager
+def _removed_if_empty(folder: Path | None) -> Iterator[None]:
+    """Leave no empty folder behind where the first picture is refused."""
+    try:
+        yield
+    except BaseException:
+        if folder is not None:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
+        raise
+
+
+def _mean_depth(depth: F32, alpha: F32) -> F32:
+    """The renderer sums weight times depth, and alpha is the sum of the weights."""
+    mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
+    return mean.astype(np.float32)

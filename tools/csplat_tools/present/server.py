@@ -1,0 +1,256 @@
+"""A web server for one scene: the page, the decoder and the scene with HTTP Range; nothing else is reachable.
+
+Every path that is answered stands in a table, so that there is no way to any other file.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import re
+import socket
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote, unquote, urlencode, urlsplit
+
+from csplat.errors import InputError
+from csplat_tools.present.viewing import ViewScene
+from csplat_tools.present.webroot import PAGE, web_files
+
+__all__ = ["SceneServer", "byte_range", "open_server"]
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".mjs": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".csplat": "model/vnd.csplat",
+}
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "default-src 'self'; img-src data:; base-uri 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-cache",
+}
+_BLOCK_BYTES = 1 << 20
+_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+_SECONDS_IDLE = 60.0
+
+
+@dataclass(frozen=True)
+class _Resource:
+    """What a path gives.
+
+    Attributes:
+        open: gives its bytes, and their number.
+        media_type: for `Content-Type`.
+        tag: gives the entity tag of the bytes that `open` gave.
+    """
+
+    open: Callable[[], tuple[BinaryIO, int]]
+    media_type: str
+    tag: Callable[[BinaryIO], str]
+
+
+class SceneServer(ThreadingHTTPServer):
+    """Serves a scene; `url` is the address of its page."""
+
+    daemon_threads = True  # a browser keeps connections open; they do not keep the command alive
+
+    def __init__(self, host: str, port: int, resources: Mapping[str, _Resource], start: str) -> None:
+        self.resources = resources
+        self.start = start
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__((host, port), _Handler)
+        shown = f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.server_address[1]}/"
+        # a page of the web that has its own name point here must not read the scene (DNS rebinding)
+        self.local_only = shown in _LOOPBACK
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of a browser that hangs up in the middle of an answer."""
+
+
+@contextmanager
+def open_server(
+    scene: ViewScene, *, host: str = "127.0.0.1", port: int = 0, wishes: Mapping[str, str] | None = None
+) -> Iterator[SceneServer]:
+    """Open a server for a scene; `serve_forever` runs it.
+
+    Args:
+        scene: what is shown.
+        host: the address of a network interface, or `localhost`.
+        port: 0 for one that is free.
+        wishes: parameters of the page.
+
+    Yields:
+        The server, already listening.
+
+    Raises:
+        InputError: the port is taken, or the host is none of this machine's.
+    """
+    place = f"scene/{scene.name}"
+    resources = {path: _file(file) for path, file in web_files().items()}
+    content = scene.content
+    resources[place] = _bytes(content, ".csplat") if isinstance(content, bytes) else _file(content, ".csplat")
+    parameters = {"scene": "/" + quote(place), **(wishes or {})}
+    if "camera" in parameters:  # too long for an address
+        resources["cameras.json"] = _bytes(parameters["camera"].encode(), ".json")
+        parameters["camera"] = "/cameras.json"
+    start = f"/{PAGE}?{urlencode(parameters)}"
+    try:
+        server = SceneServer(host, port, resources, start)
+    except OverflowError:
+        raise InputError(f"port {port} is none, wanted 1 to 65535, or 0 for one that is free") from None
+    except OSError as error:
+        raise InputError(_refusal(error, host, port)) from None
+    with server:
+        yield server
+
+
+def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
+    """Read a Range header (RFC 9110, 14.2).
+
+    Args:
+        header: its value.
+        size: bytes of what is asked for.
+
+    Returns:
+        First byte and number of bytes; `None` where everything is to be sent: there is no range, it is not
+        understood, or there are several.
+
+    Raises:
+        ValueError: nothing of the range is there (status 416).
+    """
+    match = re.fullmatch(r"bytes=\s*(\d*)-(\d*)\s*", header or "", re.ASCII | re.IGNORECASE)
+    if match is None or match[1] == match[2] == "":
+        return None
+    if match[1] == "":
+        length = min(int(match[2]), size)
+        if length == 0:
+            raise ValueError("a range of no bytes")
+        return size - length, length
+    first = int(match[1])
+    last = size - 1 if match[2] == "" else int(match[2])
+    if match[2] != "" and last < first:
+        return None
+    if first >= size:
+        raise ValueError("a range behind the end")
+    return first, min(last, size - 1) - first + 1
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version = "csplat"
+    sys_version = ""
+    timeout = _SECONDS_IDLE
+
+    def do_GET(self) -> None:
+        self._answer(send=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(send=False)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Stay quiet: standard error is for the person who runs the command."""
+
+    def _answer(self, *, send: bool) -> None:
+        server = self.server
+        assert isinstance(server, SceneServer)
+        if server.local_only and self._host() not in _LOOPBACK:
+            self._refuse(HTTPStatus.MISDIRECTED_REQUEST, send=send)
+            return
+        path = unquote(urlsplit(self.path).path).removeprefix("/")
+        if path == "":
+            self._start(HTTPStatus.FOUND, {"Location": server.start, "Content-Length": "0"})
+            return
+        resource = server.resources.get(path)
+        if resource is None:
+            self._refuse(HTTPStatus.NOT_FOUND, send=send)
+            return
+        try:
+            stream, size = resource.open()
+        except OSError:  # the file has gone since the server began
+            self._refuse(HTTPStatus.NOT_FOUND, send=send)
+            return
+        with stream:
+            self._send(resource, stream, size, send=send)
+
+    def _host(self) -> str:
+        host = self.headers.get("Host", "")
+        return host if host.endswith("]") else re.sub(r":\d*$", "", host)
+
+    def _send(self, resource: _Resource, stream: BinaryIO, size: int, *, send: bool) -> None:
+        tag = resource.tag(stream)
+        headers = {"Content-Type": resource.media_type, "Accept-Ranges": "bytes", "ETag": tag}
+        condition = self.headers.get("If-Range")
+        try:
+            found = byte_range(self.headers.get("Range"), size) if condition in (None, tag) else None
+        except ValueError:
+            headers |= {"Content-Range": f"bytes */{size}", "Content-Length": "0"}
+            self._start(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers)
+            return
+        first, length = found or (0, size)
+        headers["Content-Length"] = str(length)
+        if found is not None:
+            headers["Content-Range"] = f"bytes {first}-{first + length - 1}/{size}"
+        self._start(HTTPStatus.OK if found is None else HTTPStatus.PARTIAL_CONTENT, headers)
+        if send:
+            self._copy(stream, first, length)
+
+    def _copy(self, stream: BinaryIO, first: int, length: int) -> None:
+        stream.seek(first)
+        while length > 0:
+            block = stream.read(min(length, _BLOCK_BYTES))
+            if not block:  # the file has become shorter: the browser sees that bytes are missing
+                self.close_connection = True
+                return
+            self.wfile.write(block)
+            length -= len(block)
+
+    def _refuse(self, status: HTTPStatus, *, send: bool) -> None:
+        body = f"{status.value} {status.phrase}\n".encode()
+        self._start(status, {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+        if send:
+            self.wfile.write(body)
+
+    def _start(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
+        self.send_response(status)
+        for name, value in {**_HEADERS, **headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+
+def _file(path: Path, ending: str = "") -> _Resource:
+    def opened() -> tuple[BinaryIO, int]:
+        stream = path.open("rb")
+        return stream, os.fstat(stream.fileno()).st_size
+
+    def tag(stream: BinaryIO) -> str:
+        status = os.fstat(stream.fileno())
+        return f'"{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ino:x}"'
+
+    return _Resource(opened, _TYPES[ending or path.suffix], tag)
+
+
+def _bytes(data: bytes, ending: str) -> _Resource:
+    tag = f'"{zlib.crc32(data):08x}"'
+    return _Resource(lambda: (io.BytesIO(data), len(data)), _TYPES[ending], lambda _stream: tag)
+
+
+def _refusal(error: OSError, host: str, port: int) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return f"port {port} is taken: --port 0 finds one that is free"
+    if error.errno == errno.EACCES:
+        return f"port {port} needs more rights: --port 0 finds one that is free"
+    if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+        return f"{host} is no address of this machine: 127.0.0.1 is reached from here alone, 0.0.0.0 from everywhere"
+    return f"{host}:{port}: {error.strerror or error}"

@@ -1,0 +1,122 @@
+"""Scenes for the viewer: a .csplat file that has been looked at, or a PLY that is encoded for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED, PROFILE_BASE, PROFILE_NAMES
+from csplat.decoder import SceneHeader, read_header
+from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.errors import FormatError, InputError
+from csplat.lint import Finding
+from csplat.ply import read_ply
+from csplat_tools.files.console import Progress
+from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
+
+__all__ = ["ViewScene", "open_scene", "view_wishes"]
+
+
+@dataclass(frozen=True)
+class ViewScene:
+    """A scene that the viewer can show.
+
+    Attributes:
+        name: of the file, as the page shows it; ends in `.csplat`.
+        content: where the file lies, or its bytes.
+        size_bytes: of the file.
+        header: what it says of itself.
+        findings: what lint noticed in the PLY.
+        encoded_from: size of the PLY in bytes; 0 for a file that was one already.
+    """
+
+    name: str
+    content: Path | bytes
+    size_bytes: int
+    header: SceneHeader
+    findings: tuple[Finding, ...] = ()
+    encoded_from: int = 0
+
+    def read(self) -> bytes:
+        """All bytes of the file."""
+        return self.content if isinstance(self.content, bytes) else self.content.read_bytes()
+
+
+@contextmanager
+def open_scene(path: str, *, preset: str, progress: Progress | None = None) -> Iterator[ViewScene]:
+    """Get a scene ready: check the header of a .csplat file, encode a PLY.
+
+    Args:
+        path: a file of either kind, or `-`.
+        preset: of the encoder, for a PLY.
+        progress: is told the stages of reading and encoding.
+
+    Yields:
+        The scene; the file of standard input is there as long as the context.
+
+    Raises:
+        CsplatError: the file is not valid, or the viewer cannot read its profile.
+        OSError: it cannot be read.
+    """
+    with local_path(path) as local:
+        stem = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
+        yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
+
+
+def view_wishes(camera: str | None, axes: str | None) -> dict[str, str]:
+    """Put options into words that the page understands.
+
+    Args:
+        camera: a camera file: a list of {K, viewmat, W, H, near}. The page looks from the first and steps through
+            all of them.
+        axes: directions of +x, +y, +z instead of the scene's, as `RDF`.
+
+    Returns:
+        Parameters of the page.
+
+    Raises:
+        InputError: the camera file holds no cameras, or the axes are none.
+    """
+    wishes = {}
+    if camera is not None:
+        from csplat_render.cameras import load_cameras
+
+        entries = [one.to_json() for one in load_cameras(camera)]
+        wishes["camera"] = json.dumps(entries, separators=(",", ":"))
+    if axes is not None:
+        if sorted(axes.translate(str.maketrans("LDB", "RUF"))) != ["F", "R", "U"]:
+            raise InputError(f"the axes are {axes!r}, wanted one of R and L, of U and D, of F and B, as RDF")
+        wishes["axes"] = axes
+    return wishes
+
+
+def _checked(path: Path, stem: str) -> ViewScene:
+    with mapped_csplat(str(path)) as data:
+        header, size = read_header(data), len(data)
+    if size != header.file_size:
+        code, at, clause, detail = (
+            (ERROR_TRUNCATED, size, "HDR-5", "the file ends early")
+            if size < header.file_size
+            else (ERROR_TRAILING, header.file_size, "HDR-6", "bytes follow the end of the file")
+        )
+        raise FormatError(code, at, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
+    if header.profile != PROFILE_NAMES[PROFILE_BASE]:
+        raise InputError(
+            f"browsers do not read the profile {header.profile}: `csplat decode` makes a PLY of this file,"
+            " and that can be viewed"
+        )
+    return ViewScene(f"{stem}.csplat", path, size, header)
+
+
+def _encoded(path: Path, stem: str, preset: str, progress: Progress | None) -> ViewScene:
+    findings: list[Finding] = []
+    if progress is not None:
+        progress("reading", 0.0)
+    model = read_ply(path, report=findings)
+    if progress is not None:
+        progress("reading", 1.0)
+    data = encode_with_report(model, EncodeOptions(preset=preset), progress=progress).data
+    return ViewScene(f"{stem}.csplat", data, len(data), read_header(data), tuple(findings), path.stat().st_size)

@@ -1,0 +1,39 @@
+"""Where the page of the viewer and the JavaScript decoder lie: in a checkout, or in the installed package.
+
+Both places have `tools/viewer` and `codec/js` beside each other, as the modules' imports want it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from csplat.errors import InputError
+
+__all__ = ["PAGE", "WORKER", "web_files"]
+
+#: The page, and the module that it starts as a worker, below the root.
+PAGE = "tools/viewer/index.html"
+WORKER = "tools/viewer/worker.mjs"
+
+_FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",)}
+
+
+def web_files() -> dict[str, Path]:
+    """Find every file that the page may load.
+
+    Returns:
+        Paths below the root, with slashes, and where they lie: `tools/viewer/index.html`, `codec/js/decoder.mjs`, ...
+
+    Raises:
+        InputError: the installation is not complete.
+    """
+    package = Path(__file__).resolve().parent.parent  # csplat_tools
+    for root in (package / "web", package.parent.parent):  # an installed wheel, a checkout
+        if (root / PAGE).is_file():
+            return {
+                f"{folder}/{path.name}": path
+                for folder, endings in _FOLDERS.items()
+                for path in sorted((root / folder).iterdir())
+                if path.suffix in endings
+            }
+    raise InputError("the page of the viewer is not installed: install csplat again")

@@ -1,0 +1,157 @@
+"""The strategies one after the other: prune, then take SH bands away, then cluster what is left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat_tools.files.console import Progress
+from csplat_tools.files.scenes import without_bands
+from csplat_tools.study.clustering import Clustered, KMeans, cluster_attributes
+from csplat_tools.study.pruning import check_threshold, prune_opacity
+from csplat_tools.study.sizes import attribute_floats, raw_bytes
+
+if TYPE_CHECKING:
+    from csplat_tools.study.distilling import Teacher
+    from csplat_tools.views import ViewSet
+
+__all__ = ["Reduced", "Reduction", "find_teacher", "reduce_model", "reduced_by", "target_degree"]
+
+I64 = NDArray[np.int64]
+_ASIDE = 8  # one of so many virtual views checks
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """What is done to a scene, in this order.
+
+    Attributes:
+        prune_opacity: splats of at most this alpha go; None: all stay.
+        sh_degree: bands above it go; None: all stay.
+        distil: the bands that stay are fitted to renders of the source; otherwise they are as they were.
+        kmeans: which attributes are clustered; None: none is.
+        views: virtual views to distil by, and 16 more; one in eight of all checks.
+        seed: of the virtual views.
+        threads: how many; None for all. The result does not depend on it.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+
+    prune_opacity: float | None = None
+    sh_degree: int | None = None
+    distil: bool = False
+    kmeans: KMeans | None = None
+    views: int = 160
+    seed: int = 0
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.prune_opacity is not None:
+            check_threshold(self.prune_opacity)
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise InputError(f"sh_degree is {self.sh_degree}, wanted 0 to {MAX_SH_DEGREE}")
+        if self.views < 2:
+            raise InputError(f"{self.views} views, wanted 2 or more: one to fit by, one to check by")
+        if self.seed < 0:
+            raise InputError(f"the seed of views is {self.seed}, wanted 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """A scene after its reduction.
+
+    Attributes:
+        model: the scene.
+        source_index: [N] int64, which splat of the source each one is.
+        clustered: its codebooks; None where nothing was clustered.
+        said: what was done, JSON-compatible.
+    """
+
+    model: SplatModel
+    source_index: I64
+    clustered: Clustered | None
+    said: dict[str, Any]
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of raw float32 without an entropy coder, codebooks and indices where there are some."""
+        if self.clustered is not None:
+            return self.clustered.size_bytes
+        return raw_bytes(sum(attribute_floats(self.model.sh_degree).values()), len(self.model))
+
+
+def reduce_model(
+    source: SplatModel,
+    reduction: Reduction,
+    views: ViewSet | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Reduced:
+    """Prune, take SH bands away, cluster.
+
+    Args:
+        source: the scene.
+        reduction: what is to be done.
+        views: those that teach and those that check what is distilled; None for virtual ones.
+        progress: is told how much is done.
+
+    Raises:
+        InputError: nothing would be left; or there is nothing to distil, or too few views to do it by.
+    """
+    teacher = find_teacher(source, reduction, views)
+    return reduced_by(source, reduction, teacher, progress)
+
+
+def reduced_by(source: SplatModel, reduction: Reduction, teacher: Teacher | None, progress: Progress | None) -> Reduced:
+    """`reduce_model` by somebody who has looked at the source before; None: bands are taken away as they are."""
+    rows = np.arange(len(source), dtype=np.int64)
+    model, degree = source, target_degree(source, reduction)
+    said: dict[str, Any] = {"splats": len(source)}
+    if reduction.prune_opacity is not None:
+        model, rows = prune_opacity(source, reduction.prune_opacity)
+        said["prune_opacity"] = reduction.prune_opacity
+    if degree < source.sh_degree:
+        said |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
+    model = without_bands(model, degree) if teacher is None else teacher.taught(model, degree, progress)
+    if teacher is not None:
+        said["views"] = len(teacher.cameras)
+    clustered = None
+    if reduction.kmeans is not None:
+        clustered = cluster_attributes(model, reduction.kmeans, threads=reduction.threads, progress=progress)
+        model = clustered.model
+        said["kmeans"] = clustered.as_json()
+    return Reduced(model, rows, clustered, said)
+
+
+def target_degree(source: SplatModel, reduction: Reduction) -> int:
+    """SH degree of the result."""
+    return source.sh_degree if reduction.sh_degree is None else min(reduction.sh_degree, source.sh_degree)
+
+
+def find_teacher(source: SplatModel, reduction: Reduction, views: ViewSet | None) -> Teacher | None:
+    """Who teaches the lower degree; None where nothing is distilled.
+
+    Raises:
+        InputError: there is nothing to distil, or there are fewer than two views.
+    """
+    if not reduction.distil:
+        return None
+    degree = target_degree(source, reduction)
+    if degree >= source.sh_degree:
+        raise InputError(
+            f"nothing to distil: the scene has SH of degree {source.sh_degree}, wanted a lower one than that"
+        )
+    from csplat_tools.study.distilling import Teacher  # wants numba; the other strategies do not
+
+    if views is None:
+        from csplat_tools.views import find_view_set
+
+        aside = max(1, reduction.views // _ASIDE)
+        views = find_view_set(source, count=reduction.views - aside, aside=aside, seed=reduction.seed)
+    return Teacher.of_source(source, views, threads=reduction.threads)

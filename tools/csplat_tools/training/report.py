@@ -1,0 +1,151 @@
+"""What fine-tuning came to: sizes, pictures of source and decoded file on held-out views, times, bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from csplat.decoder import read_header
+from csplat.encoder import EncodeResult
+from csplat.model import SplatModel
+from csplat_render.metrics import Distance
+from csplat_tools.files.console import format_bytes, format_table
+from csplat_tools.inspect.layout import describe
+from csplat_tools.views import ViewSet
+
+__all__ = ["Judged", "as_report", "format_report", "judge_models", "ply_splat_bytes"]
+
+_SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Scores on views that nothing was learnt from.
+
+    Attributes:
+        by: what the views are.
+        views: how many.
+        scores: by name of the model: psnr (pooled), psnr_mean, ssim, lpips or `None`.
+    """
+
+    by: str
+    views: int
+    scores: Mapping[str, Mapping[str, float | None]]
+
+
+def judge_models(
+    source: SplatModel,
+    models: Mapping[str, SplatModel],
+    views: ViewSet,
+    lpips: Distance | None,
+    threads: int | None = None,
+) -> Judged | None:
+    """Score models on views that nothing was learnt from: by photographs, else by renders of the source.
+
+    Args:
+        source: the scene.
+        models: by name; the source itself is left out where its renders judge.
+        views: those that judge are asked; `None` comes back where there are none.
+        lpips: computes it, if wanted.
+        threads: how many; `None` for all.
+    """
+    if not views.judges:
+        return None
+    taken = bool(views.photographs)
+    judge = views.photograph_judge(threads=threads) if taken else views.judge(source, threads=threads)
+    scores: dict[str, dict[str, float | None]] = {}
+    for name, model in models.items():
+        if taken or model is not source:
+            found = judge.scores(model, lpips=lpips)
+            scores[name] = {score: getattr(found, score) for score, _ in _SCORES}
+    return Judged("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
+
+
+def ply_splat_bytes(sh_degree: int) -> int:
+    """What a splat takes in a PLY of the INRIA trainer, whose columns are floats: 248 bytes at SH degree 3.
+
+    Position and normal, opacity, scale and rotation are 14; the rest are colours.
+    """
+    return 4 * (14 + 3 * (sh_degree + 1) ** 2)
+
+
+def as_report(
+    source: SplatModel,
+    plain: EncodeResult,
+    result: EncodeResult,
+    judged: Judged | None,
+    log: Mapping[str, Any],
+    seconds: Mapping[str, float],
+    said: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Gather everything, JSON-compatible.
+
+    Args:
+        source: the scene, before anything was left out.
+        plain: the file of the same decisions without tuning. result: the tuned one.
+        judged: on held-out views; `None` where there are none.
+        log: of the tuning.
+        seconds: by stage.
+        said: of the splats that were left out.
+    """
+    described = describe(result.data, read_header(result.data))
+    size, count = len(result.data), len(source)
+    return {
+        "source_splats": count,
+        "splats": result.report.splat_count,
+        "unseen": said["unseen"],
+        "sh_degree": source.sh_degree,
+        "size_bytes": size,
+        "size_bytes_before_tuning": len(plain.data),
+        "bytes_per_source_splat": size / count,
+        "ratio": count * ply_splat_bytes(source.sh_degree) / size,
+        "bytes_by_attribute": {name: one["size_bytes"] for name, one in described["attributes"].items()},
+        "overhead_bytes": sum(described["overhead"].values()),
+        "judged_by": None if judged is None else judged.by,
+        "judged_views": 0 if judged is None else judged.views,
+        "scores": {} if judged is None else {name: dict(one) for name, one in judged.scores.items()},
+        "decoded_is_what_was_tuned": True,  # or the run had ended before
+        "validation": {
+            "views": log["validation_views"],
+            "kept_aside": log["kept_aside"],
+            "psnr_before": log["start_psnr"],
+            "psnr": log["best_psnr"],
+        },
+        "steps": log["steps"],
+        "best_step": log["best_iteration"],
+        "settled": log["settled"],
+        "seconds": dict(seconds),
+        "seconds_without_judging": round(sum(v for k, v in seconds.items() if k != "judging"), 3),
+        "peak_memory_bytes": log["peak_memory_bytes"],
+        "encoding": result.report.options,
+    }
+
+
+def format_report(report: Mapping[str, Any]) -> str:
+    """The report as text."""
+    unseen = report["unseen"]
+    gone = report["source_splats"] - report["splats"] - unseen
+    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{gone} that pictures need least"] * bool(gone)
+    left_out = f" ({' and '.join(words)} are left out)" if words else ""
+    size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
+    ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
+    lines = [f"{report['source_splats']} splats{left_out}: {size}, {ratio}"]
+    if report["scores"]:
+        rows = [
+            (name, *(_number(one[score], digits) for score, digits in _SCORES))
+            for name, one in report["scores"].items()
+        ]
+        header = (f"{report['judged_views']} {report['judged_by']}", *(score for score, _ in _SCORES))
+        lines += ["", format_table(header, rows)]
+    parts = [*report["bytes_by_attribute"].items(), ("everything else", report["overhead_bytes"])]
+    rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
+    lines += ["", format_table(("bytes", "all", "per source splat"), rows_bytes)]
+    times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in report["seconds"].items())
+    stop = ", and nothing was gained any more" if report["settled"] else ""
+    lines += ["", f"{report['steps']} steps{stop}; the best stood at {report['best_step']}; seconds: {times}"]
+    return "\n".join(lines)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
