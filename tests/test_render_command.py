@@ -174,7 +174,7 @@ def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
 @pytest.mark.parametrize(("module", "package"), [("numba", "numba"), ("PIL", "pillow")])
 def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, tmp_path, module, package):
     pytest.importorskip("numba", reason="one of the two is absent anyway")
-    code = f"import sys; sys.modules[{module!r}] = None; from csplat_tools.cli import main; main()"
+    code = f"import sys; sys.modules[{module!r}] = None; from csplat_tools.__main__ import main; main()"
     words = ["render", str(ply), "--cameras", str(cameras), "-o", str(tmp_path / "out")]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
     assert 1 == done.returncode

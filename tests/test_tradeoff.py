@@ -429,7 +429,7 @@ def test_lists_are_read_in_their_order():
 
 @pytest.mark.parametrize(("module", "words"), [("numba", []), ("matplotlib", ["-o", "report.html"])])
 def test_without_the_extra_packages_one_line_says_what_to_install(tmp_path, sample_path, module, words):
-    code = f"import sys; sys.modules[{module!r}] = None; from csplat_tools.cli import main; main()"
+    code = f"import sys; sys.modules[{module!r}] = None; from csplat_tools.__main__ import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, "tradeoff", str(sample_path), *words],
         capture_output=True, text=True, check=False, cwd=tmp_path,

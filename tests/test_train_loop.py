@@ -223,7 +223,7 @@ def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_mod
 
 def test_the_command_says_which_extra_is_missing(tmp_path):
     code = "import sys; sys.modules['numba'] = None; sys.argv = ['csplat', 'train', '.', '-o', sys.argv[1]]"
-    code += "; from csplat_tools.cli import main; main()"
+    code += "; from csplat_tools.__main__ import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "o.ply")], capture_output=True, text=True, check=False
     )
