@@ -12,7 +12,9 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+import typer
 from interrupts import heed_interrupts
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
@@ -94,12 +96,74 @@ def test_reports_as_json(tmp_path, ply):
     assert report["options"]["asked"] == {"preset": "fast"}
 
 
-def test_every_knob_of_the_encoder_is_an_option():
-    assert {field.name for field in fields(EncodeOptions)} <= set(inspect.signature(encode_command).parameters)
+def test_every_knob_of_the_encoder_is_an_option_or_a_setting():
+    options = set(inspect.signature(encode_command).parameters)
+    settings = {
+        line.partition(":")[0].strip().replace("-", "_")
+        for line in call("encode", "--help-all").partition("Settings of --set")[2].splitlines()[1:]
+    }
+    assert {field.name for field in fields(EncodeOptions)} == (
+        options & {one.name for one in fields(EncodeOptions)}
+    ) | settings
+    assert not options & settings
+
+
+def test_help_of_encode_fits_a_screen_and_the_rest_is_behind_help_all(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    shown, everything = call("encode", "--help"), call("encode", "--help-all")
+    assert len(shown.splitlines()) <= 54
+    assert "--grades" not in shown
+    assert "--grades" in everything
+    assert "csplat encode - - | wc -c" in everything
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("position-bit=9", "perhaps position-bits=...?"),
+        ("position-bits", "no such setting"),
+        ("preset=small", "no such setting"),
+        ("position-bits=9,position_bits=10", "given twice"),
+        ("position-bits=nine", "wanted an integer"),
+        ("scale-step=wide", "wanted a number"),
+        ("position-bits=40", "wanted an integer, 2 to 16"),
+    ],
+)
+def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):
+    result = invoke("encode", ply, tmp_path / "out.csplat", "--set", setting)
+    assert 2 == result.exit_code
+    assert expected in " ".join(result.stderr.replace("│", "").split())
+
+
+def test_the_output_is_an_argument_or_an_option(tmp_path, ply):
+    call("encode", ply, tmp_path / "a.csplat", "-q")
+    call("encode", ply, "-o", tmp_path / "b.csplat", "-q")
+    assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
+    assert 2 == invoke("encode", ply).exit_code
+    assert 2 == invoke("encode", ply, tmp_path / "c.csplat", "-o", tmp_path / "d.csplat").exit_code
+
+
+@pytest.mark.parametrize("name", ["info", "verify", "lint", "decode"])
+def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
+    words = {"lint": (ply,), "decode": (csplat_file, tmp_path / "back.ply")}.get(name, (csplat_file,))
+    printed = call(name, *words, "--json", "--report", tmp_path / "report.json")
+    assert json.loads(printed) == json.loads((tmp_path / "report.json").read_text())
+    assert "exists: --force replaces it" in refused(name, *words, "--report", tmp_path / "report.json")
+
+
+def test_every_command_has_the_same_four_options():
+    group = get_command(app)
+    context = typer.Context(group, info_name="csplat")
+    for name in group.list_commands(context):
+        one = group.get_command(context, name)
+        for each in getattr(one, "commands", {name: one}).values():
+            spelt = {word for parameter in each.params for word in parameter.opts}
+            assert {"--quiet", "-q", "--json", "--report", "--force"} <= spelt, name
 
 
 def test_knobs_reach_the_encoder(tmp_path, ply):
-    words = ("--sh-degree", 1, "--position-bits", 9, "--opacity-levels", 17, "--quat-levels", 33, "--tile-splats", 50)
+    knobs = "position-bits=9, opacity_levels=17,quat-levels=33"
+    words = ("--sh-degree", 1, "--set", knobs, "--set", "tile-splats=50")
     report = json.loads(call("encode", ply, tmp_path / "out.csplat", "--json", *words))
     asked = report["options"]["asked"]
     assert asked == {
@@ -118,9 +182,7 @@ def test_knobs_reach_the_encoder(tmp_path, ply):
     "words",
     [
         ("--preset", "slow"),
-        ("--position-bits", "40"),
-        ("--position-bits", "many"),
-        ("--sh-coding", "x"),
+        ("--set", "sh-coding=x"),
         ("--no-such-option",),
         ("--json", "-"),
     ],
@@ -500,7 +562,7 @@ def test_lint_does_not_fix_what_would_be_guesswork(tmp_path, ply):
 
 
 def test_runs_the_conformance_suite():
-    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/*", "--json", "-").stdout)
+    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/*", "--json").stdout)
     assert report["passed"] is True
     assert ["L1", "L2", "L3"] == list(report["levels"])
 
@@ -516,7 +578,7 @@ def test_a_command_imports_itself_alone():
         "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console")}
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "options", "settings")}
     assert {"csplat_tools.cli.info"} == set(done.stderr.split()) - shared
 
 

@@ -308,7 +308,7 @@ def test_a_file_that_the_validator_passes_and_the_decoder_refuses_is_a_failure(m
 
 def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     result = invoke(
-        "--filter", "*/one_splat", "--level", 3, "--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml",
+        "--filter", "*/one_splat", "--level", 3, "--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml",
         "--keep", tmp_path / "kept",
     )  # fmt: skip
 
@@ -323,7 +323,7 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     assert ["ordinary-one_splat.csplat", "ordinary-one_splat.ply"] == sorted(
         path.name for path in (tmp_path / "kept").iterdir()
     )
-    assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--json", tmp_path / "r.json").exit_code
+    assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--report", tmp_path / "r.json").exit_code
     assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--keep", tmp_path / "kept").exit_code
 
 

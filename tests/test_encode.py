@@ -282,7 +282,7 @@ def test_bytes_do_not_depend_on_blas_threads():
         ("position_bits", 8.5),
         ("sh_degree", 4),
         ("quat_levels", 2),
-        ("effort", 0),
+        ("deflate_level", 0),
         ("scale_step", 0),
         ("scale_step", float("nan")),
         ("sh_step", "0.1"),

@@ -87,7 +87,7 @@ def test_cameras_and_axes_go_into_the_page(tab, tmp_path, make_model):
     entry = {"K": [[90, 0, 40], [0, 90, 30], [0, 0, 1]], "viewmat": viewmat.tolist(), "W": 80, "H": 60}
     (tmp_path / "cameras.json").write_text(json.dumps([entry]))
     (tmp_path / "scene.csplat").write_bytes(encode(make_model(100, 0)))
-    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--camera", tmp_path / "cameras.json", "--axes", "RFU"]
+    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", tmp_path / "cameras.json", "--axes", "RFU"]
     done = invoke(*words)
     assert 0 == done.exit_code, done.output
     tab.page.goto((tmp_path / "page.html").as_uri())

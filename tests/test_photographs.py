@@ -216,7 +216,10 @@ def no_compiling(monkeypatch):
         (("train", "capture", "-o", "o.ply", "--resume", "absent.npz"), "absent.npz"),
         (("train", "capture", "-o", "o.ply", "--lpips-weights", "absent.npz"), "absent.npz"),
         (("train", "capture", "-o", "o.ply", "--previews", "A"), "not a folder"),
-        (("train", "capture", "-o", "o.ply", "--lpips-weight", "0.1", "--lpips-weights", "absent.npz"), "absent.npz"),
+        (
+            ("train", "capture", "-o", "o.ply", "--set", "lpips-weight=0.1", "--lpips-weights", "absent.npz"),
+            "absent.npz",
+        ),
     ],
 )
 def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, monkeypatch, words, says):

@@ -10,10 +10,10 @@ from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
+from csplat_tools.inspect.info import describe_file
 from csplat_tools.inspect.matching import UNDECIDED, UNMATCHED, match
 from csplat_tools.inspect.pairs import differences, measure_pairs
 from csplat_tools.inspect.proof import prove
-from csplat_tools.inspect.reading import describe_file
 
 
 def moved(model, rng, sigma=1e-3):
@@ -251,7 +251,7 @@ def test_extra_columns_are_part_of_the_proof(make_model):
 def test_a_description_accounts_for_every_byte(make_model, options):
     model = make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)})
     data = encode(model, options)
-    described = describe_file(data)
+    described = describe_file(data).as_json()
     sizes = sum(one["size_bytes"] for one in described["attributes"].values())
     assert sizes + sum(described["overhead"].values()) == len(data)
     header = read_header(data)
@@ -269,7 +269,7 @@ def test_damage_is_described_or_refused_but_never_a_crash(make_model):
             damaged = bytearray(data)
             damaged[place] ^= change
             try:
-                describe_file(bytes(damaged))
+                describe_file(bytes(damaged)).as_json()
             except CsplatError:
                 continue
     for length in range(len(data)):

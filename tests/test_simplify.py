@@ -25,6 +25,7 @@ from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.order import removal_order
 from csplat_tools.optimise.target import Target
+from csplat_tools.study import prune_share
 from csplat_tools.views import camera_sequence, find_view_set, reduced
 from csplat_tools.views.agreeing import find_views, removal_keys
 from csplat_trainer.evaluate import photograph_judge
@@ -111,10 +112,11 @@ def test_exact_errors_choose_better_than_opacity(source):
     check = camera_sequence(source, 6, (64, 48), seed=9)
     judge = Judge.of_source(source, check, (0, 0, 0))
     scores = {}
-    for method in ("opacity", "opacity-area", "exact", "rounds"):
-        options = replace(SMALL, method=method, refit=False, bands=False, views=40)
-        scores[method] = judge.psnr(simplify(source, target=Target(keep=0.8), options=options).model)
-    assert min(scores["exact"], scores["rounds"]) > max(scores["opacity"], scores["opacity-area"]) + 3.0
+    for rounds in (1, SMALL.rounds):
+        options = replace(SMALL, rounds=rounds, refit=False, bands=False, views=40)
+        scores[rounds] = judge.psnr(simplify(source, target=Target(keep=0.8), options=options).model)
+    by_opacity = [judge.psnr(prune_share(source, 0.8, by_area=by_area)[0]) for by_area in (False, True)]
+    assert min(scores.values()) > max(by_opacity) + 3.0
 
 
 # the whole
@@ -222,7 +224,6 @@ def test_nothing_changes_where_everything_stays(source):
         (0.998, {}, 449),  # less than a splat for each round
         (0.9, {"rounds": 300}, 405),
         (1e-4, {"keep_unseen": False, "rounds": 1}, 1),
-        (1e-4, {"method": "opacity"}, 1),
     ],
 )
 def test_as_many_stay_as_were_asked_for_and_one_at_least(source, keep, options, left):
@@ -270,7 +271,7 @@ def test_targets_of_files_and_options_out_of_range_are_refused(source):
     for wrong in (Target(size_bytes=1000), Target(psnr=40.0, max_error={"means": 0.1})):
         with pytest.raises(InputError, match="of files"):
             simplify(source, target=wrong, options=SMALL)
-    for wrong in ({"method": "luck"}, {"rounds": 0}, {"steps": 0}, {"views": 0}, {"view_size": (0, 1)}):
+    for wrong in ({"rounds": 0}, {"steps": 0}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):
             SimplifyOptions(**wrong)
 
@@ -296,7 +297,7 @@ def invoke(*words):
 def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path):
     scene, out, report = tmp_path / "scene.ply", tmp_path / "out.ply", tmp_path / "report.json"
     write_ply(scene, source)
-    words = ("simplify", scene, out, "--keep", "0.5", "--views", "8", "--view-size", "48x36", "--rounds", "2")
+    words = ("simplify", scene, out, "--keep", "0.5", "--views", "8", "--view-size", "48x36", "--set", "rounds=2")
     result = invoke(*words, "--report", report, "--source-index", tmp_path / "index.npy")
     assert result.exit_code == 0, result.output
     assert "450 -> 225 splats" in result.stderr
@@ -312,7 +313,7 @@ def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
-    words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--no-refit", "--cameras", cameras)
+    words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--set", "refit=no", "--cameras", cameras)
     result = invoke(*words, "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)

@@ -6,14 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-import typer
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.measure import covariance_errors, measure_errors
 from csplat.errors import InputError
-from csplat_tools.cli.reducing import Reducing
-from csplat_tools.cli.targeting import Looking
 from csplat_tools.inspect.proof import prove
 from csplat_tools.study import (
     ATTRIBUTES,
@@ -332,55 +329,9 @@ def test_impossible_reductions_are_refused(make_model):
             call()
 
 
-# the command line's words
-
-
-def reducing(**words):
-    nothing = dict.fromkeys(("prune_opacity", "kmeans", "residual_stages", "sh_degree", "threads"))
-    looking = Looking(words.pop("cameras", None), None, None, 40)
-    return Reducing(**{**nothing, "distil_sh": False, "looking": looking, "seed": 0, **words})
-
-
-def test_what_is_asked_is_done(source, shell):
-    assert not reducing().asked
-    assert not reducing(cameras="a.json").asked
-    for words in ({"prune_opacity": 0.0}, {"distil_sh": True}, {"kmeans": "4"}):
-        assert reducing(**words).asked
-    wanted = reducing(prune_opacity=0.3, kmeans="32", residual_stages=2)
-    scene = stored(source, wanted.encoder(quiet=True)(source, EncodeOptions(), None).result)
-    assert [32, 32] == scene.options["reduced"]["kmeans"]["means"]["sizes"]
-    distil = reducing(distil_sh=True, sh_degree=1).encoder(quiet=True)
-    assert "distilled" == stored(shell, distil(shell, EncodeOptions(sh_degree=1), None).result).options["reduced"]["sh"]
-
-
-def test_a_camera_file_decides(shell, tmp_path):
-    from captures import cameras
-
-    from csplat_render.cameras import save_cameras
-
-    path = tmp_path / "cameras.json"
-    save_cameras(path, cameras(40))
-    distil = reducing(distil_sh=True, sh_degree=0, cameras=str(path)).encoder(quiet=True)
-    assert 26 == stored(shell, distil(shell, EncodeOptions(sh_degree=0), None).result).options["reduced"]["views"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ({"distil_sh": True}, "--distil-sh wants --sh-degree"),
-        ({"prune_opacity": 2.0}, "the opacity to prune by is 2"),
-        ({"kmeans": "means"}, "'means' is no number"),
-        ({"kmeans": "4", "residual_stages": 9}, "in 9 stages"),
-    ],
-)
-def test_words_that_say_nothing_are_refused(words, message):
-    with pytest.raises(typer.BadParameter, match=message):
-        reducing(**words).encoder(quiet=True)
-
-
 def test_pruning_and_clustering_want_no_renderer():
     code = (
-        "import sys, json; from csplat_tools.cli.reducing import Reducing; import csplat_tools.study;"
+        "import sys, json; import csplat_tools.study; from csplat_tools.study.clustering import parse_kmeans;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

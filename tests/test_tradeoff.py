@@ -25,9 +25,8 @@ from csplat.errors import InputError
 from csplat_render.cameras import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.files.scenes import without_bands
-from csplat_tools.tradeoff.fetching import fetched_bytes
-from csplat_tools.tradeoff.measuring import StageClock
-from csplat_tools.tradeoff.options import Wanted, parse_numbers, parse_words
+from csplat_tools.tradeoff.measuring import StageClock, fetched_bytes
+from csplat_tools.tradeoff.options import USUAL, Wanted, parse_what
 from csplat_tools.tradeoff.page import make_page, shown_points
 from csplat_tools.tradeoff.plots import PLOTS, draw_plot
 from csplat_tools.tradeoff.points import Failure, pareto_front
@@ -60,10 +59,9 @@ def swept(capture, tmp_path_factory):
     """A sweep over every group, judged by photographs; one point cannot be made: no splat is so opaque."""
     folder = tmp_path_factory.mktemp("swept")
     result = invoke(
-        capture / "scene.ply", "--data", capture, "--what", "presets,precision,strategies,targets,simplify",
-        "--with-finetune", "--attribute-psnr", "40", "--psnr", "30", "--sizes", "9kB", "--keep", "0.5", "--opacities",
-        "0.3,0.97", "--kmeans", "16", "--iterations", "20", "-o", folder / "report.html", "--json",
-        folder / "report.json", "--plots", folder / "plots",
+        capture / "scene.ply", "--data", capture, "--what",
+        "presets,precision=40,strategies=0.3:0.97:16,targets=30:9kB,simplify=0.5,finetune", "--iterations", "20", "-o",
+        folder / "report.html", "--report", folder / "report.json", "--plots", folder / "plots",
     )  # fmt: skip
     assert 0 == result.exit_code, (result.stderr, result.exception)
     return folder, result, json.loads((folder / "report.json").read_text())
@@ -348,7 +346,7 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
     assert [Failure("small", "presets", "out of memory")] == found.failures
 
 
-@pytest.mark.parametrize("option", ["-o", "--json", "--plots"])
+@pytest.mark.parametrize("option", ["-o", "--report", "--plots"])
 def test_nothing_is_overwritten_unless_forced(capture, tmp_path, option):
     target = tmp_path / "there"
     if option == "--plots":
@@ -368,7 +366,7 @@ def test_nothing_is_overwritten_unless_forced(capture, tmp_path, option):
 
 
 def test_json_alone_is_on_standard_output_where_it_is_asked_for(capture):
-    result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json", "-", "--quiet")
+    result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json", "--quiet")
     assert {"fast", "balanced", "small"} == {one["name"] for one in json.loads(result.stdout)["points"]}
     assert "" == result.stderr
 
@@ -400,14 +398,15 @@ def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
         ["--what", "presets,everything"],
         ["--what", ""],
         ["--what", "strategies", "--preset", "huge"],
-        ["--attribute-psnr", "forty"],
-        ["--attribute-psnr", "500"],
-        ["--psnr", "100"],
-        ["--sizes", "5 parsecs"],
-        ["--keep", "0"],
-        ["--keep", "1.5"],
-        ["--opacities", "nan"],
-        ["--kmeans", "0"],
+        ["--what", "precision=forty"],
+        ["--what", "precision=500"],
+        ["--what", "presets=3"],
+        ["--what", "targets=100"],
+        ["--what", "targets=5 parsecs"],
+        ["--what", "simplify=0"],
+        ["--what", "simplify=1.5"],
+        ["--what", "strategies=nan"],
+        ["--what", "strategies=70000"],
         ["--modes", "quick"],
         ["--modes", ""],
         ["--iterations", "0"],
@@ -422,9 +421,12 @@ def test_a_wrong_command_line_has_status_2(capture, words):
 
 
 def test_lists_are_read_in_their_order():
-    assert ("b", "a") == parse_words(" b,a ,b,")
-    assert (0.5, 0.25) == parse_numbers("0.5,.25,0.50")
-    assert () == parse_numbers("")
+    assert ("targets", "presets") == parse_what("targets,presets,targets").what
+    assert (*USUAL, "finetune") == parse_what("usual, finetune").what
+    wanted = parse_what("targets=38:2MB:.5e2:38, strategies=0.1:16:256, precision=")
+    assert ((38.0, 50.0), (2_000_000,)) == (wanted.psnr, wanted.sizes)
+    assert ((0.1,), (16.0, 256.0)) == (wanted.opacities, wanted.kmeans)
+    assert () == wanted.attribute_psnr
 
 
 @pytest.mark.parametrize(("module", "words"), [("numba", []), ("matplotlib", ["-o", "report.html"])])

@@ -151,7 +151,7 @@ def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
     (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     run = [sys.executable, "-m", "csplat_tools", "train", str(tmp_path), "-o", str(tmp_path / "o.ply")]
     options = ["--max-splats", "50", "--sh-degree", "1", "--iterations", "30", "--size", "40x40", "--seed", "3"]
-    files = ["--json", str(tmp_path / "log.json"), "--plot", str(tmp_path / "loss.png")]
+    files = ["--report", str(tmp_path / "log.json"), "--plot", str(tmp_path / "loss.png")]
     done = subprocess.run([*run, *options, *files], capture_output=True, text=True, check=False)
     assert (0, "") == (done.returncode, done.stdout), done.stderr
     model = read_ply(tmp_path / "o.ply")
@@ -192,7 +192,7 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
     folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
-    told = call("train", folder, "-o", ply, "--background", background, "--json", log, *reading, *QUICK_WORDS)
+    told = call("train", folder, "-o", ply, "--background", background, "--report", log, *reading, *QUICK_WORDS)
     call("encode", ply, tmp_path / "a.csplat")
     call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
     said = TrainedOn.of(read_ply(ply).metadata)

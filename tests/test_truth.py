@@ -40,8 +40,8 @@ def test_every_command_says_of_a_trained_scene_what_its_training_said(tmp_path, 
     """None of them is told background, split or size: the PLY says it."""
     data, ply, log = photographs(kind, tmp_path / "data"), tmp_path / "s.ply", tmp_path / "log.json"
     call(
-        "train", data, "-o", ply, "--max-splats", 60, "--sh-degree", 1, "--iterations", 40, "--init", "box",
-        "--size", "x".join(map(str, SIZE)), "--test-every", every, "--json", log, "-q",
+        "train", data, "-o", ply, "--max-splats", 60, "--sh-degree", 1, "--iterations", 40, "--set", "init=box",
+        "--size", "x".join(map(str, SIZE)), "--test-every", every, "--report", log, "-q",
     )  # fmt: skip
     said = TrainedOn.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (said.background, said.size)
@@ -59,20 +59,20 @@ def compared(ply, data, _):
 
 def tuned(ply, data, folder):
     report = folder / "tuned.json"
-    words = ("finetune", ply, "--data", data, "-o", folder / "t.csplat", "--iterations", 1, "--sh-coding", "none")
+    words = ("finetune", ply, "--data", data, "-o", folder / "t.csplat", "--iterations", 1, "--set", "sh-coding=none")
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["scores"]["source"]["psnr"]
 
 
 def simplified(ply, data, folder):
     report = folder / "simplified.json"
-    words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9, "--rounds", 1, "--no-refit")
+    words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9, "--set", "rounds=1,refit=no")
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["photographs"]["source"]
 
 
 def swept(ply, data, _):
-    scores = json.loads(call("tradeoff", ply, "--data", data, "--what", "presets", "--json", "-", "-q"))
+    scores = json.loads(call("tradeoff", ply, "--data", data, "--what", "presets", "--json", "-q"))
     return scores["source"]["photographs"]["views"], scores["source"]["photographs"]["psnr"]
 
 

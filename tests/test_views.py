@@ -170,13 +170,13 @@ def command_words(name, folder, out):
     ply = folder / "scene.ply"
     return {
         "compare": ("compare", ply, ply),
-        "simplify": ("simplify", ply, out / "half.ply", "--keep", "0.5", "--rounds", "1", "--no-adjust"),
-        "max-loss": ("simplify", ply, out / "less.ply", "--max-loss", "1", "--rounds", "1", "--no-refit"),
+        "simplify": ("simplify", ply, out / "half.ply", "--keep", "0.5", "--set", "rounds=1,adjust=no"),
+        "max-loss": ("simplify", ply, out / "less.ply", "--max-loss", "1", "--set", "rounds=1,refit=no"),
         "sensitivity": ("sensitivity", ply, out / "s.npz", "--no-matrices"),
         "finetune": (
-            "finetune", ply, "-o", out / "s.csplat", "--iterations", "2", "--sh-coding", "none", "--keep", "0.7"
+            "finetune", ply, "-o", out / "s.csplat", "--iterations", "2", "--set", "sh-coding=none", "--keep", "0.7"
         ),
-        "tradeoff": ("tradeoff", ply, "--what", "targets,simplify", "--psnr", "30", "--keep", "0.5"),
+        "tradeoff": ("tradeoff", ply, "--what", "targets=30,simplify=0.5"),
     }[name]  # fmt: skip
 
 
@@ -199,12 +199,12 @@ def test_whoever_judges_says_the_same_of_the_same_scene(sets, tmp_path, kind):
     found = {}
     compared = json.loads(invoke("compare", ply, ply, *own, "--json").stdout)
     found["compare"] = compared["photographs"]["a"]["psnr"]
-    words = ("simplify", ply, tmp_path / "all.ply", "--keep", "0.9", "--no-refit", "--rounds", "1", "--json")
+    words = ("simplify", ply, tmp_path / "all.ply", "--keep", "0.9", "--set", "refit=no,rounds=1", "--json")
     simplified = json.loads(invoke(*words, *own).stdout)["photographs"]
     found["simplify"] = simplified["source"]
-    words = ("finetune", ply, "-o", tmp_path / "s.csplat", "--iterations", "1", "--sh-coding", "none", "--say-json")
+    words = ("finetune", ply, "-o", tmp_path / "s.csplat", "--iterations", "1", "--set", "sh-coding=none", "--json")
     found["finetune"] = json.loads(invoke(*words, *own).stdout)["scores"]["source"]["psnr"]
-    swept = json.loads(invoke("tradeoff", ply, "--what", "presets", "--json", "-", *own).stdout)
+    swept = json.loads(invoke("tradeoff", ply, "--what", "presets", "--json", *own).stdout)
     found["tradeoff"] = swept["source"]["photographs"]["psnr"]
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets[kind]), (24, 20), test_every=5))

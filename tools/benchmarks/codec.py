@@ -24,7 +24,7 @@ from scenes import ROOT, Scene, find_scenes
 
 from csplat.decoder import read_header
 from csplat_tools.files.console import format_table
-from csplat_tools.inspect.layout import describe
+from csplat_tools.inspect.info import byte_shares
 
 _CHILD = Path(__file__).with_name("child.py")
 _PRESETS = ("fast", "balanced", "small")
@@ -110,14 +110,14 @@ def _measure_preset(scene: Scene, preset: str, runs: int, args: argparse.Namespa
     program = [sys.executable, "-m", "csplat_tools", "encode", str(scene.path), str(output)]
     whole = run_timed([*program, "--preset", preset, "--force", "--quiet", *threads], encode_runs)
     data = output.read_bytes()
-    layout = describe(data, read_header(data))
+    shares = byte_shares(data, read_header(data))
     return {
         "encode": encode,
         "decode": decode,
         "whole_wall_seconds": whole and whole.wall,
         "whole_cpu_seconds": whole and whole.cpu,
         "size_bytes": len(data),
-        "attribute_bytes": {name: one["size_bytes"] for name, one in layout["attributes"].items()},
+        "attribute_bytes": {name: size for name, size in shares.items() if name != "overhead"},
     }
 
 

@@ -22,7 +22,7 @@ from csplat.ply import read_ply
 from csplat_render.judge import renderer
 from csplat_render.lpips import Lpips
 from csplat_render.removal import measure_removal
-from csplat_tools.inspect.layout import describe
+from csplat_tools.inspect.info import byte_shares
 from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.finetune import Clock
@@ -170,7 +170,7 @@ class Bench:
         scores = self.judge({"before": before, "after": after})
         colours, shapes = books_of(tuned.frozen)
         kept = len(tuned.frozen.source_index)
-        described = describe(tuned.result.data, read_header(tuned.result.data))
+        described = byte_shares(tuned.result.data, read_header(tuned.result.data))
         return {
             "splats": kept,
             "before_bytes": len(tuned.plain.data),
@@ -181,7 +181,7 @@ class Bench:
             "sh_escapes": None if colours is None else colours.escaped / kept,
             "shapes": 0 if shapes is None else shapes.entries,
             "shape_escapes": None if shapes is None else shapes.escaped / kept,
-            "attribute_bytes": {name: one["size_bytes"] for name, one in described["attributes"].items()},
+            "attribute_bytes": {name: size for name, size in described.items() if name != "overhead"},
             "steps": tuned.log["steps"],
             "best_step": tuned.log["best_iteration"],
             "seconds": dict(tuned.seconds),

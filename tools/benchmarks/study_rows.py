@@ -13,7 +13,7 @@ from study_scenes import Subject
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
-from csplat_tools.inspect.layout import describe
+from csplat_tools.inspect.info import byte_shares
 from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
@@ -174,8 +174,8 @@ def attribute_bytes(subject: Subject) -> dict[str, dict[str, int]]:
     wanted = {"balanced": Reduction(), "small": Reduction(), "small, SH 0, τ 0.02": Reduction(0.02, sh_degree=0)}
     for name, reduction in wanted.items():
         data = encode_reduced(source, reduction, EncodeOptions(preset=name.partition(",")[0])).data
-        described = describe(data, read_header(data))
-        used = {name: int(one["size_bytes"]) for name, one in described["attributes"].items()}
+        used = byte_shares(data, read_header(data))
+        del used["overhead"]
         files[name] = {**_gathered(used), "frame": len(data) - sum(used.values())}
     return files
 

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import sys
 
-__all__ = ["main"]
+from csplat import __version__
+from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
+__all__ = ["VERSIONS", "main"]
+
+#: Of the program and of the format.
+VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
 def main() -> None:
     """Run the program.
 
-    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one.
+    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one. The
+    versions alone want none of them.
     """
+    if sys.argv[1:] == ["--version"]:
+        print(VERSIONS)  # noqa: T201  # data, before there is a console
+        return
     try:
         from csplat_tools.cli.app import app
 

@@ -34,7 +34,7 @@ class TrainOptions:
         iterations: training steps, one picture each.
         seed: of every random choice.
         device: `cpu` (numba) or `cuda` (the gsplat package).
-        strategy: one of `STRATEGIES`.
+        strategy: how splats come and go: `mcmc`, `fixed`, `gradient` or `none`.
         init: where splats start: at the data set's points, inside the visual hull of the alpha
             masks, anywhere in the scene's box, or (`auto`) the first of these that there is.
         initial_splats: how many there are at first; 0: the strategy decides.

@@ -105,9 +105,9 @@ def starting_splats(
     have_points = points is not None and len(points) > 0
     have_masks = any(picture.has_alpha for picture in pictures)
     if init == "points" and not have_points:
-        raise InputError("the data set holds no points to start from: wanted --init hull or box")
+        raise InputError("the data set holds no points to start from: wanted --set init=hull or init=box")
     if init == "hull" and not have_masks:
-        raise InputError("the pictures have no alpha channel to make a hull of: wanted --init points or box")
+        raise InputError("the pictures have no alpha channel to make a hull of: wanted --set init=points or init=box")
     if have_points and init in ("points", "auto"):
         assert points is not None
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))

@@ -50,7 +50,7 @@ class EncodeOptions:
             steps of their own. Only where an importance holds curvatures; by default one per 2,500 splats, one in
             all with the preset "fast".
         tile_splats: splats per tile at most, 1 to 65536.
-        effort: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
+        deflate_level: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: carry the model's extra columns.
         seed: of the k-means.
@@ -80,7 +80,7 @@ class EncodeOptions:
     adaptive: float | None = None
     grades: int | None = None
     tile_splats: int = _spec.TILE_SPLATS_MAX
-    effort: int | None = None
+    deflate_level: int | None = None
     deflate: str = "auto"
     keep_extra: bool = False
     seed: int = 0
@@ -124,7 +124,7 @@ class Preset:
         sh_quality: the same for the bands 1 to 3, where bits are dear.
         sh_coding: as in `EncodeOptions`, "auto" among them.
         adaptive: as in `EncodeOptions`.
-        effort: as in `EncodeOptions`.
+        deflate_level: as in `EncodeOptions`.
         codebook_share: entries of an SH codebook per splat.
         codebook_finer: its lattice is finer than that of scalar coding by 2**codebook_finer.
         escape_fraction: as in `EncodeOptions`.
@@ -134,7 +134,7 @@ class Preset:
     sh_quality: float
     sh_coding: str
     adaptive: float
-    effort: int
+    deflate_level: int
     codebook_share: float = 1 / 16
     codebook_finer: int = 1
     escape_fraction: float = 0.02
@@ -174,7 +174,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "adaptive": (float, 0, 1),
     "grades": (int, 1, 5),
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
-    "effort": (int, 1, 12),
+    "deflate_level": (int, 1, 12),
     "seed": (int, 0, math.inf),
     "threads": (int, 1, math.inf),
 }

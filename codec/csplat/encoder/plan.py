@@ -115,7 +115,7 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
         adaptive=_first(options.adaptive, preset.adaptive if importance_given else 0.0),
         tile_splats=options.tile_splats,
         coding=Coding(
-            effort=_first(options.effort, preset.effort),
+            effort=_first(options.deflate_level, preset.deflate_level),
             library=deflate_library(options.deflate),
             zstandard=options.profile == _spec.PROFILE_NAMES[_spec.PROFILE_ARCHIVE],
         ),

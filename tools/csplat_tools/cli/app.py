@@ -9,8 +9,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
-import csplat
-from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat_tools.__main__ import VERSIONS
 from csplat_tools.files.console import say
 
 __all__ = ["app"]
@@ -31,7 +30,7 @@ _MODULES = {
     "finetune": "finetune",
     "view": "view",
     "export-html": "view",
-    "conformance": "conformance_encoder",
+    "conformance": "conformance",
 }
 
 
@@ -72,7 +71,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        say(f"csplat {csplat.__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}")
+        say(VERSIONS)
         raise typer.Exit
 
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from csplat_tools.cli.console import guarded
-from csplat_tools.cli.data_options import Images, Size, Split, TestEvery, data_options
-from csplat_tools.cli.parsing import parse_colour, parse_mode
-from csplat_tools.files.console import format_table, note, progress_bar, say, say_json
+from csplat_tools.cli.options import Lpips, Mode, Output, command
+from csplat_tools.cli.parsing import parse_mode
+from csplat_tools.cli.view_options import Split, Views, check_split
+from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.inspect.attributes import AttributeErrors
 from csplat_tools.inspect.compare import FileComparison, compare_files
@@ -25,24 +25,13 @@ _PAIRING = {
 }
 
 
-@guarded
+@command(needs={"split": ("data",), "amplify": ("pictures",)})
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
-    cameras: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE.json", help="Cameras, instead of virtual ones; of 40 or more every fourth, 24 at most."
-        ),
-    ] = None,
-    data: Annotated[
-        str | None,
-        typer.Option(metavar="DATA", help="Or the cameras of a data set; its photographs judge A and B, too."),
-    ] = None,
+    views: Views,
+    out: Output,
     split: Split = "test",
-    size: Size = None,
-    images: Images = None,
-    test_every: TestEvery = None,
     source_index: Annotated[
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
     ] = None,
@@ -50,18 +39,8 @@ def compare(
         str | None, typer.Option(metavar="FOLDER", help="Write A, B and their difference, side by side, for each view.")
     ] = None,
     amplify: Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Of the differences shown.")] = 10.0,
-    lpips: Annotated[
-        str | None,
-        typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`."),
-    ] = None,
-    background: Annotated[
-        str | None,
-        typer.Option(metavar="R,G,B", help="Behind the scene: black, but with --data or --cameras as in training."),
-    ] = None,
-    mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
-    force: Annotated[bool, typer.Option("--force", help="Replace existing pictures.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Everything, for programs.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    lpips: Lpips = None,
+    mode: Mode = "standard",
 ) -> None:
     """Compare a scene with its source: sizes, errors of the splats, and pictures.
 
@@ -78,36 +57,18 @@ def compare(
       csplat compare scene.ply scene.csplat --pictures differences
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
-    if cameras is not None and data is not None:
-        raise typer.BadParameter("wanted one of --cameras and --data")
-    colour = None if background is None else parse_colour(background)
-    chosen = parse_mode(mode)
-    shots = data_options(data, size, images, test_every, split=split)
-    with progress_bar(quiet=quiet) as progress:
+    out.check(inputs=(a, b, views.cameras, source_index))
+    with out.bar() as progress:
         compared = compare_files(
-            a,
-            b,
-            cameras=cameras,
-            data=shots,
-            split=split,
-            source_index=source_index,
-            lpips=lpips,
-            pictures=pictures,
-            amplification=amplify,
-            background=colour,
-            mode=chosen,
-            force=force,
-            prepare=partial(prepare_renderer, quiet=quiet, ssim=True, lpips=lpips is not None),
+            a, b, cameras=views.cameras, data=views.photographs(), split=check_split(split), source_index=source_index,
+            lpips=lpips, pictures=pictures, amplification=amplify, background=views.colour, mode=parse_mode(mode),
+            force=out.force, prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None),
             progress=progress,
-        )
-    for line in () if quiet else compared.notes:
-        note(line)
-    if as_json:
-        say_json(compared.as_json())
-    else:
-        say(_format(compared, Path(a).name, Path(b).name))
-    if pictures is not None and not quiet:
-        note(f"{len(compared.quality.each)} files in {pictures}")
+        )  # fmt: skip
+    out.remark(*compared.notes)
+    out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
+    if pictures is not None:
+        out.remark(f"{len(compared.quality.each)} files in {pictures}")
 
 
 def _format(compared: FileComparison, a: str, b: str) -> str:

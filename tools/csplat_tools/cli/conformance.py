@@ -1,22 +1,73 @@
-"""`csplat conformance`."""
+"""`csplat conformance decoder` and `csplat conformance encoder`."""
 
 from __future__ import annotations
 
-import json
+import shlex
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder
+from csplat_conformance.encoders.judge import PictureJudge
+from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
 from csplat_conformance.report import Report, to_json, to_junit, to_table
 from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
-from csplat_tools.cli.console import FAILED, guarded
-from csplat_tools.files.console import note, progress_bar, say, say_json
-from csplat_tools.files.streams import STANDARD_STREAM, check_output, write_bytes
+from csplat_tools.cli.console import FAILED
+from csplat_tools.cli.options import Group, Output, command
+from csplat_tools.files.console import Progress, note, say
+from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
 
 __all__ = ["conformance"]
 
+_PICTURES_LEVEL = 4
+_OURS = "-m csplat_tools encode {ply} {out} --quiet"
+
 conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+
+
+@dataclass(frozen=True)
+class Run(Group):
+    """How a suite is run, and reported beside the JSON."""
+
+    pattern: Annotated[
+        str | None, typer.Option("--filter", metavar="PATTERN", help="Only checks of this name: 'invalid/*'.")
+    ] = None
+    timeout: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.1, help="For each file.")] = None
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", metavar="N", min=1, help="Processes at a time; one per core.")
+    ] = None
+    junit: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Every result as JUnit XML, for CI; - for standard output.")
+    ] = None
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for each check.")] = False
+
+    def publish(self, report: Report, out: Output, nothing: str) -> None:
+        """Give the report, in every form that is wanted, and end with its status.
+
+        Args:
+            report: of the run.
+            out: where results go.
+            nothing: what is said where nothing was checked.
+
+        Raises:
+            typer.Exit: a check failed, or there was none.
+        """
+        if self.junit == STANDARD_STREAM:
+            say(to_junit(report).rstrip("\n"))
+        elif self.junit is not None:
+            write_bytes(self.junit, to_junit(report).encode())
+        out.publish(to_json(report), "" if self.junit == STANDARD_STREAM else to_table(report, verbose=self.verbose))
+        if not report.outcomes:
+            note(f"error: {nothing}")
+        if not report.passed:
+            raise typer.Exit(FAILED)
 
 
 @conformance.callback()
@@ -31,12 +82,14 @@ def root() -> None:
 
 
 @conformance.command()
-@guarded
+@command()
 def decoder(
-    command: Annotated[
+    run: Run,
+    out: Output,
+    program: Annotated[
         str | None, typer.Option("--cmd", metavar="COMMAND", help="Another decoder, with {input} and {outdir}.")
     ] = None,
-    render_command: Annotated[
+    render_program: Annotated[
         str | None,
         typer.Option(
             "--render-cmd", metavar="COMMAND", help="A renderer, with {input}, {camera} and {out} or {outdir}."
@@ -49,25 +102,12 @@ def decoder(
     profile: Annotated[
         str, typer.Option(metavar="base|archive", help="What the decoder reads; base must refuse archive.")
     ] = "archive",
-    pattern: Annotated[
-        str | None, typer.Option("--filter", metavar="PATTERN", help="Only vectors of this name: 'invalid/*'.")
-    ] = None,
     clause: Annotated[
         str | None, typer.Option(metavar="PATTERN", help="Only vectors that cover such a clause of the spec: 'HDR-*'.")
     ] = None,
-    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="For each file.")] = TIMEOUT_SECONDS,
-    jobs: Annotated[int | None, typer.Option("--jobs", "-j", metavar="N", help="Processes at a time.")] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Of refusals demand code, clause and offset too: for our decoders.")
     ] = False,
-    json_file: Annotated[
-        str | None, typer.Option("--json", metavar="FILE", help="Every result for programs; - for standard output.")
-    ] = None,
-    junit_file: Annotated[
-        str | None, typer.Option("--junit", metavar="FILE", help="Every result as JUnit XML, for CI.")
-    ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for each check.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing reports.")] = False,
 ) -> None:
     """Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
 
@@ -83,54 +123,83 @@ def decoder(
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
-    check_reports(json_file, junit_file, force=force)
-    with progress_bar() as bar:
+    out.check(run.junit)
+    with out.bar() as bar:
         # A renderer alone is tested at L4 alone.
-        usual = "3" if render_command is None else "4"
-        choice = Choice(pattern, clause, parse_levels(level or usual), profile, exact, timeout, jobs)
-        moved = (lambda done, count: bar("conformance", done / count)) if bar else None
-        if command is None and render_command is None:
-            report = run_builtin(choice, moved)
+        levels = parse_levels(level or ("3" if render_program is None else "4"))
+        choice = Choice(run.pattern, clause, levels, profile, exact, run.timeout or TIMEOUT_SECONDS, run.jobs)
+        if program is None and render_program is None:
+            report = run_builtin(choice, _moved(bar))
         else:
-            report = run_command(command, choice, render=render_command, progress=moved)
-    publish(report, json_file, junit_file, verbose=verbose)
-    if not report.outcomes:
-        note("error: no vector is chosen")
-    if not report.passed:
-        raise typer.Exit(FAILED)
+            report = run_command(program, choice, render=render_program, progress=_moved(bar))
+    run.publish(report, out, "no vector is chosen")
 
 
-def check_reports(json_file: str | None, junit_file: str | None, *, force: bool) -> None:
-    """Refuse the places of reports before anything is run; arguments as those of `publish`.
+@conformance.command()
+@command()
+def encoder(
+    run: Run,
+    out: Output,
+    program: Annotated[
+        str | None, typer.Option("--cmd", metavar="COMMAND", help="Another encoder, with {ply} and {out}.")
+    ] = None,
+    level: Annotated[str, typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3.")] = "4",
+    min_psnr: Annotated[
+        float, typer.Option(metavar="DB", help="That pictures must keep at L4; choose it by your preset.")
+    ] = PSNR_MIN,
+    keep: Annotated[
+        str | None, typer.Option(metavar="FOLDER", help="Write the inputs and what was made of them there.")
+    ] = None,
+) -> None:
+    """Run an encoder over reference PLYs: csplat's own, or the one that --cmd starts.
 
-    Raises:
-        InputError: a file exists and `force` is not given, or both reports go to the same place.
-        OSError: a folder does not exist.
+    L1: it ends as it should and the file breaks no clause. L2: every splat
+    of the source is there once, or counted as left out. L3: the stated errors
+    hold. L4: pictures keep --min-psnr; needs the packages of the render
+    extra. An encoder exits with 0 and a file, or with 1, a line that says
+    why, and no file; ordinary inputs it must take.
+
+    Examples:
+      csplat conformance encoder --cmd 'my-encoder {ply} {out}'
+      csplat conformance encoder --cmd 'my-encoder --small {ply} {out}' --min-psnr 28 --junit report.xml
+      csplat conformance encoder --cmd 'my-encoder {ply} {out}' --filter 'nasty/*' --level 1 --keep tried
     """
-    if json_file is not None and json_file == junit_file:
-        both = "standard output" if json_file == STANDARD_STREAM else json_file
-        raise InputError(f"only one report can go to {both}")
-    for path in (json_file, junit_file):
-        if path is not None and path != STANDARD_STREAM:
-            check_output(path, force=force)
+    out.check(run.junit)
+    levels = tuple(f"L{number}" for number in parse_levels(level))
+    folder = _checked_folder(keep, force=out.force)
+    pictures, reason = _picture_judge() if f"L{_PICTURES_LEVEL}" in levels else (None, "")
+    choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, folder)
+    ours = f"{shlex.quote(sys.executable)} {_OURS}"
+    with out.bar() as bar:
+        report = run_encoder(program or ours, choice, pictures=pictures, no_pictures=reason, progress=_moved(bar))
+    run.publish(report, out, "no input has such a name")
 
 
-def publish(report: Report, json_file: str | None, junit_file: str | None, *, verbose: bool) -> None:
-    """Print a report as a table, and write it as JSON and JUnit XML where that is wanted.
+def _moved(bar: Progress | None) -> Callable[[int, int], None] | None:
+    return (lambda done, count: bar("conformance", done / count)) if bar else None
 
-    Args:
-        report: of a run.
-        json_file: file name, `-` for standard output in place of the table, or None.
-        junit_file: likewise.
-        verbose: a line for each check.
-    """
-    if json_file == STANDARD_STREAM:
-        say_json(to_json(report))
-    elif json_file is not None:
-        write_bytes(json_file, (json.dumps(to_json(report), indent=2, allow_nan=False) + "\n").encode())
-    if junit_file == STANDARD_STREAM:
-        say(to_junit(report).rstrip("\n"))
-    elif junit_file is not None:
-        write_bytes(junit_file, to_junit(report).encode())
-    if STANDARD_STREAM not in (json_file, junit_file):
-        say(to_table(report, verbose=verbose))
+
+def _checked_folder(name: str | None, *, force: bool) -> Path | None:
+    if name is None:
+        return None
+    folder = Path(name)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{name} is a file, wanted a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not force:
+        raise InputError(f"{name} is not empty: --force replaces what is in the way")
+    return folder
+
+
+def _picture_judge() -> tuple[PictureJudge | None, str]:
+    """Return what judges pictures, or why nothing does."""
+    try:
+        prepare_renderer(quiet=False)
+    except InputError as error:
+        return None, str(error)
+    from csplat_render.judge import Judge
+    from csplat_tools.views import comparison_cameras
+
+    def psnr(source: SplatModel, decoded: SplatModel) -> float:
+        return Judge.of_source(source, comparison_cameras(source)).psnr(decoded)
+
+    return psnr, ""

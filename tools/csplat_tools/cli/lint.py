@@ -8,25 +8,25 @@ import typer
 
 from csplat.lint import Finding
 from csplat.ply import lint_ply, read_ply
-from csplat_tools.cli.console import FAILED, guarded
-from csplat_tools.files.console import format_table, note, say, say_json
+from csplat_tools.cli.console import FAILED
+from csplat_tools.cli.options import Output, command
+from csplat_tools.files.console import format_table, note
 from csplat_tools.files.convert import findings_as_json
-from csplat_tools.files.streams import STANDARD_STREAM, check_output, ply_path, write_model
+from csplat_tools.files.streams import STANDARD_STREAM, ply_path, write_model
 
 __all__ = ["lint"]
 
 
-@guarded
+@command()
 def lint(
     source: Annotated[str, typer.Argument(metavar="F.ply", help="A 3DGS PLY, or - for standard input.")],
+    out: Output,
     fix: Annotated[
         str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY, where that is safe.")
     ] = None,
     keep_extra: Annotated[
         bool, typer.Option("--keep-extra", help="Extra columns are no defect; --fix keeps them.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing OUT.ply.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Say what is wrong with a PLY: each defect with its count.
 
@@ -40,10 +40,7 @@ def lint(
       csplat lint scene.ply --fix clean.ply
       csplat lint scene.ply --json | jq '.findings[].id'
     """
-    if as_json and fix == STANDARD_STREAM:
-        raise typer.BadParameter("--json and --fix - both want standard output")
-    if fix is not None:
-        check_output(fix, force=force, inputs=(source,))
+    out.check(fix, inputs=(source,))
     with ply_path(source) as path:
         findings = lint_ply(path)
         if keep_extra:
@@ -52,13 +49,11 @@ def lint(
         if fix is not None and not errors:
             write_model(fix, read_ply(path, keep_extra=keep_extra), absolute=False)
     clean = all(one.kind == "note" for one in findings)
-    if as_json:
-        fixed = fix is not None and not errors
-        say_json({"clean": clean, "fixed": fixed, "findings": findings_as_json(findings)})
-    elif fix == STANDARD_STREAM:
-        note(_table(findings))
-    else:
-        say(_table(findings))
+    table = _table(findings)
+    if fix == STANDARD_STREAM:
+        note(table)
+    result = {"clean": clean, "fixed": fix is not None and not errors, "findings": findings_as_json(findings)}
+    out.publish(result, "" if fix == STANDARD_STREAM else table)
     if errors or (fix is None and not clean):
         raise typer.Exit(FAILED)
 

@@ -7,8 +7,6 @@ import re
 
 import typer
 
-from csplat_render.conventions import MODES
-
 __all__ = ["parse_colour", "parse_decibels", "parse_mode", "parse_size"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -50,6 +48,8 @@ def parse_mode(text: str) -> str:
     Raises:
         typer.BadParameter: there is no such mode.
     """
+    from csplat_render.conventions import MODES  # not wanted by commands that render nothing
+
     if text not in MODES:
         raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
     return text

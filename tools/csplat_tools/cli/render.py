@@ -2,58 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from csplat_tools.cli.console import guarded
-from csplat_tools.cli.data_options import Images, Split, TestEvery, data_options
-from csplat_tools.cli.parsing import parse_colour, parse_mode, parse_size
-from csplat_tools.files.console import note, progress_bar
+from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
+from csplat_tools.cli.parsing import parse_mode, parse_size
+from csplat_tools.cli.view_options import Split, Views, check_split
+from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
+from csplat_tools.views import BLACK
 
 __all__ = ["render"]
 
 
-@guarded
+class _Views(Views):
+    """Views that pictures are made from; a size is that of the pictures."""
+
+    one_of = (("cameras", "orbit", "data"),)
+    needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("images", "test_every", "split"), ("data",))
+
+
+@command()
 def render(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY or .csplat file, or - for standard input.")],
+    source: Scene,
     output: Annotated[
-        str, typer.Option("--output", "-o", metavar="FOLDER|FILM", help="A folder, or NAME.webp, .gif, .png: a film.")
+        str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.webp, .gif, .png: a film.")
     ],
-    cameras: Annotated[
-        str | None, typer.Option(metavar="FILE.json", help="Cameras: a list of {K, viewmat, W, H, near, image}.")
-    ] = None,
+    views: _Views,
+    out: Output,
     orbit: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Instead: N cameras on a circle around the scene.")
-    ] = None,
-    data: Annotated[
-        str | None, typer.Option(metavar="DATA", help="Instead: where the pictures of a data set were taken.")
+        int | None, typer.Option(metavar="N", min=1, help="N cameras on a circle around the scene.")
     ] = None,
     split: Split = "test",
-    images: Images = None,
-    test_every: TestEvery = None,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the pictures: the cameras' own, or 640x480.")
-    ] = None,
     fps: Annotated[
         float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Pictures per second of a film.")
     ] = DEFAULT_FPS,
-    background: Annotated[
-        str, typer.Option(metavar="R,G,B", help="Colour behind the scene, 0 to 1, or black, or white.")
-    ] = "black",
-    mode: Annotated[str, typer.Option(metavar="exact|standard|fast", help="Speed for accuracy.")] = "standard",
-    sh_degree: Annotated[
-        int | None, typer.Option(metavar="0..3", min=0, max=3, help="Leave out SH bands above this one.")
-    ] = None,
+    mode: Mode = "standard",
+    sh_degree: ShDegree = None,
     depth: Annotated[bool, typer.Option("--depth", help="Write NAME.depth.npy too, float32, scene units.")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Write NAME.alpha.png too.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
 ) -> None:
     """Render a scene to PNG files, or to an animated WebP, GIF or PNG.
 
@@ -63,38 +56,34 @@ def render(
     where its pictures were taken. Needs the packages of the render extra.
 
     Examples:
-      csplat render scene.csplat --orbit 120 -o turn.webp
-      csplat render scene.csplat --orbit 120 -o film
+      csplat render scene.csplat --orbit 120 turn.webp
+      csplat render scene.csplat film --orbit 120
       ffmpeg -framerate 25 -i film/%04d.png -pix_fmt yuv420p film.mp4
-      csplat render scene.ply --data capture --split test -o held-out
-      csplat render scene.ply --cameras test.json -o views --background white
-      csplat render scene.ply --orbit 8 -o small --size 320x240 --sh-degree 0
+      csplat render scene.ply held-out --data capture --split test
+      csplat render scene.ply views --cameras test.json --background white
+      csplat render scene.ply small --orbit 8 --size 320x240 --sh-degree 0
     """
-    if (cameras is None) + (orbit is None) + (data is None) != 2:
+    if (views.cameras, orbit, views.data) == (None, None, None):
         raise typer.BadParameter("wanted one of --cameras, --orbit and --data")
     film = is_film(output)
     if film and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
-    pixels = None if size is None else parse_size(size)
-    colour, chosen = parse_colour(background), parse_mode(mode)
-    shots = data_options(data, None if data is None else size, images, test_every, split=split)
+    pixels = None if views.size is None else parse_size(views.size)
+    colour, chosen = views.colour or BLACK, parse_mode(mode)
+    shots = views.photographs()
+    out.check(inputs=(source, views.cameras))
     need_renderer()
-    loaded = load_model(source)
-    model = loaded.model if sh_degree is None else without_bands(loaded.model, sh_degree)
-    views = find_cameras(model, cameras, orbit, shots, pixels, split=split)
+    model = load_model(source).model
+    if sh_degree is not None:
+        model = without_bands(model, sh_degree)
+    cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=check_split(split))
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
-    with progress_bar(quiet=quiet) as progress:
+    with out.bar() as progress:
         rendered = write(
-            model,
-            views,
-            output,
-            background=colour,
-            mode=chosen,
-            force=force,
-            prepare=partial(prepare_renderer, quiet=quiet),
-            progress=progress,
-        )
+            model, cameras, output, background=colour, mode=chosen, force=out.force,
+            prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
+        )  # fmt: skip
     if rendered.ignored_count:
         note(f"{rendered.ignored_count} splats that hold NaN or infinities are not drawn")
-    if not quiet:
-        note(f"{len(views)} pictures in {output}" if film else f"{len(rendered.files)} files in {output}")
+    out.remark(f"{len(cameras)} pictures in {output}" if film else f"{len(rendered.files)} files in {output}")
+    out.publish({"files": [str(file) for file in rendered.files], "ignored_splats": rendered.ignored_count})

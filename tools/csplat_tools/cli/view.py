@@ -9,18 +9,17 @@ from typing import Annotated
 import typer
 
 from csplat.decoder import decode_scene
-from csplat.encoder import PRESETS
-from csplat_tools.cli.console import guarded
-from csplat_tools.files.console import format_bytes, note, progress_bar, say
-from csplat_tools.files.streams import check_output, write_bytes
+from csplat_tools.cli.encoder_options import Preset, check_preset
+from csplat_tools.cli.options import Output, Scene, command
+from csplat_tools.files.console import format_bytes, note
+from csplat_tools.files.streams import write_bytes
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import ViewScene, open_scene, view_wishes
 
 __all__ = ["export_html", "view"]
 
-_Scene = Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file or a PLY, or - for standard input.")]
-_Camera = Annotated[
+_Cameras = Annotated[
     str | None, typer.Option(metavar="FILE.json", help="Look from these cameras: a list of {K, viewmat, W, H, near}.")
 ]
 _Axes = Annotated[
@@ -28,13 +27,12 @@ _Axes = Annotated[
 ]
 
 
-@guarded
+@command()
 def view(
-    source: _Scene,
-    preset: Annotated[
-        str, typer.Option(metavar="|".join(PRESETS), help="How a PLY is encoded before it is shown.")
-    ] = "fast",
-    camera: _Camera = None,
+    source: Scene,
+    out: Output,
+    preset: Preset = "fast",
+    cameras: _Cameras = None,
     axes: _Axes = None,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 finds one that is free.")] = 0,
     host: Annotated[
@@ -53,32 +51,33 @@ def view(
       csplat view scene.ply --preset small --axes RFU
       csplat view scene.csplat --no-browser --port 8000
     """
-    _check_preset(preset)
-    wishes = view_wishes(camera, axes)
-    with progress_bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
+    check_preset(preset)
+    out.check(inputs=(source, cameras))
+    wishes = view_wishes(cameras, axes)
+    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
-            _describe(scene, preset)
-            say(opened.url)
+            out.findings([one for one in scene.findings if one.kind == "repair"])
+            out.remark(*_encoded(scene, preset))
+            out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
-            note("Ctrl-C ends this.")
+            out.remark("Ctrl-C ends this.")
             if not no_browser and not webbrowser.open(opened.url):
                 note("no browser could be opened: open the address above in one")
             try:
                 opened.serve_forever(poll_interval=0.1)
             except KeyboardInterrupt:
-                note("")  # behind the ^C of the terminal
+                out.remark("")  # behind the ^C of the terminal
 
 
-@guarded
+@command()
 def export_html(
-    source: _Scene,
-    target: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or - for standard output.")],
-    preset: Annotated[str, typer.Option(metavar="|".join(PRESETS), help="How a PLY is encoded.")] = "balanced",
-    camera: _Camera = None,
+    source: Scene,
+    output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -.")],
+    out: Output,
+    preset: Preset = "balanced",
+    cameras: _Cameras = None,
     axes: _Axes = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing unless something is wrong.")] = False,
 ) -> None:
     """Write one page that shows a scene, with everything inside.
 
@@ -89,36 +88,28 @@ def export_html(
     Examples:
       csplat export-html scene.csplat scene.html
       csplat export-html scene.ply scene.html --preset small --force
-      csplat export-html scene.csplat scene.html --camera views.json
+      csplat export-html scene.csplat scene.html --cameras views.json
     """
-    _check_preset(preset)
-    wishes = view_wishes(camera, axes)
-    check_output(target, force=force, inputs=(source,))
-    with progress_bar(quiet=quiet) as progress, open_scene(source, preset=preset, progress=progress) as scene:
+    check_preset(preset)
+    wishes = view_wishes(cameras, axes)
+    out.check(output, inputs=(source, cameras))
+    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
         exported = export_page(data, scene.name, wishes)
-        write_bytes(target, exported.page)
-        if quiet:
-            return
-        _describe(scene, preset)
-    note(
-        f"{target}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
+        write_bytes(output, exported.page)
+        out.findings([one for one in scene.findings if one.kind == "repair"])
+        out.remark(*_encoded(scene, preset))
+    out.remark(
+        f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
         f" (its file and a third), page and decoder {format_bytes(exported.code_bytes)}"
     )
+    sizes = {"scene_bytes": exported.scene_bytes, "code_bytes": exported.code_bytes}
+    out.publish({"splats": scene.header.splat_count, "size_bytes": len(exported.page), **sizes})
 
 
-def _check_preset(preset: str) -> None:
-    if preset not in PRESETS:
-        raise typer.BadParameter(f"the preset is {preset!r}, wanted one of {', '.join(PRESETS)}")
-
-
-def _describe(scene: ViewScene, preset: str) -> None:
-    for finding in scene.findings:
-        if finding.kind == "repair":
-            note(str(finding))
-    if scene.encoded_from:
-        note(
-            f"encoded with the preset {preset}: {format_bytes(scene.encoded_from)} ->"
-            f" {format_bytes(scene.size_bytes)}, {scene.header.splat_count} splats"
-        )
+def _encoded(scene: ViewScene, preset: str) -> list[str]:
+    if not scene.encoded_from:
+        return []
+    sizes = f"{format_bytes(scene.encoded_from)} -> {format_bytes(scene.size_bytes)}"
+    return [f"encoded with the preset {preset}: {sizes}, {scene.header.splat_count} splats"]

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
-from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bars
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
 
-__all__ = ["Progress", "format_bytes", "format_table", "note", "progress_bar", "say", "say_json", "step_progress"]
+__all__ = [
+    "Progress",
+    "finite",
+    "format_bytes",
+    "format_table",
+    "note",
+    "progress_bar",
+    "say",
+    "say_json",
+    "step_progress",
+]
 
 _LINES = 10  # of progress where there is no terminal
 
@@ -30,6 +41,11 @@ def say_json(value: Any) -> None:
     say(json.dumps(value, indent=2, allow_nan=False))
 
 
+def finite(value: float | None) -> float | None:
+    """The same; `None`, as JSON has neither, for NaN and infinities."""
+    return value if value is not None and math.isfinite(value) else None
+
+
 def note(text: str) -> None:
     """Print what is not data."""
     _echo(text, sys.stderr)
@@ -45,14 +61,13 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
     if quiet or not sys.stderr.isatty():
         yield None
         return
-    columns = (TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn())
-    with Bars(*columns, console=Console(stderr=True), transient=True) as progress:
+    with _bars("{task.description:<24}", timed=True) as bars:
         tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: float) -> None:
             if stage not in tasks:
-                tasks[stage] = progress.add_task(stage, total=1.0)
-            progress.update(tasks[stage], completed=done)
+                tasks[stage] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[stage], completed=done)
 
         yield report
 
@@ -95,13 +110,23 @@ def step_progress(
 
         yield line
         return
-    with Bars(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
+    with _bars("{task.description}", timed=False) as bar:
         task = bar.add_task(name, total=iterations)
 
         def show(now: S) -> None:
             bar.update(task, completed=now.iteration, description=tell(now))
 
         yield show
+
+
+def _bars(text: str, *, timed: bool) -> Bars:
+    """Bars on standard error that vanish in the end."""
+    from rich.console import Console  # takes longer to import than most commands to run
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn(text), BarColumn(), TimeElapsedColumn()) if timed else (BarColumn(), TextColumn(text))
+    return Bars(*columns, console=Console(stderr=True), transient=True)
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -5,38 +5,31 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from csplat.decoder import Limits, decode
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.files.console import Progress
-from csplat_tools.files.importance import read_importance, weights_of
 from csplat_tools.files.scenes import without_bands
-from csplat_tools.files.streams import mapped_csplat, ply_path, write_array, write_bytes, write_model
-from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_tools.files.streams import STANDARD_STREAM, mapped_csplat, ply_path, write_array, write_bytes, write_model
 
 __all__ = [
     "Encoded",
     "Encoder",
     "Made",
     "SceneFacts",
+    "Source",
     "decode_file",
     "encode_file",
     "findings_as_json",
     "limits_for",
+    "read_source",
 ]
-
-_ONE_GRADE = (
-    "all splats are of one grade: weights alone do not say how precise they have to be, nor do virtual views inside of"
-    " surroundings; `csplat sensitivity` from cameras does"
-)
 
 
 @dataclass(frozen=True)
@@ -47,11 +40,13 @@ class Made:
         result: of the encoder.
         key: under which name a report has `said`.
         said: what was looked for, tried and chosen, JSON-compatible.
+        lines: what a user should know of that, a sentence each.
     """
 
     result: EncodeResult
     key: str = ""
     said: Mapping[str, Any] = field(default_factory=dict)
+    lines: tuple[str, ...] = ()
 
 
 #: Makes a file of a scene.
@@ -127,6 +122,54 @@ class Encoded:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A PLY that was read to be encoded.
+
+    Attributes:
+        name: of the file. size_bytes: its size.
+        model: its splats.
+        findings: what lint noticed.
+    """
+
+    name: str
+    size_bytes: int
+    model: SplatModel
+    findings: tuple[Finding, ...]
+
+
+def read_source(
+    path: str,
+    facts: SceneFacts | None = None,
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    progress: Progress | None = None,
+) -> Source:
+    """Read a PLY, repaired where that is safe.
+
+    Args:
+        path: of the PLY, or `-`.
+        facts: what it does not say.
+        strict: refuse what would be repaired.
+        keep_extra: carry columns that splats do not have.
+        progress: is told the stage.
+
+    Raises:
+        CsplatError: it cannot be used.
+        OSError: it cannot be read.
+    """
+    findings: list[Finding] = []
+    report = progress or (lambda _stage, _done: None)
+    report("reading", 0.0)
+    with ply_path(path) as local:
+        model = read_ply(local, strict=strict, keep_extra=keep_extra, report=findings)
+        size_bytes = local.stat().st_size
+    report("reading", 1.0)
+    name = "standard input" if path == STANDARD_STREAM else Path(path).name
+    return Source(name, size_bytes, (facts or SceneFacts()).applied(model), tuple(findings))
+
+
 def encode_file(
     source: str,
     target: str,
@@ -159,63 +202,22 @@ def encode_file(
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
-    findings: list[Finding] = []
-    if progress is not None:
-        progress("reading", 0.0)
-    with ply_path(source) as path:
-        model = read_ply(path, strict=strict, keep_extra=options.keep_extra, report=findings)
-        source_bytes = path.stat().st_size
-    if progress is not None:
-        progress("reading", 1.0)
-    model = (facts or SceneFacts()).applied(model)
+    read = read_source(source, facts, strict=strict, keep_extra=options.keep_extra, progress=progress)
+    model = read.model
     if encoder is not None:
         made = encoder(model, options, progress)
+    elif importance is None:
+        if prune_unseen:
+            raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
+        made = Made(encode_with_report(model, options, progress=progress))
     else:
-        made = Made(_encoded(model, options, importance, prune_unseen, progress))
+        from csplat_tools.files.importance import encode_by_importance  # wants names of trainer and renderer
+
+        made = Made(encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress))
     write_bytes(target, made.result.data)
     if source_index is not None:
         write_array(source_index, made.result.source_index)
-    return Encoded(made, tuple(findings), source_bytes, time.perf_counter() - start)
-
-
-def _encoded(
-    model: SplatModel, options: EncodeOptions, importance: str | None, prune_unseen: bool, progress: Progress | None
-) -> EncodeResult:
-    found = None if importance is None else read_importance(importance, model)
-    stored = found if isinstance(found, StoredSensitivity) else None
-    if prune_unseen and stored is None:
-        raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
-    weights = None if found is None else weights_of(found, model)
-    notes = _unheeded(options, weights)
-    if not prune_unseen or stored is None or stored.seen.all():
-        return _noted(encode_with_report(model, options, importance=weights, progress=progress), *notes)
-    rows = np.flatnonzero(stored.seen)
-    if not len(rows):
-        raise InputError(f"{importance}: no view saw any splat; nothing would be left")
-    said = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
-    result = encode_with_report(
-        model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
-        origin=Origin(len(model), rows), said={"pruned": said}, progress=progress,
-    )  # fmt: skip
-    if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
-        missed = (
-            f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
-            " them: `csplat sensitivity` with more views misses fewer"
-        )
-        notes = (*notes, missed)
-    return _noted(result, *notes)
-
-
-def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance | None) -> tuple[str, ...]:
-    """What an importance does not say, though it is asked for."""
-    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.curvatures is not None):
-        return ()
-    return (_ONE_GRADE,)
-
-
-def _noted(result: EncodeResult, *notes: str) -> EncodeResult:
-    """The same, with sentences for the user."""
-    return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))
+    return Encoded(made, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
 def decode_file(
@@ -226,7 +228,7 @@ def decode_file(
     absolute: bool = False,
     max_splats: int | None = None,
     progress: Progress | None = None,
-) -> None:
+) -> SplatModel:
     """Read a .csplat file, write a PLY.
 
     Args:
@@ -236,6 +238,9 @@ def decode_file(
         absolute: add the origin and write doubles.
         max_splats: budget; the default is the decoder's.
         progress: called with the stage's name and the share done.
+
+    Returns:
+        What was written.
 
     Raises:
         CsplatError: the file is not valid, or too large.
@@ -252,6 +257,7 @@ def decode_file(
     report("writing", 0.0)
     write_model(target, model, absolute=absolute)
     report("writing", 1.0)
+    return model
 
 
 def limits_for(max_splats: int | None) -> Limits:

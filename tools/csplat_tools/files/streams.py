@@ -7,6 +7,7 @@ is replaced unless asked.
 from __future__ import annotations
 
 import io
+import json
 import mmap
 import shutil
 import sys
@@ -36,6 +37,7 @@ __all__ = [
     "read_array",
     "write_array",
     "write_bytes",
+    "write_json",
     "write_model",
 ]
 
@@ -211,6 +213,11 @@ def write_bytes(path: str, data: bytes) -> None:
     else:
         with atomic_writer(path) as stream:
             stream.write(data)
+
+
+def write_json(path: str, value: Any) -> None:
+    """Write JSON; NaN and infinities do not occur in it: JSON has none."""
+    write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat_tools.files.console import Progress, finite
 from csplat_tools.files.scenes import LoadedModel
 from csplat_tools.inspect.matching import match
 from csplat_tools.inspect.pairs import measure_pairs
@@ -48,7 +47,7 @@ class AttributeErrors:
             "matched": self.matched,
             "unmatched": self.unmatched,
             "errors": {
-                name: {"max": _finite(largest), "rms": _finite(rms)} for name, (largest, rms) in self.errors.items()
+                name: {"max": finite(largest), "rms": finite(rms)} for name, (largest, rms) in self.errors.items()
             },
         }
 
@@ -58,7 +57,7 @@ def attribute_errors(
     other: LoadedModel,
     source_index: NDArray[Any] | None = None,
     *,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> AttributeErrors | None:
     """Measure the errors of a scene's splats against those of its source.
 
@@ -102,7 +101,3 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
     distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
     spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
     return float(np.median(distances)) <= _NEAR * spread
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

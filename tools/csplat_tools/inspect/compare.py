@@ -14,6 +14,7 @@ from csplat.errors import InputError
 from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
 from csplat_tools.files.scenes import LoadedModel, load_model
@@ -100,7 +101,7 @@ def compare_files(
     mode: str = "standard",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> FileComparison:
     """Compare a file with its source.
 

@@ -7,13 +7,14 @@ a splat's partner lies in its own cell or, along each axis, in the nearer neighb
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat_tools.files.console import Progress
 from csplat_tools.inspect.pairs import differences
 
 __all__ = ["UNDECIDED", "UNMATCHED", "allowed", "match"]
@@ -44,7 +45,7 @@ def match(
     radii: F64,
     *,
     candidates_max: int = _CANDIDATES_MAX,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> I64:
     """Find partners.
 

@@ -7,7 +7,7 @@ source within the stated maxima; rms and counts are then not proved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder import SceneHeader, StatedErrors
 from csplat.model import SplatModel
+from csplat_tools.files.console import Progress, finite
 from csplat_tools.inspect.matching import UNDECIDED, UNMATCHED, allowed, match
 from csplat_tools.inspect.pairs import measure_names, measure_pairs
 
@@ -68,6 +69,24 @@ class Proof:
         """Whether everything that could be looked at holds."""
         return not self.failures
 
+    def as_json(self) -> dict[str, Any]:
+        """Everything, JSON-compatible; what overflowed is `null`."""
+        return {
+            "rms_and_counts_proved": self.rms_proved and self.holds,
+            "failures": list(self.failures),
+            "notes": list(self.notes),
+            "measures": {
+                one.name: {
+                    "stated_max": one.stated_max,
+                    "stated_rms": one.stated_rms,
+                    "measured_max": finite(one.measured_max),
+                    "measured_rms": finite(one.measured_rms),
+                    "holds": one.holds,
+                }
+                for one in self.measures
+            },
+        }
+
 
 def prove(
     source: SplatModel,
@@ -76,7 +95,7 @@ def prove(
     stated: StatedErrors | None,
     source_index: NDArray[Any] | None = None,
     *,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Proof:
     """Compare a file's stated errors with its source.
 
@@ -175,7 +194,7 @@ def _prove_matches(
     header: SceneHeader,
     stated: StatedErrors,
     names: Sequence[str],
-    progress: Callable[[str, float], None] | None,
+    progress: Progress | None,
 ) -> Proof:
     bounds = {"opacities": math.inf, "sh0": math.inf, **{record.measure: record.max for record in stated.records}}
     found = match(source, decoded, bounds, lattice_radii(decoded, header), progress=progress)

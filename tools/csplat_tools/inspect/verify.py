@@ -7,13 +7,13 @@ from typing import Any
 
 from csplat.decoder import decode_scene
 from csplat.ply import read_ply
-from csplat_conformance.validator import Validation, Violation, validate
+from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import limits_for
 from csplat_tools.files.streams import mapped_csplat, ply_path, read_array
 from csplat_tools.inspect.proof import Proof, prove
 
-__all__ = ["Verified", "validation_as_json", "verify_file"]
+__all__ = ["Verified", "verify_file"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,24 @@ class Verified:
     def holds(self) -> bool:
         """Whether the file conforms, and what it states was not disproved."""
         return self.validation.conforms and (self.proof is None or self.proof.holds)
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, JSON-compatible."""
+        found, proof = self.validation, self.proof
+        return {
+            "holds": self.holds,
+            "conforms": found.conforms,
+            "violations": [
+                {name: getattr(one, name) for name in ("clause", "code", "offset", "field", "message")}
+                for one in found.violations
+            ],
+            "remarks": list(found.remarks),
+            "not_looked_at": [{"field": one.field, "reason": one.reason} for one in found.unread],
+            "splats": found.splat_count,
+            "tiles": found.tile_count,
+            "checks": list(found.checks),
+            "proof": None if proof is None else proof.as_json(),
+        }
 
 
 def verify_file(
@@ -65,26 +83,3 @@ def verify_file(
     with ply_path(source) as ply:
         model = read_ply(ply, keep_extra=bool(scene.header.extras))
     return Verified(validation, prove(model, scene.model, scene.header, scene.stated_errors, rows, progress=progress))
-
-
-def validation_as_json(validation: Validation) -> dict[str, Any]:
-    """Return what was found as JSON-compatible values."""
-    return {
-        "conforms": validation.conforms,
-        "violations": [_violation(one) for one in validation.violations],
-        "remarks": list(validation.remarks),
-        "not_looked_at": [{"field": one.field, "reason": one.reason} for one in validation.unread],
-        "splats": validation.splat_count,
-        "tiles": validation.tile_count,
-        "checks": list(validation.checks),
-    }
-
-
-def _violation(one: Violation) -> dict[str, Any]:
-    return {
-        "clause": one.clause,
-        "code": one.code,
-        "offset": one.offset,
-        "field": one.field,
-        "message": one.message,
-    }

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from csplat.encoder import EncodeResult
+from csplat_tools.files.console import format_bytes
 
 __all__ = ["Optimised", "Report"]
 
@@ -52,6 +53,35 @@ class Report:
     def as_json(self) -> dict[str, Any]:
         """Everything, JSON-compatible."""
         return asdict(self)
+
+    def lines(self) -> tuple[str, ...]:
+        """What a user should know of it, a sentence each."""
+        goal = self.goal
+        asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
+        if "size_bytes" in goal:
+            share = 100.0 * self.size_bytes / goal["size_bytes"]
+            asked.append(f"{format_bytes(goal['size_bytes'])}, of which the file takes {share:.1f} %")
+        if "psnr" in goal:
+            asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
+        if "keep" in goal:
+            asked.append(f"{100.0 * goal['keep']:g} % of {self.splats_before} splats")
+        if "max_loss" in goal:
+            asked.append(f"a loss of {goal['max_loss']:g} dB by the photographs that decide")
+        lines = [f"target: {'; '.join(asked)}"]
+        if self.photographs:
+            file, source = self.photographs["file"], self.photographs["source"]
+            lines.append(f"photographs that judge: {file:.2f} dB, the source {source:.2f}")
+        lines += [f"chosen: {line}" for line in self.why]
+        if self.psnr is not None:
+            lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
+        cost = f"{self.encodes} file{'s' if self.encodes > 1 else ''} tried"
+        if self.renders:
+            cost += f", {self.renders} pictures judged"
+        if self.sensitivity_views:
+            cost += f", sensitivity measured in {self.sensitivity_views}"
+        if self.removal_views:
+            cost += f", removal measured in {self.removal_views} small ones"
+        return (*lines, cost)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,12 @@ from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.removal import measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.views import Colour, ViewSet, evenly
+from csplat_tools.views.agreeing import find_views
+from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
-
-if TYPE_CHECKING:
-    from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = ["Measured", "measure_scene", "measure_views", "measured_for", "measured_importance", "measuring_views"]
 
@@ -88,9 +88,6 @@ def measure_scene(
     Raises:
         InputError: there are no splats, or no views, or they show no splat.
     """
-    from csplat_render.removal import measure_removal
-    from csplat_tools.views.agreeing import find_views
-
     if not len(model):
         raise InputError(_NOTHING)
     cameras, check, source = (
@@ -131,8 +128,6 @@ def measure_views(
     Raises:
         InputError: there are no splats, or no view shows any.
     """
-    from csplat_trainer.sensitivity import measure_sensitivity
-
     if not len(model):
         raise InputError(_NOTHING)
     if progress is not None:

@@ -168,7 +168,7 @@ class Solver:
         """The share of the bytes that a decibel costs here."""
         for other in self.trials.of(trial.part, trial.coding):
             apart = other.decided_psnr - trial.decided_psnr
-            if abs(apart) > _APART and other.options.effort == trial.options.effort:
+            if abs(apart) > _APART and other.options.deflate_level == trial.options.deflate_level:
                 return min(max(math.log(other.size_bytes / trial.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
         return BYTES_PER_DB
 

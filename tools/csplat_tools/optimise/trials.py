@@ -23,7 +23,7 @@ __all__ = ["Coding", "Part", "Trial", "Trials", "Whole", "spread_of"]
 F64 = NDArray[np.float64]
 Weights = NDArray[Any] | Importance
 _ENTRIES = (16, 8192)  # of a codebook that is chosen here, at least and at most
-_QUICK_EFFORT = 10  # of files that are compared: half of the time of the highest goes into the last per cent
+_QUICK_LEVEL = 10  # of files that are compared: half of the time of the highest goes into the last per cent
 
 
 @dataclass(frozen=True)
@@ -244,9 +244,9 @@ class Trials:
         """
         options = coding.options(encoding or self.encoding, len(part.model))
         options = options if quality is None else replace(options, attribute_psnr=quality)
-        packing = options.preset != "fast" and options.sh_coding != "codebook" and options.effort is None
+        packing = options.preset != "fast" and options.sh_coding != "codebook" and options.deflate_level is None
         if quick and packing and not part.refits:
-            options = replace(options, effort=_QUICK_EFFORT)
+            options = replace(options, deflate_level=_QUICK_LEVEL)
         careful = not (quick and (part.refits or packing))
         for trial in self.made:
             alike = trial.part is part and trial.options == options and trial.coding.graded == coding.graded

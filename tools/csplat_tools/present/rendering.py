@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render import Camera, render
+from csplat_render.arrays import RenderResult
 from csplat_render.cameras import load_cameras, resized
 from csplat_render.virtual import orbit_cameras
+from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
 from csplat_tools.files.streams import check_output, write_array
@@ -89,7 +91,7 @@ def render_folder(
     alpha: bool = False,
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Rendered:
     """Render a scene and write NAME.png for each camera.
 
@@ -118,12 +120,8 @@ def render_folder(
     target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _removed_if_empty(target if is_new else None):
-        if prepare is not None:
-            prepare()
-        for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-            if progress is not None:
-                progress("rendering", number / len(cameras))
-            result = render(model, camera, background=background, mode=mode)
+        pictures = _pictures(model, cameras, background, mode, prepare, progress)
+        for name, result in zip(names, pictures, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
             write_png(files[-1], to_bytes(result.rgb))
@@ -133,8 +131,6 @@ def render_folder(
             if depth:
                 files.append(target / f"{name}.depth.npy")
                 write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
-    if progress is not None:
-        progress("rendering", 1.0)
     return Rendered(tuple(files), ignored)
 
 
@@ -148,7 +144,7 @@ def render_film(
     mode: str = "standard",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Rendered:
     """Render a scene into one animated file.
 
@@ -168,19 +164,31 @@ def render_film(
     need_pictures()
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
+    frames, ignored = [], 0
+    for result in _pictures(model, cameras, background, mode, prepare, progress):
+        ignored = max(ignored, result.ignored)
+        frames.append(to_bytes(result.rgb))
+    write_film(path, frames, fps)
+    return Rendered((Path(path),), ignored)
+
+
+def _pictures(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: tuple[float, float, float],
+    mode: str,
+    prepare: Callable[[], object] | None,
+    progress: Progress | None,
+) -> Iterator[RenderResult]:
+    """Render camera after camera; see `render_folder`."""
     if prepare is not None:
         prepare()
-    frames, ignored = [], 0
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("rendering", number / len(cameras))
-        result = render(model, camera, background=background, mode=mode)
-        ignored = max(ignored, result.ignored)
-        frames.append(to_bytes(result.rgb))
+        yield render(model, camera, background=background, mode=mode)
     if progress is not None:
         progress("rendering", 1.0)
-    write_film(path, frames, fps)
-    return Rendered((Path(path),), ignored)
 
 
 @contextmanager

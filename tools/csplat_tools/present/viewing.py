@@ -13,8 +13,9 @@ from csplat.decoder import SceneHeader, read_header
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import FormatError, InputError
 from csplat.lint import Finding
-from csplat.ply import read_ply
+from csplat_render.cameras import load_cameras
 from csplat_tools.files.console import Progress
+from csplat_tools.files.convert import read_source
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 
 __all__ = ["ViewScene", "open_scene", "view_wishes"]
@@ -82,8 +83,6 @@ def view_wishes(camera: str | None, axes: str | None) -> dict[str, str]:
     """
     wishes = {}
     if camera is not None:
-        from csplat_render.cameras import load_cameras
-
         entries = [one.to_json() for one in load_cameras(camera)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
     if axes is not None:
@@ -112,11 +111,6 @@ def _checked(path: Path, stem: str) -> ViewScene:
 
 
 def _encoded(path: Path, stem: str, preset: str, progress: Progress | None) -> ViewScene:
-    findings: list[Finding] = []
-    if progress is not None:
-        progress("reading", 0.0)
-    model = read_ply(path, report=findings)
-    if progress is not None:
-        progress("reading", 1.0)
-    data = encode_with_report(model, EncodeOptions(preset=preset), progress=progress).data
-    return ViewScene(f"{stem}.csplat", data, len(data), read_header(data), tuple(findings), path.stat().st_size)
+    source = read_source(str(path), progress=progress)
+    data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
+    return ViewScene(f"{stem}.csplat", data, len(data), read_header(data), source.findings, source.size_bytes)

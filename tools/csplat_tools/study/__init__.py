@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from csplat_tools.study.clustering import ATTRIBUTES, Book, Clustered, KMeans, cluster_attributes, parse_kmeans
 from csplat_tools.study.encoding import encode_reduced
-from csplat_tools.study.pruning import prune_opacity
+from csplat_tools.study.pruning import prune_opacity, prune_share
 from csplat_tools.study.reduction import Reduced, Reduction, reduce_model
 from csplat_tools.study.sizes import attribute_floats, raw_bytes
 
@@ -20,6 +20,7 @@ __all__ = [
     "encode_reduced",
     "parse_kmeans",
     "prune_opacity",
+    "prune_share",
     "raw_bytes",
     "reduce_model",
 ]

@@ -1,4 +1,4 @@
-"""Remove splats that are nearly transparent: one comparison a splat, and no picture is looked at."""
+"""Remove splats by what they say of themselves, their opacity and size: no picture is looked at."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_render.cloud import surface_areas
 
-__all__ = ["check_threshold", "prune_opacity"]
+__all__ = ["check_threshold", "prune_opacity", "prune_share"]
 
 I64 = NDArray[np.int64]
 
@@ -32,6 +33,25 @@ def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:
         largest = float(model.opacities.max())
         raise InputError(f"no splat has an opacity above {tau:g}: the largest is {largest:g}")
     return model.select(rows), rows.astype(np.int64, copy=False)
+
+
+def prune_share(model: SplatModel, keep: float, *, by_area: bool = False) -> tuple[SplatModel, I64]:
+    """Keep a share of the splats: the most opaque ones, or those of the most opacity × surface.
+
+    Args:
+        model: the scene.
+        keep: the share, above 0, at most 1; one splat stays at least.
+        by_area: whether the surface counts.
+
+    Returns:
+        The others, in their order, and which splat of the scene each one was, [N] int64.
+    """
+    keys = model.opacities.astype(np.float64)
+    if by_area:
+        keys *= surface_areas(model)
+    gone = len(model) - max(1, round(keep * len(model)))
+    rows = np.sort(np.argsort(keys, kind="stable")[gone:])
+    return model.select(rows), rows
 
 
 def check_threshold(tau: float) -> None:

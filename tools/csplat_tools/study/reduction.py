@@ -15,10 +15,10 @@ from csplat_tools.files.scenes import without_bands
 from csplat_tools.study.clustering import Clustered, KMeans, cluster_attributes
 from csplat_tools.study.pruning import check_threshold, prune_opacity
 from csplat_tools.study.sizes import attribute_floats, raw_bytes
+from csplat_tools.views import ViewSet, find_view_set
 
 if TYPE_CHECKING:
     from csplat_tools.study.distilling import Teacher
-    from csplat_tools.views import ViewSet
 
 __all__ = ["Reduced", "Reduction", "find_teacher", "reduce_model", "reduced_by", "target_degree"]
 
@@ -150,8 +150,6 @@ def find_teacher(source: SplatModel, reduction: Reduction, views: ViewSet | None
     from csplat_tools.study.distilling import Teacher  # wants numba; the other strategies do not
 
     if views is None:
-        from csplat_tools.views import find_view_set
-
         aside = max(1, reduction.views // _ASIDE)
         views = find_view_set(source, count=reduction.views - aside, aside=aside, seed=reduction.seed)
     return Teacher.of_source(source, views, threads=reduction.threads)

@@ -7,26 +7,25 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
 from csplat_render.cameras import relative_to
 from csplat_render.judge import renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_tools.files.console import Progress
-from csplat_tools.inspect.layout import describe
-from csplat_tools.tradeoff.fetching import fetched_bytes
+from csplat_tools.inspect.info import byte_shares
 from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
 from csplat_tools.tradeoff.setting import Setting
 from csplat_tools.tradeoff.showing import WorstView
 from csplat_tools.tradeoff.sweep import Candidate
 from csplat_tools.views import evenly
 
-__all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer"]
+__all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer", "fetched_bytes"]
 
 F32 = NDArray[np.float32]
 
@@ -93,12 +92,10 @@ class Measurer:
         made = candidate.make(clock.listening(progress))
         encode_seconds = time.perf_counter() - start
         setting, header = self._setting, read_header(made.data)
-        described = describe(made.data, header)
         decoded, decode_seconds = self._decoded(made.data, None)
         worst = WorstView()
         quality, photographs = self._compared(decoded, worst)
         modes = {mode: self._mode_time(decoded, mode) for mode in self._modes}
-        use = {name: int(one["size_bytes"]) for name, one in described["attributes"].items()}
         return Point(
             name=candidate.name,
             family=candidate.family,
@@ -109,18 +106,13 @@ class Measurer:
             sh_degree=header.sh_degree,
             source_splats=len(setting.source),
             source_bytes=setting.source_bytes,
-            psnr=quality.psnr,
-            psnr_mean=quality.psnr_mean,
-            psnr_worst=quality.psnr_worst,
-            worst_view=quality.worst_view,
-            ssim=quality.ssim,
-            lpips=quality.lpips,
+            quality=quality,
             photographs=photographs,
             encode_seconds=encode_seconds,
             stages=made.stages or clock.seconds,
             decode_seconds=decode_seconds,
             modes=modes,
-            attribute_bytes={**use, "overhead": sum(described["overhead"].values())},
+            attribute_bytes=byte_shares(made.data, header),
             first_picture_bytes=fetched_bytes(header, 0),
             partial=self._partial(made, header) if candidate.is_partial else (),
             shown=worst.shown(),
@@ -135,9 +127,7 @@ class Measurer:
         return Partial(
             sh_degree=degree,
             size_bytes=fetched_bytes(header, degree),
-            psnr=quality.psnr,
-            psnr_worst=quality.psnr_worst,
-            ssim=quality.ssim,
+            quality=quality,
             decode_seconds=seconds,
             render_milliseconds=self._mode_time(decoded, "standard").milliseconds,
         )
@@ -151,7 +141,7 @@ class Measurer:
             seconds.append(time.perf_counter() - start)
         return models[0], statistics.median(seconds)
 
-    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Scores, dict[str, Any] | None]:
+    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Scores, Scores | None]:
         """Against the source's renders; without a `WorstView` neither by LPIPS nor by photographs."""
         distance = None if worst is None else self._setting.distance
         each = list[ViewScore]()
@@ -163,9 +153,9 @@ class Measurer:
                     each.append(self._photographs.score(number, other, lpips=distance))
 
         quality = self._judge.scores(decoded, lpips=distance, on_view=look)
-        return quality, Scores.of(each).as_json() if each else None
+        return quality, Scores.of(each) if each else None
 
-    def _source_scores(self) -> dict[str, Any] | None:
+    def _source_scores(self) -> Scores | None:
         judge, distance = self._photographs, self._setting.distance
         if judge is None:
             return None
@@ -173,7 +163,7 @@ class Measurer:
             judge.score(number, self._judge.look(number).picture, lpips=distance)
             for number in range(len(judge.cameras))
         ]
-        return Scores.of(each).as_json()
+        return Scores.of(each)
 
     def _mode_time(self, model: SplatModel, mode: str) -> ModeTime:
         """Render the timed views, after one that is not timed: it allocates."""
@@ -190,3 +180,22 @@ class Measurer:
             squares = squared_error(wanted, picture)
             error, count = error + float(np.sum(squares)), count + squares.size
         return ModeTime(1000.0 * statistics.median(seconds), psnr_of_mse(error / count))
+
+
+def fetched_bytes(header: SceneHeader, sh_degree: int) -> int:
+    """Bytes that a decoder needs for a scene with the SH bands up to a degree.
+
+    Args:
+        header: of the file; its index says where everything lies.
+        sh_degree: the highest band that is wanted; 0 for what the first picture takes.
+
+    Returns:
+        Header, index, the layers of all tiles up to this band and the codebooks that they need. What says something
+        about the whole file, stated errors and options, is not fetched, nor are extra columns.
+    """
+    wanted = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything before
+    tiles = sum(layer.size for tile in header.tiles for id_, layer in tile.layers.items() if id_ in wanted)
+    codebooks = sum(
+        chunk.size for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer in wanted
+    )
+    return _spec.HEADER_SIZE + header.index_size + tiles + codebooks

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
+from typing import Any
 
 from csplat.encoder import PRESETS
 from csplat.errors import InputError
+from csplat_tools.optimise.target import parse_size_bytes
 
-__all__ = ["FAMILIES", "USUAL", "Wanted", "parse_numbers", "parse_sizes", "parse_words"]
+__all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
 
 #: Groups of points, in the order in which they are measured: what is quick comes first.
 FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")
 #: Those that are measured unless others are asked for: fine-tuning takes minutes for each point.
 USUAL = FAMILIES[:-1]
+
+_VALUES = {"precision": "attribute_psnr", "strategies": "opacities", "targets": "psnr", "simplify": "keep"}
+_NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
@@ -69,38 +75,40 @@ class Wanted:
             raise InputError("no mode of the renderer is given")
 
 
-def parse_words(text: str) -> tuple[str, ...]:
-    """Words from `a,b`, each once, in the order given."""
-    words = [word.strip() for word in text.split(",")]
-    return tuple(dict.fromkeys(word for word in words if word))
+def parse_what(text: str, **how: Any) -> Wanted:
+    """What is swept, from `presets,precision=36:44,targets=40:2MB`.
 
-
-def parse_numbers(text: str) -> tuple[float, ...]:
-    """Numbers from `0.7,0.5`, each once, in the order given; none from an empty text.
+    Args:
+        text: groups, and values of some; `usual` stands for all of `USUAL`. A group without `=` has the usual ones.
+        how: other fields of `Wanted`.
 
     Raises:
-        InputError: one is no finite number.
+        InputError: there is no such group, or a value is none.
     """
-    found = []
-    for word in parse_words(text):
-        try:
-            found.append(float(word))
-        except ValueError:
-            found.append(math.nan)
-        if not math.isfinite(found[-1]):
-            raise InputError(f"{word!r} is no number, wanted some with commas between them")
-    return tuple(dict.fromkeys(found))
+    words = {name: values for name, *values in (word.strip().split("=", 1) for word in text.split(",")) if name}
+    what = [one for name in words for one in (USUAL if name == "usual" else (name,))]
+    values: dict[str, Any] = {}
+    for name, listed in words.items():
+        if not listed:
+            continue
+        found = tuple(dict.fromkeys(one.strip() for one in listed[0].split(":") if one.strip()))
+        if name not in _VALUES:
+            raise InputError(f"{name} takes no values, wanted them for {', '.join(_VALUES)}")
+        if name == "targets":
+            values["sizes"] = tuple(parse_size_bytes(one) for one in found if not _NUMBER.fullmatch(one))
+            found = tuple(one for one in found if _NUMBER.fullmatch(one))
+        numbers = tuple(_number(one) for one in found)
+        if name == "strategies":
+            values["kmeans"] = tuple(one for one in numbers if one >= 1.0)
+            numbers = tuple(one for one in numbers if one < 1.0)
+        values[_VALUES[name]] = numbers
+    return Wanted(what=tuple(dict.fromkeys(what)), **values, **how)
 
 
-def parse_sizes(text: str) -> tuple[int, ...]:
-    """Bytes from `2MB,800kB`, see `csplat_tools.optimise.target.parse_size_bytes`.
-
-    Raises:
-        InputError: one is no size.
-    """
-    from csplat_tools.optimise.target import parse_size_bytes
-
-    return tuple(dict.fromkeys(parse_size_bytes(word) for word in parse_words(text)))
+def _number(word: str) -> float:
+    if not _NUMBER.fullmatch(word):
+        raise InputError(f"{word!r} is no number, wanted some with colons between them")
+    return float(word)
 
 
 def _check(what: str, values: tuple[float, ...], low: float, high: float, unit: str) -> None:

@@ -6,15 +6,17 @@ from collections.abc import Sequence
 from html import escape
 
 from csplat_tools.files.console import format_bytes
+from csplat_tools.files.pictures import check_folder
+from csplat_tools.files.streams import write_bytes
 from csplat_tools.tradeoff.measuring import DECODE_RUNS
 from csplat_tools.tradeoff.page_parts import SCRIPT, STYLE, policy
-from csplat_tools.tradeoff.plots import draw_plot
+from csplat_tools.tradeoff.plots import PLOTS, draw_plot
 from csplat_tools.tradeoff.points import Point
 from csplat_tools.tradeoff.running import Tradeoff
 from csplat_tools.tradeoff.showing import AMPLIFICATION, as_data_uri
 from csplat_tools.tradeoff.tables import columns_of, mode_rows, partial_rows, views_line
 
-__all__ = ["make_page"]
+__all__ = ["check_plots", "make_page", "write_page", "write_plots"]
 
 _MOST_SHOWN = 9  # points with pictures: some 100 kB each
 
@@ -170,7 +172,7 @@ def _measured(tradeoff: Tradeoff) -> str:
         + ", ".join(f"{name} {version}" for name, version in machine["packages"].items()),
     }
     if scores is not None:
-        facts["photographs"] = f"{scores['views']} that were held out; the source itself scores {scores['psnr']:.2f} dB"
+        facts["photographs"] = f"{len(scores.each)} that were held out; the source itself scores {scores.psnr:.2f} dB"
     entries = "\n".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in facts.items())
     return f"<h2>How it was measured</h2>\n<dl>\n{entries}\n</dl>"
 
@@ -191,3 +193,34 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _value(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
+
+
+def check_plots(folder: str | None, *, force: bool) -> None:
+    """Make the folder of the plots; refuse if they would replace files.
+
+    Raises:
+        InputError: one of them exists.
+        OSError: the folder cannot be made.
+    """
+    if folder is not None:
+        check_folder(folder, [_file(name) for name in PLOTS], force=force)
+
+
+def write_plots(folder: str, tradeoff: Tradeoff) -> Sequence[str]:
+    """Write the plots that the sweep has something for, and return their paths."""
+    paths = []
+    for name in PLOTS:
+        text = draw_plot(name, tradeoff, inline=False)
+        if text is not None:
+            paths.append(f"{folder}/{_file(name)}")
+            write_bytes(paths[-1], text.encode())
+    return paths
+
+
+def write_page(path: str, tradeoff: Tradeoff) -> None:
+    """Write the report as one page."""
+    write_bytes(path, make_page(tradeoff).encode())
+
+
+def _file(name: str) -> str:
+    return f"{name}.svg"

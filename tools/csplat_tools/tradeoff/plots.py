@@ -76,7 +76,7 @@ def _photographs(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
     if scores is None:
         return None
     front, label = tradeoff.photograph_front, "PSNR on held-out photographs, dB"
-    level = float(scores["psnr"])
+    level = scores.psnr
     return _front_plot(tradeoff, name, inline, lambda one: one.photograph_psnr, front, label, level=level)
 
 
@@ -160,7 +160,10 @@ def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
         axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
         for number, point in enumerate(points):
             colour, marker = styles[number % len(styles)]
-            sizes, scores = [one.size_bytes / divisor for one in point.partial], [one.psnr for one in point.partial]
+            sizes, scores = (
+                [one.size_bytes / divisor for one in point.partial],
+                [one.quality.psnr for one in point.partial],
+            )
             axes.plot(sizes, scores, marker=marker, color=colour, label=point.name)
             for one, x, y in zip(point.partial, sizes, scores, strict=True):
                 axes.annotate(

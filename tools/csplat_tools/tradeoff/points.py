@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat_render.metrics import Scores
+
 __all__ = ["Failure", "Made", "ModeTime", "Partial", "Point", "Shown", "pareto_front"]
 
 U8 = NDArray[np.uint8]
+
+_QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,16 +57,14 @@ class Partial:
     Attributes:
         sh_degree: the highest band.
         size_bytes: header, index, and the layers up to this band with their codebooks.
-        psnr, psnr_worst, ssim: as of `Scores`.
+        quality: against the source's renders.
         decode_seconds: median of some runs.
         render_milliseconds: of mode `standard`, median over views.
     """
 
     sh_degree: int
     size_bytes: int
-    psnr: float
-    psnr_worst: float
-    ssim: float | None
+    quality: Scores
     decode_seconds: float
     render_milliseconds: float
 
@@ -71,9 +73,7 @@ class Partial:
         return {
             "sh_degree": self.sh_degree,
             "size_bytes": self.size_bytes,
-            "psnr": self.psnr,
-            "psnr_worst": self.psnr_worst,
-            "ssim": self.ssim,
+            **{name: getattr(self.quality, name) for name in ("psnr", "psnr_worst", "ssim")},
             "decode_seconds": round(self.decode_seconds, 5),
             "render_ms": round(self.render_milliseconds, 3),
         }
@@ -125,8 +125,8 @@ class Point:
         size_bytes: of the file. digest: SHA-256 that it states, in hexadecimal digits.
         splats, sh_degree: of the file.
         source_splats, source_bytes: of the scene, and of its PLY.
-        psnr, psnr_mean, psnr_worst, worst_view, ssim, lpips: against the source's renders, as of `Scores`.
-        photographs: scores against held-out photographs as of `Scores`, where there are some.
+        quality: against the source's renders.
+        photographs: against held-out photographs, where there are some.
         encode_seconds: everything from the splats to the bytes. stages: what stages took of that, as far as known.
         decode_seconds: from the bytes to the splats, median of some runs.
         modes: the renderer's, by name.
@@ -145,13 +145,8 @@ class Point:
     sh_degree: int
     source_splats: int
     source_bytes: int
-    psnr: float
-    psnr_mean: float
-    psnr_worst: float
-    worst_view: int
-    ssim: float | None
-    lpips: float | None
-    photographs: Mapping[str, Any] | None
+    quality: Scores
+    photographs: Scores | None
     encode_seconds: float
     stages: Mapping[str, float]
     decode_seconds: float
@@ -172,9 +167,14 @@ class Point:
         return self.size_bytes / self.source_splats if self.source_splats else None
 
     @property
+    def psnr(self) -> float:
+        """Against the source's renders, dB."""
+        return self.quality.psnr
+
+    @property
     def photograph_psnr(self) -> float | None:
         """Pooled over held-out photographs, dB."""
-        return None if self.photographs is None else float(self.photographs["psnr"])
+        return None if self.photographs is None else self.photographs.psnr
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -189,13 +189,8 @@ class Point:
             "ratio": self.ratio,
             "splats": self.splats,
             "sh_degree": self.sh_degree,
-            "psnr": self.psnr,
-            "psnr_mean": self.psnr_mean,
-            "psnr_worst": self.psnr_worst,
-            "worst_view": self.worst_view,
-            "ssim": self.ssim,
-            "lpips": self.lpips,
-            "photographs": None if self.photographs is None else dict(self.photographs),
+            **{name: getattr(self.quality, name) for name in _QUALITY},
+            "photographs": None if self.photographs is None else self.photographs.as_json(),
             "seconds": {
                 "encode": round(self.encode_seconds, 4),
                 "stages": {name: round(seconds, 4) for name, seconds in self.stages.items()},

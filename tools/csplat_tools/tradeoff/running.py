@@ -8,6 +8,7 @@ from typing import Any
 
 from csplat.errors import CsplatError, InputError
 from csplat_render.jit import thread_count
+from csplat_render.metrics import Scores
 from csplat_tools.files.console import Progress, format_bytes, note, progress_bar
 from csplat_tools.tradeoff.machine import describe_machine
 from csplat_tools.tradeoff.measuring import DECODE_RUNS, Measurer
@@ -49,7 +50,7 @@ class Tradeoff:
     wanted: Wanted
     points: Sequence[Point | Failure]
     source_modes: dict[str, ModeTime]
-    source_photographs: dict[str, Any] | None
+    source_photographs: Scores | None
     machine: dict[str, Any]
 
     @property
@@ -95,7 +96,7 @@ class Tradeoff:
             "times": f"single runs; decoding: the median of {DECODE_RUNS}; rendering: the median over views",
             "source": {
                 "render": {name: one.as_json() for name, one in self.source_modes.items()},
-                "photographs": self.source_photographs,
+                "photographs": None if self.source_photographs is None else self.source_photographs.as_json(),
             },
             "pareto": [one.name for one in self.front],
             "pareto_photographs": [one.name for one in self.photograph_front],

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply import read_ply
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance
-from csplat_tools.files.streams import STANDARD_STREAM, ply_path
-from csplat_tools.views import DataOptions, ViewSet, find_view_set
+from csplat_tools.files.convert import read_source
+from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
 
 __all__ = ["Setting", "read_setting"]
 
@@ -38,13 +36,18 @@ class Setting:
 
 
 def read_setting(
-    path: str, *, cameras: str | None = None, data: DataOptions | None = None, lpips: str | None = None
+    path: str,
+    *,
+    cameras: str | None = None,
+    data: DataOptions | None = None,
+    background: Colour | None = None,
+    lpips: str | None = None,
 ) -> Setting:
     """Read scene and views.
 
     Args:
         path: a PLY, or `-`.
-        cameras, data: as for `find_view_set`.
+        cameras, data, background: as for `find_view_set`.
         lpips: a file of LPIPS weights, or `auto`; it is not computed if left out.
 
     Raises:
@@ -52,14 +55,10 @@ def read_setting(
         OSError: it cannot be read.
     """
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
-    findings: list[Finding] = []
-    with ply_path(path) as local:
-        source = read_ply(local, report=findings)
-        source_bytes = local.stat().st_size
-    if not len(source):
+    source = read_source(path)
+    if not len(source.model):
         raise InputError("a scene without splats has nothing to trade")
-    views = find_view_set(source, cameras=cameras, data=data)
+    views = find_view_set(source.model, cameras=cameras, data=data, background=background)
     if not views.judges:
         raise InputError(f"{views.name} has no photographs that were held out")
-    name = "standard input" if path == STANDARD_STREAM else Path(path).name
-    return Setting(name, source, source_bytes, findings, views, distance)
+    return Setting(source.name, source.model, source.size_bytes, source.findings, views, distance)

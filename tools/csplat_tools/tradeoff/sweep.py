@@ -5,17 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress, format_bytes
+from csplat_tools.optimise.optimiser import optimise
+from csplat_tools.optimise.target import Target
+from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoff.options import Wanted
 from csplat_tools.tradeoff.points import Made
 from csplat_tools.tradeoff.setting import Setting
-
-if TYPE_CHECKING:
-    from csplat_tools.study import Reduction
+from csplat_tools.training.finetune import (
+    BYTE_COST,
+    LEARNING_FACTOR,
+    SHAPE_ENTRIES,
+    VIEW_SIZE,
+    VIEWS,
+    Clock,
+    plan_tuning,
+    tune,
+)
+from csplat_tools.views import ViewSet, find_view_set
+from csplat_tools.views.viewset import pose
+from csplat_trainer.finetune import FinetuneOptions, Moment
 
 __all__ = ["Candidate", "candidates"]
 
@@ -69,7 +82,6 @@ def _precisions(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     """Bands, splats and values taken away by simple rules; what looks at pictures comes last."""
-    from csplat_tools.study import Reduction, parse_kmeans
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> Candidate:
         how = replace(reduction, threads=wanted.threads)
@@ -102,11 +114,9 @@ def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 
 def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
-    from csplat_tools.tradeoff.tuning import tune_file
-
-    yield Candidate("tuned", "finetune", partial(tune_file, setting, wanted, None))
+    yield Candidate("tuned", "finetune", partial(_tune, setting, wanted, None))
     for keep in wanted.keep[len(wanted.keep) // 2 :][:1]:  # the middle one: each takes minutes
-        yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(tune_file, setting, wanted, keep))
+        yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(_tune, setting, wanted, keep))
 
 
 def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> Made:
@@ -114,8 +124,6 @@ def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> M
 
 
 def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Progress) -> Made:
-    from csplat_tools.study import encode_reduced
-
     return _made(
         encode_reduced(
             setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
@@ -125,9 +133,6 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Pr
 
 
 def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -> Made:
-    from csplat_tools.optimise.optimiser import optimise
-    from csplat_tools.optimise.target import Target
-
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
     found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)
     return _made(found.result, target=found.report.as_json())
@@ -135,3 +140,32 @@ def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -
 
 def _made(result: EncodeResult, **said: Any) -> Made:
     return Made(result.data, {"encoding": result.report.options, **said})
+
+
+def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> Made:
+    """The file that `csplat finetune` makes with its usual options, but for which virtual views decide."""
+    itself = not setting.views.photographs
+    encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
+    options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
+    clock = Clock()
+    plan = plan_tuning(setting.source, _tuning_views(setting), encoding, clock, keep=keep, progress=progress)
+
+    def show(now: Moment) -> None:
+        progress("tuning", now.iteration / now.iterations)
+
+    tuned = tune(plan, options.scaled(LEARNING_FACTOR[itself]), clock, threads=wanted.threads, show=show)
+    said = {"steps": tuned.log["steps"], "best_step": tuned.log["best_iteration"], "keep": keep, **plan.chosen.said}
+    return Made(tuned.result.data, {"encoding": tuned.result.report.options, "finetune": said}, clock.seconds)
+
+
+def _tuning_views(setting: Setting) -> ViewSet:
+    """Those of `csplat finetune`: of photographs, all teach that do not judge; of virtual views, there are more."""
+    views = setting.views
+    if views.photographs:
+        judging = {pose(camera) for camera in views.judges}
+        teaches = [one.camera for one in views.photographs if pose(one.camera) not in judging]
+        return replace(views, teaches=teaches, decides=())
+    if views.virtual:
+        more = find_view_set(setting.source, background=views.background, count=VIEWS, size=VIEW_SIZE)
+        return replace(views, teaches=more.teaches, decides=more.decides)
+    return views

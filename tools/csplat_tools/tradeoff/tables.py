@@ -50,12 +50,14 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
         Column("ratio", "How many times the file is smaller than the PLY.", lambda one: one.ratio, 1),
         Column("psnr", "dB, of the squared error pooled over all views, against the source's renders.",
                lambda one: one.psnr, 2),
-        Column("mean", "dB, mean over the views.", lambda one: one.psnr_mean, 2, detailed=True),
-        Column("worst", "dB, of the worst view.", lambda one: one.psnr_worst, 2),
-        Column("ssim", "Mean over the views.", lambda one: one.ssim, 4),
+        Column("mean", "dB, mean over the views.", lambda one: one.quality.psnr_mean, 2, detailed=True),
+        Column("worst", "dB, of the worst view.", lambda one: one.quality.psnr_worst, 2),
+        Column("ssim", "Mean over the views.", lambda one: one.quality.ssim, 4),
     ]  # fmt: skip
     if tradeoff.setting.distance is not None:
-        columns.append(Column("lpips", "Perceptual distance (Alex), mean over the views.", lambda one: one.lpips, 4))
+        columns.append(
+            Column("lpips", "Perceptual distance (Alex), mean over the views.", lambda one: one.quality.lpips, 4)
+        )
     if tradeoff.setting.views.photographs:
         columns.append(Column("photos", "dB against held-out photographs.", lambda one: one.photograph_psnr, 2))
     columns += [
@@ -100,7 +102,7 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
         parts.append(format_table(("fewer SH layers", *partial[0]), partial[1:]))
     if tradeoff.source_photographs is not None:
         scores = tradeoff.source_photographs
-        parts.append(f"the source itself scores {scores['psnr']:.2f} dB against {scores['views']} held-out photographs")
+        parts.append(f"the source itself scores {scores.psnr:.2f} dB against {len(scores.each)} held-out photographs")
     machine = tradeoff.machine
     parts.append(
         f"Times are single runs with {machine['threads']} threads on {machine['cores']} cores ({machine['processor']}),"
@@ -149,9 +151,9 @@ def _partial_row(point: Point, part: Partial) -> tuple[str, ...]:
         f"{point.name}, SH {part.sh_degree}",
         str(part.size_bytes),
         f"{100.0 * part.size_bytes / point.size_bytes:.1f} %",
-        f"{part.psnr:.2f}",
-        f"{part.psnr_worst:.2f}",
-        "-" if part.ssim is None else f"{part.ssim:.4f}",
+        f"{part.quality.psnr:.2f}",
+        f"{part.quality.psnr_worst:.2f}",
+        "-" if part.quality.ssim is None else f"{part.quality.ssim:.4f}",
         f"{1000.0 * part.decode_seconds:.1f}",
         f"{part.render_milliseconds:.1f}",
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from csplat.encoder import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_render import Camera
+from csplat_render.removal import measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.files.importance import read_importance
 from csplat_tools.optimise.sensitivity import measure_views
-from csplat_tools.views import ViewSet, with_deciders
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.target import Target
+from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
+from csplat_trainer.finetune import View, Views, renders_of, split_views
+from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-
-if TYPE_CHECKING:
-    from csplat_render import Camera
-    from csplat_trainer.finetune import Views
-    from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = ["Chosen", "choose_splats", "training_views"]
 
 I64 = NDArray[np.int64]
-_MEASURED = 160  # virtual views at most that say how much splats matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,6 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> V
 
     Where no view decides which step was best, some that teach do.
     """
-    from csplat_trainer.finetune import View, Views, renders_of, split_views
-
     behind = np.array(views.background, np.float32)
 
     def looks(cameras: Sequence[Camera]) -> list[View]:
@@ -89,9 +87,7 @@ def choose_splats(
     Raises:
         InputError: no view shows anything; or the file is none, or about another scene.
     """
-    from csplat_render.removal import measure_removal
-
-    measuring = views.teaches[:_MEASURED] if views.virtual else views.teaches
+    measuring = views.teaches[:VIEW_COUNT] if views.virtual else views.teaches
     looking = [*views.teaches, *views.decides]
 
     def weighed(model: SplatModel) -> Sensitivity:
@@ -135,9 +131,6 @@ def _simplified(
     model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
 ) -> tuple[SplatModel, I64]:
     """A share of the splats, their colours fitted, and which they are."""
-    from csplat_tools.optimise.simplify import SimplifyOptions, simplify
-    from csplat_tools.optimise.target import Target
-
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(threads=threads)

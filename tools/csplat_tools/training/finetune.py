@@ -6,25 +6,24 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
 from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Origin, Seen
-from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply import read_ply
+from csplat_render.jit import thread_count
+from csplat_render.metrics import Distance
+from csplat_render.warmup import warm_up
 from csplat_tools.files.console import Progress, note, progress_bar, step_progress
-from csplat_tools.files.convert import SceneFacts
-from csplat_tools.files.streams import ply_path, write_array, write_bytes
+from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.views import ViewSet
-
-if TYPE_CHECKING:
-    from csplat_trainer.finetune import FinetuneOptions, Moment, Views
+from csplat_trainer.finetune import FinetuneOptions, Moment, Views, finetune
+from csplat_trainer.outputs import Outputs
 
 __all__ = [
     "BYTE_COST",
@@ -32,12 +31,10 @@ __all__ = [
     "SHAPE_ENTRIES",
     "VIEWS",
     "VIEW_SIZE",
-    "Begun",
     "Clock",
-    "Files",
-    "Scene",
     "Tuned",
-    "begin",
+    "TuningPlan",
+    "plan_tuning",
     "run_finetuning",
     "tune",
 ]
@@ -55,44 +52,6 @@ SHAPE_ENTRIES = 4096
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
 
-@dataclass(frozen=True)
-class Files:
-    """What is read and written; `None`: not wanted.
-
-    Attributes:
-        source: a PLY. output: the file to write.
-        importance: weights of the splats, see `choose_splats`.
-        source_index: a .npy file: which splat of the PLY as read each splat of the file is.
-        log: options, losses and looks as JSON. report: what came of it as JSON.
-        checkpoint, checkpoint_every, resume: as for `csplat_trainer.finetune.finetune`.
-        lpips: a file of weights, or `auto`.
-    """
-
-    source: str
-    output: str
-    importance: str | None = None
-    source_index: str | None = None
-    log: str | None = None
-    report: str | None = None
-    checkpoint: str | None = None
-    checkpoint_every: int = 0
-    resume: str | None = None
-    lpips: str | None = None
-
-
-@dataclass(frozen=True)
-class Scene:
-    """How the PLY is read.
-
-    Attributes:
-        facts: what it does not say.
-        strict: whether what would be repaired is refused.
-    """
-
-    facts: SceneFacts
-    strict: bool = False
-
-
 @dataclass
 class Clock:
     """Seconds by stage."""
@@ -108,77 +67,65 @@ class Clock:
 
 
 def run_finetuning(
-    files: Files,
-    scene: Scene,
+    source: SplatModel,
+    views: ViewSet,
+    output: str,
     encoding: EncodeOptions,
-    find_views: Callable[[SplatModel], ViewSet],
     options: FinetuneOptions,
+    files: Outputs,
     *,
     keep: float | None = None,
     prune_unseen: bool | None = None,
+    importance: str | None = None,
+    source_index: str | None = None,
+    lpips: Distance | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Read, prune, freeze, tune, write, judge.
+    """Prune, freeze, tune, write, judge.
 
     Args:
-        files: what is read and written.
-        scene: how the PLY is read.
+        source: the scene.
+        views: what the file is to look like.
+        output: the file to write, or `-`.
         encoding: of the encoder.
-        find_views: says from where a scene is looked at.
         options: of the tuning.
-        keep, prune_unseen: as for `choose_splats`.
+        files: checkpoints.
+        keep, prune_unseen, importance: as for `choose_splats`.
+        source_index: a .npy file to write: which splat of the scene each splat of the file is.
+        lpips: computes it, if wanted.
         quiet: say nothing that is not wrong.
 
     Returns:
-        The report, JSON-compatible.
+        The report, JSON-compatible; under `log` options, losses and what each look at the views found.
 
     Raises:
-        CsplatError: a file or an option cannot be used.
+        CsplatError: an option or a file cannot be used.
         OSError: a file cannot be read or written.
     """
-    from csplat_render.jit import thread_count
-    from csplat_render.lpips import load_lpips
-    from csplat_render.warmup import warm_up
-    from csplat_trainer.report import write_log
-
     clock, threads = Clock(), encoding.threads
-    distance = None if files.lpips is None else load_lpips(None if files.lpips == "auto" else files.lpips)
-    with clock.stage("reading"):
-        source = _read(files.source, scene, encoding, quiet=quiet)
-        views = find_views(source)
-        views.read()
-        for line in () if quiet else views.notes:
-            note(line)
     with thread_count(threads):
         warm_up(None if quiet else note)
         with progress_bar(quiet=quiet) as progress:
-            begun = begin(
-                source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=files.importance,
+            plan = plan_tuning(
+                source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=importance,
                 progress=progress,
             )  # fmt: skip
         shown = step_progress("tuning", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
         with shown as show:
-            tuned = tune(
-                begun, options, clock, checkpoint=files.checkpoint, checkpoint_every=files.checkpoint_every,
-                resume=files.resume, threads=threads, show=show,
-            )  # fmt: skip
-        result, plain = tuned.result, begun.plain
-        write_bytes(files.output, result.data)
-        if files.source_index is not None:
-            write_array(files.source_index, result.source_index)
+            tuned = tune(plan, options, clock, files, threads=threads, show=show)
+        result = tuned.result
+        write_bytes(output, result.data)
+        if source_index is not None:
+            write_array(source_index, result.source_index)
         with clock.stage("judging"):
-            models = {"source": source, "before tuning": decode(plain.data), "file": tuned.decoded}
-            judged = judge_models(source, models, views, distance, threads)
-    report = as_report(source, plain, result, judged, tuned.log, clock.seconds, begun.chosen.said)
-    if files.log is not None:
-        write_log(files.log, {**tuned.log, "encoding": result.report.options, "seconds_by_stage": clock.seconds})
-    if files.report is not None:
-        write_log(files.report, report)
-    return report
+            models = {"source": source, "before tuning": decode(plan.plain.data), "file": tuned.decoded}
+            judged = judge_models(source, models, views, lpips, threads)
+    report = as_report(source, plan.plain, result, judged, tuned.log, clock.seconds, plan.chosen.said)
+    return {**report, "log": tuned.log}
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
+class TuningPlan:
     """All that is decided before values move.
 
     Attributes:
@@ -208,7 +155,7 @@ class Tuned:
     log: dict[str, Any]
 
 
-def begin(
+def plan_tuning(
     source: SplatModel,
     views: ViewSet,
     encoding: EncodeOptions,
@@ -218,7 +165,7 @@ def begin(
     prune_unseen: bool | None = None,
     importance: str | None = None,
     progress: Progress | None = None,
-) -> Begun:
+) -> TuningPlan:
     """Choose the splats of the file, and freeze the encoder's decisions.
 
     Args:
@@ -245,27 +192,25 @@ def begin(
         )  # fmt: skip
         frozen = draft.frozen(source, progress)
         plain = frozen.coded(frozen.start()).write()
-    return Begun(looked, chosen, frozen, plain)
+    return TuningPlan(looked, chosen, frozen, plain)
 
 
 def tune(
-    begun: Begun,
+    plan: TuningPlan,
     options: FinetuneOptions,
     clock: Clock,
+    files: Outputs | None = None,
     *,
-    checkpoint: str | None = None,
-    checkpoint_every: int = 0,
-    resume: str | None = None,
     threads: int | None = None,
     show: Callable[[Moment], None] | None = None,
 ) -> Tuned:
     """Move the values until pictures look right, and encode them.
 
     Args:
-        begun: by `begin`.
+        plan: by `plan_tuning`.
         options: of the tuning.
         clock: is told the seconds of `tuning` and `encoding`.
-        checkpoint, checkpoint_every, resume: as for `csplat_trainer.finetune.finetune`.
+        files: checkpoints.
         threads: how many; `None` for all.
         show: is told where the run stands.
 
@@ -273,35 +218,23 @@ def tune(
         CsplatError: as `finetune`.
         RuntimeError: the file is not what was tuned: a fault of csplat.
     """
-    from csplat_trainer.finetune import finetune
-
-    frozen = begun.frozen
+    frozen, files = plan.frozen, files or Outputs()
     with clock.stage("tuning"):
         tuned = finetune(
-            frozen, begun.views, options, progress=show, checkpoint=checkpoint, checkpoint_every=checkpoint_every,
-            resume=resume, threads=threads,
+            frozen, plan.views, options, progress=show, checkpoint=files.checkpoint,
+            checkpoint_every=files.checkpoint_every, resume=files.resume, threads=threads,
         )  # fmt: skip
     with clock.stage("encoding"):
         said = {
             "simplified": {},  # `simplified_from` says it, where splats were taken away
-            "views": len(begun.views.train),
+            "views": len(plan.views.train),
             "steps": tuned.log["best_iteration"],
-            **begun.chosen.said,
+            **plan.chosen.said,
         }
         result = frozen.coded(tuned.held).write({"finetuned": said})
         decoded = decode(result.data)
     _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
     return Tuned(result, decoded, tuned.log)
-
-
-def _read(path: str, scene: Scene, encoding: EncodeOptions, *, quiet: bool) -> SplatModel:
-    findings: list[Finding] = []
-    with ply_path(path) as local:
-        model = read_ply(local, strict=scene.strict, keep_extra=encoding.keep_extra, report=findings)
-    for finding in findings:
-        if not quiet or finding.kind == "repair":
-            note(str(finding))
-    return scene.facts.applied(model)
 
 
 def _check_identity(seen: Seen, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:

@@ -11,7 +11,7 @@ from csplat.encoder import EncodeResult
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
 from csplat_tools.files.console import format_bytes, format_table
-from csplat_tools.inspect.layout import describe
+from csplat_tools.inspect.info import byte_shares
 from csplat_tools.views import ViewSet
 
 __all__ = ["Judged", "as_report", "format_report", "judge_models", "ply_splat_bytes"]
@@ -89,7 +89,8 @@ def as_report(
         seconds: by stage.
         said: of the splats that were left out.
     """
-    described = describe(result.data, read_header(result.data))
+    shares = byte_shares(result.data, read_header(result.data))
+    overhead = shares.pop("overhead")
     size, count = len(result.data), len(source)
     return {
         "source_splats": count,
@@ -100,8 +101,8 @@ def as_report(
         "size_bytes_before_tuning": len(plain.data),
         "bytes_per_source_splat": size / count,
         "ratio": count * ply_splat_bytes(source.sh_degree) / size,
-        "bytes_by_attribute": {name: one["size_bytes"] for name, one in described["attributes"].items()},
-        "overhead_bytes": sum(described["overhead"].values()),
+        "bytes_by_attribute": shares,
+        "overhead_bytes": overhead,
         "judged_by": None if judged is None else judged.by,
         "judged_views": 0 if judged is None else judged.views,
         "scores": {} if judged is None else {name: dict(one) for name, one in judged.scores.items()},

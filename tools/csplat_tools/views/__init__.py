@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from csplat_tools.views.finding import SPLITS, DataOptions, comparison_cameras, find_view_set, with_deciders
-from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence, evenly, reduced
+from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced
 from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet
 
 __all__ = [
     "BLACK",
     "CHECKS",
     "SPLITS",
+    "VIEW_COUNT",
     "VIEW_SIZE",
     "VIRTUAL",
     "WHITE",

@@ -22,7 +22,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.files.extras import need_photographs
-from csplat_tools.views.placing import CHECKS, VIEW_SIZE, camera_sequence, evenly
+from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly
 from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def find_view_set(
     cameras: str | None = None,
     data: DataOptions | None = None,
     background: Colour | None = None,
-    count: int = 160,
+    count: int = VIEW_COUNT,
     size: tuple[int, int] = VIEW_SIZE,
     seed: int = 0,
     aside: int | None = None,

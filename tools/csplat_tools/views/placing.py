@@ -19,12 +19,13 @@ from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
 from csplat_render.virtual import FIELD_OF_VIEW, Frame, scene_frame
 
-__all__ = ["CHECKS", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
+__all__ = ["CHECKS", "VIEW_COUNT", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
 
 F64 = NDArray[np.float64]
 T = TypeVar("T")
 
-#: Width and height of the virtual pictures that teach, in pixels.
+#: Virtual views that teach, unless others are asked for: how many at most; width and height of their pictures, pixels.
+VIEW_COUNT = 160
 VIEW_SIZE = (240, 180)
 
 #: Virtual views beside those that are asked for: whether what these taught holds elsewhere, they say.

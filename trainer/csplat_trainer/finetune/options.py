@@ -18,7 +18,7 @@ class FinetuneOptions:
     Attributes:
         iterations: steps at most, one picture each.
         seed: of the order of the pictures.
-        loss: as in `TrainOptions`.
+        loss: `inria`, `study` or `l1`, as in `TrainOptions`.
         lr_means: learning rate of the means, as a share of the median of the splats' middle standard deviation.
         lr_quats: of the rotations.
         lr_scales: of the log scales.

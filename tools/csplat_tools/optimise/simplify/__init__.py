@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from csplat_tools.optimise.simplify.options import METHODS, SimplifyOptions
+from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.simplify import Simplified, simplify
 
 __all__ = [
-    "METHODS",
     "Simplified",
     "SimplifyOptions",
     "simplify",

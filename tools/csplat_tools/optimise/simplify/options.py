@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from csplat.errors import InputError
-from csplat_tools.views import VIEW_SIZE
+from csplat_tools.views import VIEW_COUNT, VIEW_SIZE
 
-__all__ = ["METHODS", "SimplifyOptions"]
-
-#: By what splats are chosen: exact errors measured anew after each round; once; and two that look at no picture.
-METHODS = ("rounds", "exact", "opacity", "opacity-area")
+__all__ = ["SimplifyOptions"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +15,6 @@ class SimplifyOptions:
     """How to go about it.
 
     Attributes:
-        method: one of `METHODS`.
         rounds: how often errors are measured anew on the way, at least 1.
         refit: fit the colours of what stays to the source's renders.
         steps: of that fit at most.
@@ -37,7 +33,6 @@ class SimplifyOptions:
         InputError: a value is out of range.
     """
 
-    method: str = "rounds"
     rounds: int = 4
     refit: bool = True
     steps: int = 8
@@ -46,14 +41,12 @@ class SimplifyOptions:
     bands: bool = True
     keep_unseen: bool = True
     view_size: tuple[int, int] = VIEW_SIZE
-    views: int = 160
+    views: int = VIEW_COUNT
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise InputError(f"the method is {self.method!r}, wanted one of {', '.join(METHODS)}")
         for name in ("rounds", "steps", "passes", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat_render.cloud import surface_areas
 from csplat_render.removal import measure_removal
+from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.views.agreeing import Measured, removal_keys
 
@@ -45,7 +44,7 @@ class Order:
 
     Attributes:
         rows: [G] int64, source splats, the first to go first; those that never go are not among them.
-        errors: [G], error of each one's removal when its round came; 0 where the method does not know.
+        errors: [G], error of each one's removal when its round came.
         rounds: what each round took.
     """
 
@@ -65,7 +64,7 @@ def removal_order(
     views: Measured,
     options: SimplifyOptions,
     left: int | None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
     *,
     enough: float = math.inf,
     start: Order | None = None,
@@ -75,19 +74,13 @@ def removal_order(
     Args:
         model: the source.
         views: cameras that teach, and what they say of the source.
-        options: method, rounds.
+        options: rounds.
         left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.
         enough: such an order ends with the round in which the sum of all errors exceeds this.
         start: goes on from there.
     """
     count = len(model)
-    if options.method in ("opacity", "opacity-area"):
-        keys = model.opacities.astype(np.float64)
-        if options.method == "opacity-area":
-            keys = keys * surface_areas(model)
-        rows = np.argsort(keys, kind="stable")
-        return Order(rows, np.zeros(count), ())
     rows, removal = np.arange(count), views.removal
     gone, errors, rounds = list[I64](), list[F64](), list[Round]()
     if start is not None:
@@ -118,9 +111,7 @@ def removal_order(
 def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
     """How many splats are left after each round, each time fewer."""
     last = max(1, round(count * _LEAST_SHARE)) if left is None else left
-    if options.method == "exact":
-        targets = [last]
-    elif left is not None:
+    if left is not None:
         targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
     else:
         targets = [now]

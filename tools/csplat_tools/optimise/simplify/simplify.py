@@ -262,7 +262,7 @@ def _unchanged(session: Session, judge: Judge) -> Simplified:
 
 def _report(session: Session, result: Simplified, target: Target) -> dict[str, Any]:
     """What was removed and why, what was predicted and what was found."""
-    source, views, options = session.source, session.views, session.options
+    source, views = session.source, session.views
     stays = np.zeros(len(source), bool)
     stays[result.source_index] = True
     invisible = source.opacities < ALPHA_MIN
@@ -274,7 +274,6 @@ def _report(session: Session, result: Simplified, target: Target) -> dict[str, A
         bands = {str(band + 1): int(np.count_nonzero(~result.stays[:, band])) for band in range(result.stays.shape[1])}
     return {
         "target": target.as_json(),
-        "method": options.method,
         "splats_before": len(source),
         "splats": len(result.model),
         "removed": {

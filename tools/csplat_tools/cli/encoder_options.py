@@ -1,0 +1,109 @@
+"""Options of the encoder, for every command that writes a .csplat file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+import typer
+
+from csplat.encoder import PRESETS, EncodeOptions
+from csplat_tools.cli.options import Group, chosen
+from csplat_tools.cli.settings import Settings
+from csplat_tools.files.convert import SceneFacts
+
+__all__ = ["ENCODER", "Encoding", "Facts", "Preset", "check_preset"]
+
+_SCENE = "What the PLY may not say"
+
+#: What `--set` takes of the encoder.
+ENCODER = "csplat.encoder.options:EncodeOptions"
+
+Preset = Annotated[str, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
+
+
+@dataclass(frozen=True)
+class Facts(Group):
+    """How a PLY is read, and what it may not say."""
+
+    strict: Annotated[
+        bool, typer.Option("--strict", hidden=True, help="Refuse a PLY with defects instead of repairing it.")
+    ] = False
+    keep_extra: Annotated[
+        bool, typer.Option("--keep-extra", hidden=True, help="Carry columns that splats do not have, bit for bit.")
+    ] = False
+    axes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RDF", rich_help_panel=_SCENE, hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B."
+        ),
+    ] = None
+    unit_metres: Annotated[
+        float | None,
+        typer.Option(metavar="METRES", rich_help_panel=_SCENE, hidden=True, help="Length of one scene unit."),
+    ] = None
+    antialiased: Annotated[
+        bool | None,
+        typer.Option(
+            "--antialiased/--no-antialiased", rich_help_panel=_SCENE, hidden=True, help="Trained with mip-splatting."
+        ),
+    ] = None
+    licence: Annotated[
+        str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, hidden=True, help="Into the metadata.")
+    ] = None
+
+    def read(self) -> SceneFacts:
+        """What the scene is told."""
+        return SceneFacts(self.axes, self.unit_metres, self.antialiased, self.licence)
+
+
+@dataclass(frozen=True)
+class Encoding(Group):
+    """How the encoder works."""
+
+    preset: Preset = "balanced"
+    attribute_psnr: Annotated[
+        float | None,
+        typer.Option(metavar="DB", help="PSNR of each attribute alone; of pictures 5 to 12 less."),
+    ] = None
+    sh_degree: Annotated[int | None, typer.Option(metavar="0..3", help="Leave out SH bands above this one.")] = None
+    grades: Annotated[
+        int | None,
+        typer.Option(
+            metavar="1..5",
+            hidden=True,
+            help="Sort splats into so many grades at most, each with steps of its own, by what pictures lose: a target"
+            " measures it, or --importance says it. 1 for one precision throughout.",
+        ),
+    ] = None
+    profile: Annotated[str, typer.Option(metavar="base|archive", hidden=True, help="Base is read everywhere.")] = "base"
+    deflate_level: Annotated[
+        int | None, typer.Option(metavar="1..12", hidden=True, help="How hard DEFLATE tries; zlib stops at 9.")
+    ] = None
+    seed: Annotated[int, typer.Option(min=0, hidden=True, help="Seed of the clustering.")] = 0
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, hidden=True, help="Threads, one per core by default; the bytes stay the same."),
+    ] = None
+
+    def options(self, facts: Facts, settings: Settings) -> EncodeOptions:
+        """Options of the encoder.
+
+        Args:
+            facts: says which columns are carried.
+            settings: those that have no option.
+
+        Raises:
+            typer.BadParameter: one is out of its range.
+        """
+        own = {one.name: getattr(self, one.name) for one in fields(self)}
+        return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=facts.keep_extra)
+
+
+def check_preset(preset: str) -> None:
+    """Refuse what is no preset.
+
+    Raises:
+        typer.BadParameter: it is none.
+    """
+    chosen(EncodeOptions, preset=preset)

@@ -1,0 +1,337 @@
+"""How commands take options: groups that are declared once, spread over a command line, and checked in one place.
+
+A command is a function whose parameters are arguments, options, and groups of options: subclasses of `Group`. What
+`command` makes of it is what typer runs: a group arrives as one typed value, and which options exclude each other or
+want another one is said beside them.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from copy import copy
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+
+import typer
+from typer.models import OptionInfo
+
+from csplat.errors import InputError
+from csplat.lint import Finding
+from csplat_tools.cli.console import guarded
+from csplat_tools.cli.settings import Settings, describe_settings, read_settings
+from csplat_tools.files.console import Progress, note, progress_bar, say, say_json
+from csplat_tools.files.streams import STANDARD_STREAM, check_outputs, write_json
+
+__all__ = [
+    "Checkpoint",
+    "CheckpointEvery",
+    "Group",
+    "Importance",
+    "Lpips",
+    "Mode",
+    "Output",
+    "Resume",
+    "Scene",
+    "Seed",
+    "ShDegree",
+    "SourceIndex",
+    "Threads",
+    "chosen",
+    "command",
+]
+
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="A PLY or .csplat file, or - for standard input.")]
+Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choices.")]
+Threads = Annotated[
+    int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")
+]
+Mode = Annotated[str, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
+Lpips = Annotated[
+    str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
+]
+ShDegree = Annotated[int | None, typer.Option(metavar="0..3", min=0, max=3, help="Leave out SH bands above this one.")]
+SourceIndex = Annotated[
+    str | None,
+    typer.Option(metavar="FILE.npy", hidden=True, help="Write which splat of the source each one of the result is."),
+]
+Importance = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE",
+        hidden=True,
+        help="How much each splat matters: what `csplat sensitivity` wrote, or weights (.npy) without dropped rows.",
+    ),
+]
+Checkpoint = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Where checkpoints go.")]
+CheckpointEvery = Annotated[int, typer.Option(metavar="N", min=0, hidden=True, help="Steps; 0: at the end alone.")]
+Resume = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from this checkpoint.")]
+
+_Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE,...", hidden=True, help="Settings that have no option; see below."),
+]
+_MORE = re.compile(r"\n *---\n")  # in a docstring: what follows is for --help-all
+_HELP_ALL = "help_all"
+_ALIAS = "output_option"  # `-o`, beside the argument
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Options that belong together: the fields, with their defaults.
+
+    Class attributes:
+        one_of: of each of these options one at most may be given.
+        needs: options that say nothing unless one of others is given.
+    """
+
+    one_of: ClassVar[Sequence[tuple[str, ...]]] = ()
+    needs: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+
+
+@dataclass(frozen=True)
+class Output(Group):
+    """Where results go: the same for every command."""
+
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False
+    report: Annotated[str | None, typer.Option(metavar="FILE.json", help="Write the result as JSON.")] = None
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")] = False
+
+    def check(
+        self,
+        *outputs: str | None,
+        inputs: Sequence[str | None] = (),
+        named: Mapping[str, str | None] | None = None,
+        force: bool = False,
+    ) -> None:
+        """Refuse files before any work is done for them.
+
+        Args:
+            outputs: what the command writes, or `-`; `None` for what is not wanted.
+            inputs: what it reads: none of them may be written.
+            named: by option, what it writes beside them, which cannot be `-`.
+            force: they may be replaced, whatever the user says.
+
+        Raises:
+            InputError: one exists, or two are the same.
+            OSError: a folder does not exist.
+            typer.BadParameter: two of them want standard output, or one that cannot go there.
+        """
+        files = {"--report": self.report, **(named or {})}
+        for name, path in files.items():
+            if path == STANDARD_STREAM:
+                raise typer.BadParameter(f"{name} wants the name of a file")
+        if self.as_json and STANDARD_STREAM in outputs:
+            raise typer.BadParameter("--json and - both want standard output")
+        check_outputs((*outputs, *files.values()), force=self.force or force, inputs=inputs)
+
+    def publish(self, result: Any, text: str = "") -> None:
+        """Give the result: as JSON into `--report` and with `--json`, else as text.
+
+        Args:
+            result: JSON-compatible, without NaN and infinities.
+            text: what people read on standard output; nothing where a file is the result.
+        """
+        if self.report is not None:
+            write_json(self.report, result)
+        if self.as_json:
+            say_json(result)
+        elif text:
+            say(text)
+
+    def remark(self, *lines: str) -> None:
+        """Tell people on standard error, unless they asked for silence."""
+        for line in () if self.quiet else lines:
+            note(line)
+
+    def findings(self, findings: Sequence[Finding]) -> None:
+        """Tell what lint noticed in a PLY; what was repaired is told in any case."""
+        for one in findings:
+            if one.kind == "repair" or not self.quiet:
+                note(str(one))
+
+    def bar(self) -> AbstractContextManager[Progress | None]:
+        """The progress bar, see `progress_bar`."""
+        return progress_bar(quiet=self.quiet)
+
+
+def command(
+    *,
+    one_of: Sequence[tuple[str, ...]] = (),
+    needs: Mapping[str, tuple[str, ...]] | None = None,
+    settings: Sequence[str] = (),
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
+
+    An argument `output` may be given as `-o`, too.
+
+    Args:
+        one_of, needs: as in `Group`, for options of several groups or of none.
+        settings: dataclasses of which `--set` takes what has no option, as `module:name`; they come as a parameter
+            `settings` of type `Settings`.
+    """
+
+    def made(function: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(function, include_extras=True)
+        own = [one.replace(annotation=hints[one.name]) for one in inspect.signature(function).parameters.values()]
+        groups: dict[str, type[Group]] = {one.name: one.annotation for one in own if _is_group(one.annotation)}
+        exclusive = [*one_of, *(names for kind in groups.values() for names in kind.one_of)]
+        wanting = {name: those for kind in groups.values() for name, those in kind.needs.items()} | dict(needs or {})
+        flat = [one for each in own for one in (_fields(groups[each.name]) if each.name in groups else _own(each))]
+        options = {one.name: _spelling(one) for one in flat}
+        defaults = {one.name: one.default for one in flat}
+
+        @functools.wraps(function)
+        def run(**given: Any) -> None:
+            given.pop(_HELP_ALL, None)
+            _check({name for name in given if given[name] != defaults[name]}, options, exclusive, wanting)
+            if settings:
+                given["settings"] = read_settings(given["settings"] or (), settings, options)
+            if _ALIAS in given:
+                given["output"] = _one_output(given["output"], given.pop(_ALIAS))
+            values = {
+                name: kind(**{one.name: given.pop(one.name) for one in fields(kind)}) for name, kind in groups.items()
+            }
+            function(**given, **values)
+
+        if any(_is_hidden(one) for one in flat if one.name != _ALIAS):
+            more = functools.partial(_more_help, function, settings, options)
+            flat.append(_help_all(more))
+        shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}
+        told = [_saying_what_excludes_it(one, shown, exclusive) for one in flat]
+        run.__signature__ = inspect.Signature(told)  # type: ignore[attr-defined]  # functions take attributes
+        run.__annotations__ = {one.name: one.annotation for one in told} | {"return": None}
+        run.__doc__ = _MORE.split(function.__doc__ or "")[0]
+        return guarded(run)
+
+    return made
+
+
+def chosen(kind: Callable[..., T], **values: Any) -> T:
+    """Build options of the library from those of a command line.
+
+    Raises:
+        typer.BadParameter: the library refuses them.
+    """
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+def _is_hidden(one: inspect.Parameter) -> bool:
+    return any(getattr(info, "hidden", False) for info in getattr(one.annotation, "__metadata__", ()))
+
+
+def _help_all(more: Callable[[], str]) -> inspect.Parameter:
+    """The option that shows what `--help` leaves out."""
+
+    def show(context: typer.Context, wanted: bool) -> None:
+        if wanted and not context.resilient_parsing:
+            for option in context.command.params:
+                option.hidden = option.name in (_HELP_ALL, _ALIAS)  # type: ignore[attr-defined]  # arguments have it, too
+            say(context.get_help())
+            say(more())
+            raise typer.Exit
+
+    option = typer.Option(
+        "--help-all", is_eager=True, callback=show, help="Show every option, setting and example, and exit."
+    )
+    return inspect.Parameter(
+        _HELP_ALL, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option]
+    )
+
+
+def _more_help(function: Callable[..., None], settings: Sequence[str], options: Mapping[str, str]) -> str:
+    """What `--help-all` says beside the options: the docstring behind its line, and the settings."""
+    parts = [inspect.cleandoc("\n" + one) for one in _MORE.split(function.__doc__ or "")[1:]]
+    parts += [describe_settings(settings, options)] * bool(settings)
+    return "\n\n".join(parts)
+
+
+def _is_group(annotation: object) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Group)
+
+
+def _fields(kind: type[Group]) -> list[inspect.Parameter]:
+    hints = get_type_hints(kind, include_extras=True)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return [
+        inspect.Parameter(one.name, keyword, default=one.default, annotation=hints[one.name]) for one in fields(kind)
+    ]
+
+
+def _own(one: inspect.Parameter) -> list[inspect.Parameter]:
+    """A parameter as typer is to see it; that of the output twice."""
+    one = one.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+    if one.annotation is Settings:
+        return [one.replace(default=None, annotation=_Set)]
+    if one.name != "output":
+        return [one]
+    alias = Annotated[str | None, typer.Option("--output", "-o", hidden=True)]
+    info = copy(one.annotation.__metadata__[0])
+    info.help = f"{info.help} Or: -o OUT."
+    output = one.replace(default=None, annotation=Annotated[str | None, info])
+    return [output, inspect.Parameter(_ALIAS, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=alias)]
+
+
+def _one_output(output: str | None, alias: str | None) -> str:
+    if (output is None) == (alias is None):
+        raise typer.BadParameter("wanted one output: OUT, or -o OUT")
+    return output or alias or ""
+
+
+def _spelling(one: inspect.Parameter) -> str:
+    """An option as users write it; nothing for an argument."""
+    info = next(iter(getattr(one.annotation, "__metadata__", ())), None)
+    if not isinstance(info, OptionInfo):
+        return ""
+    given = (info.default, *(info.param_decls or ()))  # inside of Annotated a name may stand in the default's place
+    declared = [word for word in given if isinstance(word, str) and word.startswith("--")]
+    return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
+
+
+def _saying_what_excludes_it(
+    one: inspect.Parameter, shown: Mapping[str, str], exclusive: Sequence[tuple[str, ...]]
+) -> inspect.Parameter:
+    """The same option; its help says which other one it excludes. Of three and more the name of the panel says it.
+
+    Args:
+        one: the option.
+        shown: how those options are spelt that `--help` shows.
+        exclusive: as `one_of` of `Group`.
+    """
+    pairs = [names for names in exclusive if one.name in names and len(names) == 2]
+    others = [shown[name] for names in pairs for name in names if name != one.name and name in shown]
+    if not others:
+        return one
+    kind, info = one.annotation.__origin__, copy(one.annotation.__metadata__[0])
+    info.help = f"{info.help} Not with {' or '.join(others)}."
+    return one.replace(annotation=Annotated[kind, info])
+
+
+def _check(
+    given: set[str],
+    options: Mapping[str, str],
+    exclusive: Sequence[tuple[str, ...]],
+    needs: Mapping[str, tuple[str, ...]],
+) -> None:
+    """Refuse options that exclude each other, and those that say nothing without others.
+
+    Raises:
+        typer.BadParameter: there are such.
+    """
+    for names in exclusive:
+        those = [options[name] for name in names if name in given]
+        if len(those) > 1:
+            raise typer.BadParameter(f"{' and '.join(those)}: give one of them")
+    for name, wanted in needs.items():
+        if name in given and not given & set(wanted):
+            raise typer.BadParameter(
+                f"{options[name]} says nothing without {' or '.join(options[one] for one in wanted)}"
+            )

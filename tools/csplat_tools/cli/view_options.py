@@ -1,0 +1,136 @@
+"""Options that say from where a scene is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import typer
+
+from csplat.model import SplatModel
+from csplat_tools.cli.options import Group, Output
+from csplat_tools.cli.parsing import parse_colour, parse_size
+
+if TYPE_CHECKING:
+    from csplat_tools.views import DataOptions, ViewSet
+
+__all__ = ["Near", "Split", "Views", "Virtual", "check_split"]
+
+_DATA = "Photographs of --data (by default as the scene was trained)"
+_VIEWS = "Views (virtual ones by default)"
+
+Split = Annotated[str, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
+Near = Annotated[
+    float | None, typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Their near plane.")
+]
+
+
+@dataclass(frozen=True)
+class Views(Group):
+    """Views of a camera file or a data set."""
+
+    one_of: ClassVar[Sequence[tuple[str, ...]]] = (("cameras", "data"),)
+    needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("size", "images", "test_every"), ("data",))
+
+    cameras: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.json",
+            rich_help_panel=_VIEWS,
+            help="Cameras that judge; of 40 or more most teach and decide.",
+        ),
+    ] = None
+    data: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATA",
+            rich_help_panel=_VIEWS,
+            help="Photographs: training ones teach, held-out ones judge.",
+        ),
+    ] = None
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="R,G,B",
+            rich_help_panel=_VIEWS,
+            hidden=True,
+            help="Behind the scene: black, but with --data or --cameras as in training.",
+        ),
+    ] = None
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", rich_help_panel=_DATA, hidden=True, help="Scale them to this size.")
+    ] = None
+    images: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", rich_help_panel=_DATA, hidden=True, help="COLMAP: folder of pictures, images_4."),
+    ] = None
+    test_every: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", rich_help_panel=_DATA, hidden=True, help="Every Nth was held out; 8 if nothing says it."
+        ),
+    ] = None
+
+    @property
+    def colour(self) -> tuple[float, float, float] | None:
+        """What is behind the scene; `None`: as usual."""
+        return None if self.background is None else parse_colour(self.background)
+
+    def photographs(self, near: float | None = None) -> DataOptions | None:
+        """The data set; `None` without one."""
+        from csplat_tools.views import DataOptions  # not wanted by commands that render nothing
+
+        size = None if self.size is None else parse_size(self.size)
+        return None if self.data is None else DataOptions(self.data, size, self.images, self.test_every, near)
+
+    def find(self, model: SplatModel, output: Output, *, near: float | None = None, **how: Any) -> ViewSet:
+        """Find views of a scene, and say what the user should know of them.
+
+        Args:
+            model: the scene.
+            output: whether remarks are wanted.
+            near: near plane of the photographs; `None`: one that suits.
+            how: what else `find_view_set` is told; handed on, so that its defaults stand in one place.
+        """
+        from csplat_tools.views import find_view_set
+
+        found = find_view_set(model, cameras=self.cameras, data=self.photographs(near), background=self.colour, **how)
+        output.remark(*found.notes)
+        return found
+
+
+@dataclass(frozen=True)
+class Virtual(Group):
+    """Virtual views that teach."""
+
+    views: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=1, hidden=True, rich_help_panel=_VIEWS, help="Virtual views that teach, at most."
+        ),
+    ] = None
+    view_size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", hidden=True, rich_help_panel=_VIEWS, help="About how large pictures that teach are."
+        ),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """What is asked for, as `find_view_set` takes it."""
+        size = None if self.view_size is None else parse_size(self.view_size)
+        return {name: value for name, value in (("count", self.views), ("size", size)) if value is not None}
+
+
+def check_split(split: str) -> str:
+    """Refuse what is no part of a data set.
+
+    Raises:
+        typer.BadParameter: it is none.
+    """
+    from csplat_tools.views import SPLITS
+
+    if split not in SPLITS:
+        raise typer.BadParameter(f"the split is {split!r}, wanted one of {', '.join(SPLITS)}")
+    return split

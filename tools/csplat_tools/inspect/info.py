@@ -1,0 +1,263 @@
+"""Everything that a file says of itself without being decoded: `csplat info`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from mmap import mmap
+from typing import Any
+
+from csplat import _spec
+from csplat.decoder import (
+    SceneHeader,
+    StatedErrors,
+    read_cameras,
+    read_header,
+    read_metadata,
+    read_options,
+    read_stated_errors,
+)
+from csplat_tools.files.console import finite
+from csplat_tools.inspect.blocks import AttributeUse, attribute_use
+
+__all__ = ["AttributeFacts", "CodebookFacts", "FileFacts", "LayerFacts", "Span", "byte_shares", "describe_file"]
+
+
+@dataclass(frozen=True)
+class Span:
+    """The smallest and the largest of some integers."""
+
+    min: int
+    max: int
+
+
+@dataclass(frozen=True)
+class AttributeFacts:
+    """What one attribute takes, and how it is coded.
+
+    Attributes:
+        size_bytes: everything; codebook_bytes: of that, its columns of codebooks.
+        bits_per_splat: of everything; `None` without splats.
+        codings, coders: names, and how many blocks or streams use them.
+        escaped_splats: those whose values lie beside a codebook.
+        mapping, step, chroma_shift, levels: of its record; `None` where it has none.
+    """
+
+    size_bytes: int
+    codebook_bytes: int
+    bits_per_splat: float | None
+    codings: Mapping[str, int]
+    coders: Mapping[str, int]
+    escaped_splats: int
+    mapping: str | None = None
+    step: float | None = None
+    chroma_shift: int | None = None
+    levels: int | None = None
+
+
+@dataclass(frozen=True)
+class LayerFacts:
+    """Size of a layer: its tiles, and the codebook chunks that it needs."""
+
+    size_bytes: int
+    codebook_bytes: int
+    bits_per_splat: float | None
+    tiles: int
+
+
+@dataclass(frozen=True)
+class CodebookFacts:
+    """A codebook: the SH bands that it serves, entries stage by stage, bytes of its chunks."""
+
+    id: int
+    kind: str
+    bands: Sequence[int]
+    stages: Sequence[int]
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """A file as it describes itself; sizes in bytes.
+
+    Attributes:
+        header: header and index.
+        attributes, layers: by name, in the order of the registry.
+        codebooks: in the order of the index.
+        overhead: what is no attribute, by name: header, index, chunks of the whole file, frames of the tiles' chunks.
+        cameras: how many; `None` without the chunk, as all that follows.
+        options, metadata: JSON of the file.
+        stated_errors: what it stands for, and how nearly.
+    """
+
+    header: SceneHeader
+    attributes: Mapping[str, AttributeFacts]
+    layers: Mapping[str, LayerFacts]
+    codebooks: Sequence[CodebookFacts]
+    overhead: Mapping[str, int]
+    cameras: int | None
+    options: Mapping[str, Any] | None
+    metadata: Mapping[str, Any] | None
+    stated_errors: StatedErrors | None
+
+    @property
+    def bytes_per_splat(self) -> float | None:
+        """Of the whole file; `None` without splats."""
+        count = self.header.splat_count
+        return self.header.file_size / count if count else None
+
+    @property
+    def spans(self) -> dict[str, Span]:
+        """Splats, lattice exponents and bits per axis of the tiles; nothing where there is none."""
+        tiles = self.header.tiles
+        columns = {
+            "splats": [one.splat_count for one in tiles],
+            "exponents": [one.exponent for one in tiles],
+            "bits_per_axis": [max(extent.bit_length() for extent in one.extent) for one in tiles],
+        }
+        return {name: Span(min(values), max(values)) for name, values in columns.items() if values}
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, JSON-compatible."""
+        header, tiles = self.header, self.header.tiles
+        largest = {"max_scale": finite(max(tile.max_scale for tile in tiles))} if tiles else {}
+        return {
+            "format": f"csplat {header.version[0]}.{header.version[1]}",
+            "profile": header.profile,
+            "size_bytes": header.file_size,
+            "bytes_per_splat": self.bytes_per_splat,
+            "splats": header.splat_count,
+            "sh_degree": header.sh_degree,
+            "coordinate_system": header.coordinate_system,
+            "unit_metres": header.unit_metres,
+            "origin": list(header.origin),
+            "antialiased": header.antialiased,
+            "flat": header.flat,
+            "digest": header.digest.hex(),
+            "attributes": {
+                name: {key: value for key, value in asdict(one).items() if value is not None or key in _ALWAYS}
+                for name, one in self.attributes.items()
+            },
+            "layers": {name: asdict(one) for name, one in self.layers.items()},
+            "overhead": dict(self.overhead),
+            "codebooks": [asdict(one) for one in self.codebooks],
+            "extra_columns": [{"name": extra.name, "dtype": extra.dtype} for extra in header.extras],
+            "tiles": {"count": len(tiles), **{name: asdict(one) for name, one in self.spans.items()}, **largest},
+            "chunks": [
+                {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
+                for chunk in header.directory
+            ],
+            "cameras": self.cameras,
+            "options": self.options,
+            "metadata": self.metadata,
+            "stated_errors": None if self.stated_errors is None else _stated(self.stated_errors),
+        }
+
+
+_ALWAYS = ("bits_per_splat",)
+
+
+def describe_file(data: bytes | mmap) -> FileFacts:
+    """Describe a file by its header, its index, the heads of its blocks, and its small chunks.
+
+    Args:
+        data: all of the file; of a memory-mapped one little is touched.
+
+    Raises:
+        FormatError: header, index, block heads or one of the small chunks are not valid.
+        LimitError: metadata, cameras or options are larger than the decoder's budget.
+    """
+    header = read_header(data)
+    use = attribute_use(data, header)
+    attributes = {name: _attribute(header, name, one) for name, one in use.items()}
+    cameras = read_cameras(data)
+    return FileFacts(
+        header,
+        attributes,
+        _layers(header),
+        [_codebook(header, record) for record in header.codebooks],
+        _overhead(header, use),
+        None if cameras is None else len(cameras),
+        read_options(data),
+        read_metadata(data),
+        read_stated_errors(data),
+    )
+
+
+def byte_shares(data: bytes | mmap, header: SceneHeader) -> dict[str, int]:
+    """Bytes of each attribute, and as `overhead` of everything else.
+
+    Raises:
+        FormatError: heads contradict each other.
+    """
+    use = attribute_use(data, header)
+    return {**{name: one.size_bytes for name, one in use.items()}, "overhead": sum(_overhead(header, use).values())}
+
+
+def _bits(size_bytes: int, count: int) -> float | None:
+    return 8.0 * size_bytes / count if count else None
+
+
+def _attribute(header: SceneHeader, name: str, use: AttributeUse) -> AttributeFacts:
+    record = next((one for one in header.attributes if _spec.ATTRIBUTE_NAMES[one.attribute] == name), None)
+    known: dict[str, Any] = {}
+    if record is not None:
+        known["mapping"] = _spec.MAPPING_NAMES[record.mapping]
+        if _spec.ATTRIBUTE_KIND[record.attribute] == "lattice":
+            known |= {"step": record.step, "chroma_shift": record.chroma_shift}
+        else:
+            known["levels"] = record.levels
+    return AttributeFacts(
+        use.size_bytes,
+        use.codebook_bytes,
+        _bits(use.size_bytes, header.splat_count),
+        dict(use.codings),
+        dict(use.coders),
+        use.escaped_count,
+        **known,
+    )
+
+
+def _layers(header: SceneHeader) -> dict[str, LayerFacts]:
+    tile_bytes, tile_count, codebook_bytes = Counter[int](), Counter[int](), Counter[int]()
+    for tile in header.tiles:
+        for id_, layer in tile.layers.items():
+            tile_bytes[id_] += layer.size
+            tile_count[id_] += 1
+    for chunk in header.directory:
+        if chunk.type == _spec.CHUNK_CODEBOOK:
+            codebook_bytes[chunk.layer] += chunk.size
+    sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
+    return {
+        _spec.LAYER_NAMES[id_]: LayerFacts(size, codebook_bytes[id_], _bits(size, header.splat_count), tile_count[id_])
+        for id_, size in sizes.items()
+    }
+
+
+def _overhead(header: SceneHeader, use: Mapping[str, AttributeUse]) -> dict[str, int]:
+    whole = {chunk.type.decode("ascii"): chunk.size for chunk in header.directory if chunk.type != _spec.CHUNK_CODEBOOK}
+    parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **whole}
+    rest = header.file_size - sum(parts.values()) - sum(one.size_bytes for one in use.values())
+    return {**parts, "tile_frames": rest}
+
+
+def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookFacts:
+    chunks = [chunk for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK]
+    return CodebookFacts(
+        record.codebook_id,
+        _spec.CODEBOOK_KIND_NAMES[record.kind],
+        list(range(record.band_first, record.band_last + 1)) if record.band_first else [],
+        list(record.sizes[: record.stage_count]),
+        sum(chunk.size for chunk in chunks if chunk.id == record.codebook_id),
+    )
+
+
+def _stated(stated: StatedErrors) -> dict[str, Any]:
+    return {
+        "source_splats": stated.source_count,
+        "pruned_splats": stated.pruned_count,
+        "source_sh_degree": stated.source_sh_degree,
+        "refitted": stated.refitted,
+        "errors": {record.measure: {"max": record.max, "rms": record.rms} for record in stated.records},
+    }
