@@ -359,7 +359,7 @@ def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
     def absent(**_):
         raise InputError("this needs numba: pip install 'csplat[render]'")
 
-    monkeypatch.setattr("csplat_tools.cli.conformance_encoder.prepare_renderer", absent)
+    monkeypatch.setattr("csplat_tools.cli.conformance.prepare_renderer", absent)
     result = invoke("--filter", "*/degree_0")
 
     assert 0 == result.exit_code

@@ -32,7 +32,7 @@ _MOST_ASIDE = 16  # but no more than these
 
 
 @command(
-    one_of=(("data", "itself"), ("data", "cameras"), ("data", "views"), ("data", "view_size")),
+    one_of=(("data", "itself"), ("data", "views"), ("data", "view_size")),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
     settings=(ENCODER, "csplat_trainer.finetune.options:FinetuneOptions"),
 )

@@ -179,6 +179,7 @@ def command(
     def made(function: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(function, include_extras=True)
         own = [one.replace(annotation=hints[one.name]) for one in inspect.signature(function).parameters.values()]
+        own.sort(key=lambda one: one.annotation is Output)  # what every command has comes last
         groups: dict[str, type[Group]] = {one.name: one.annotation for one in own if _is_group(one.annotation)}
         exclusive = [*one_of, *(names for kind in groups.values() for names in kind.one_of)]
         wanting = {name: those for kind in groups.values() for name, those in kind.needs.items()} | dict(needs or {})
