@@ -7,7 +7,7 @@ import * as spec from './spec.mjs';
 
 /**
  * @typedef {{profile: string, indexSize: number, fileSize: number, digest: Uint8Array, end: number}} FileHeader
- * @typedef {import('./index.mjs').ChunkPlace} ChunkPlace
+ * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  */
 
 const { HEADER_OFFSETS: AT, CHUNK_HEADER_OFFSETS: AT_CHUNK } = spec;

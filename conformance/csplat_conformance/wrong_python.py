@@ -15,7 +15,7 @@ import numpy as np
 from csplat import _spec, decoder
 from csplat.decoder import blocks, container, reconstruct, streams
 from csplat.errors import UnsupportedError
-from csplat_conformance.wrong import Mistake
+from csplat_conformance.mistakes import Mistake
 
 __all__ = ["MISTAKES"]
 
