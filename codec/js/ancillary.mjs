@@ -6,7 +6,8 @@ import { nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { readJson } from './streams.mjs';
 
-const { ERROR_JSON, ERROR_RESERVED, ERROR_VALUE } = spec;
+const { ERROR_JSON, ERROR_RESERVED, ERROR_VALUE, STATED_ERRORS_HEAD_OFFSETS: AT_HEAD } = spec;
+const AT = spec.STATED_ERROR_RECORD_OFFSETS;
 
 /**
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
@@ -68,7 +69,12 @@ function readStatedErrors(payload, splatCount) {
     throw fault(ERROR_VALUE, offset, 'SER-4', `${source} splats less ${pruned}, the file holds ${splatCount}`);
   }
   if (head.error_flags & ~spec.ERROR_FLAG_REFITTED) {
-    throw fault(ERROR_RESERVED, offset + 17, 'RES-1', `flags ${head.error_flags} of the stated errors`);
+    throw fault(
+      ERROR_RESERVED,
+      offset + AT_HEAD.error_flags,
+      'RES-1',
+      `flags ${head.error_flags} of the stated errors`,
+    );
   }
   /** @type {StatedErrors} */
   const stated = {
@@ -94,7 +100,7 @@ function readStatedError(payload, last, stated) {
   const { fields, offset } = payload.read(
     spec.unpackStatedErrorRecord,
     spec.STATED_ERROR_RECORD_SIZE,
-    { reserved_0: 1, reserved_1: 2, reserved_2: 4 },
+    spec.STATED_ERROR_RECORD_RESERVED,
     'a stated error',
   );
   const { measure, max, rms } = fields;
@@ -103,9 +109,9 @@ function readStatedError(payload, last, stated) {
     throw fault(ERROR_VALUE, offset, 'SER-1', `measure ${measure} after ${last}`);
   const components = Math.sqrt(measureComponents(measure));
   const room = 1 + 2 ** -20;
-  // Negated, so that NaN is refused; max = Infinity would let every rms pass.
-  if (!(max >= 0 && rms >= 0 && Number.isFinite(max) && rms <= max * components * room)) {
-    throw fault(ERROR_VALUE, offset + 8, 'SER-2', `${name}: maximum ${max}, rms ${rms}`);
+  const isBound = (/** @type {number} */ value) => value >= 0 && Number.isFinite(value);
+  if (!(isBound(max) && isBound(rms) && rms <= max * components * room)) {
+    throw fault(ERROR_VALUE, offset + AT.max, 'SER-2', `${name}: maximum ${max}, rms ${rms}`);
   }
   stated.errors[name] = { max, rms };
   return measure;

@@ -1,5 +1,8 @@
 // CRC-32 (spec section 2) and SHA-256 (FIPS 180-4).
 
+/** Bytes of a CRC-32. */
+export const CRC_SIZE = 4;
+
 /** @type {Uint32Array | null} eight tables of 256, made at the first use */
 let crcTables = null;
 

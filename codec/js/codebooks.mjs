@@ -17,6 +17,7 @@ import { readStream } from './streams.mjs';
 import { signed } from './transforms.mjs';
 
 const { ERROR_CODEBOOK, ERROR_INDEX, ERROR_STREAM } = spec;
+const { CODEBOOK_HEAD_OFFSETS: AT_HEAD, CODEBOOK_PARAMS_OFFSETS: AT_PARAMS } = spec;
 const ENTRY_WIDTH_MAX = 4; // STR-2
 const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
 
@@ -92,9 +93,10 @@ export async function readTable(bytes, { id, layer, offset }, codebook, inflate)
   const { codebook_id, layer: itsLayer, stage_count } = fields;
   const stageCount = codebook.sizes.length;
   if (codebook_id !== id) throw fault(ERROR_INDEX, at, 'CDB-1', `codebook ${codebook_id} instead of ${id}`);
-  if (itsLayer !== layer) throw fault(ERROR_INDEX, at + 2, 'CDB-1', `layer ${itsLayer} instead of ${layer}`);
+  if (itsLayer !== layer)
+    throw fault(ERROR_INDEX, at + AT_HEAD.layer, 'CDB-1', `layer ${itsLayer} instead of ${layer}`);
   if (stage_count !== stageCount)
-    throw fault(ERROR_INDEX, at + 3, 'CDB-1', `${stage_count} stages instead of ${stageCount}`);
+    throw fault(ERROR_INDEX, at + AT_HEAD.stage_count, 'CDB-1', `${stage_count} stages instead of ${stageCount}`);
   const count = tableColumns(codebook, layer);
   /** @type {Stage[]} */
   const stages = [];
@@ -123,7 +125,7 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   const { fields, offset: at } = payload.read(
     spec.unpackCodebookParams,
     spec.CODEBOOK_PARAMS_SIZE,
-    { reserved_0: 2 },
+    spec.CODEBOOK_PARAMS_RESERVED,
     'codebook parameters',
   );
   const { codebook_id: id, escape_count: escapeCount } = fields;
@@ -182,7 +184,12 @@ async function readIndices(tile, payload, codebook, escapeCount, at) {
   const found = [];
   for (let i = 0; i < n; i++) if (indices[0][i] === codebook.sizes[0]) found.push(i);
   if (found.length !== escapeCount) {
-    throw fault(ERROR_CODEBOOK, at + 4, 'CBK-3', `${found.length} splats are escaped, ${escapeCount} announced`);
+    throw fault(
+      ERROR_CODEBOOK,
+      at + AT_PARAMS.escape_count,
+      'CBK-3',
+      `${found.length} splats are escaped, ${escapeCount} announced`,
+    );
   }
   const shared = { indices, escapeCount, escaped: Uint32Array.from(found) };
   tile.indices.set(codebook.id, shared);
@@ -325,7 +332,7 @@ async function readEscapes(tile, payload, attribute, count) {
     );
   }
   if (head.coding === spec.CODING_CODEBOOK)
-    throw fault(ERROR_STREAM, head.offset + 1, 'CBK-5', 'escapes coded CODEBOOK');
+    throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', 'escapes coded CODEBOOK');
   checkCoding(head); // all other codings that it allows are those of CBK-5
   return readValues(tile, payload, attribute, head.coding, count, true);
 }

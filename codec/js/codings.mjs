@@ -26,7 +26,7 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
  * @typedef {import('./tile.mjs').TileContext} TileContext
  */
 
-const RESERVED = { reserved_0: 2 };
+const AT = spec.BLOCK_HEAD_OFFSETS;
 
 /**
  * Columns of an attribute.
@@ -41,10 +41,15 @@ export const columnCount = ({ id }) => spec.ATTRIBUTE_COLUMNS[/** @type {keyof t
  * @param {Payload} payload
  */
 export function readBlockHead(payload) {
-  const { fields, offset } = payload.read(spec.unpackBlockHead, spec.BLOCK_HEAD_SIZE, RESERVED, 'a block head');
+  const { fields, offset } = payload.read(
+    spec.unpackBlockHead,
+    spec.BLOCK_HEAD_SIZE,
+    spec.BLOCK_HEAD_RESERVED,
+    'a block head',
+  );
   const { attribute, coding } = fields;
   const name = nameOf(spec.CODING_NAMES, coding);
-  if (name === undefined) throw fault(ERROR_UNSUPPORTED, offset + 1, 'BLK-1', `coding ${coding}`);
+  if (name === undefined) throw fault(ERROR_UNSUPPORTED, offset + AT.coding, 'BLK-1', `coding ${coding}`);
   return { attribute, coding, name, offset };
 }
 
@@ -56,7 +61,8 @@ export function readBlockHead(payload) {
 export function checkCoding({ attribute, name, offset }) {
   /** @type {readonly string[]} */
   const listed = spec.ATTRIBUTE_CODINGS[/** @type {keyof typeof spec.ATTRIBUTE_CODINGS} */ (attribute)];
-  if (!listed.includes(name)) throw fault(ERROR_VALUE, offset + 1, 'BLK-1', `attribute ${attribute} coded ${name}`);
+  if (!listed.includes(name))
+    throw fault(ERROR_VALUE, offset + AT.coding, 'BLK-1', `attribute ${attribute} coded ${name}`);
 }
 
 /**
@@ -92,7 +98,7 @@ export function readLatticeParams(payload, attribute, mustBeZero) {
   const { fields, offset } = payload.read(
     spec.unpackLatticeParams,
     spec.LATTICE_PARAMS_SIZE,
-    RESERVED,
+    spec.LATTICE_PARAMS_RESERVED,
     'lattice parameters',
   );
   const { exponent } = fields;
@@ -118,7 +124,7 @@ export function readOffsets(payload, count) {
   const offsets = [];
   for (let i = 0; i < count; i++) {
     const { offset } = payload;
-    const value = payload.view.getBigInt64(payload.claim(8, 'an offset'), true);
+    const value = payload.view.getBigInt64(payload.claim(BigInt64Array.BYTES_PER_ELEMENT, 'an offset'), true);
     if (value > spec.COLUMN_MAX || value < -spec.COLUMN_MAX)
       throw fault(ERROR_VALUE, offset, 'LAT-3', `an offset of ${value}`);
     offsets.push(Number(value));
@@ -158,7 +164,7 @@ async function readMorton(tile, payload, attribute, n) {
   const { fields, offset: at } = payload.read(
     spec.unpackMortonParams,
     spec.MORTON_PARAMS_SIZE,
-    { reserved_0: 1, reserved_1: 2 },
+    spec.MORTON_PARAMS_RESERVED,
     'Morton parameters',
   );
   const { bits } = fields;

@@ -1,13 +1,16 @@
 // The header of a file (spec 4.2) and the frame of a chunk (5.1).
 
-import { crc32, sha256 } from './checksums.mjs';
+import { CRC_SIZE, crc32, sha256 } from './checksums.mjs';
 import { allocate, fault } from './errors.mjs';
+import { checkReserved } from './payload.mjs';
 import * as spec from './spec.mjs';
 
 /**
  * @typedef {{profile: string, indexSize: number, fileSize: number, digest: Uint8Array, end: number}} FileHeader
- * @typedef {import('./index.mjs').ChunkPlace} ChunkPlace
+ * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  */
+
+const { HEADER_OFFSETS: AT, CHUNK_HEADER_OFFSETS: AT_CHUNK } = spec;
 
 /** Four letters as a string. @param {Uint8Array} bytes */
 export const typeName = (bytes) => String.fromCharCode(...bytes);
@@ -40,28 +43,32 @@ export function readFileHeader(bytes) {
   const { version_major: major, version_minor: minor, profile, index_size: indexSize } = header;
   if (major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR) {
     const ours = `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`;
-    throw fault(spec.ERROR_VERSION, 8, 'HDR-2', `the file has version ${major}.${minor}, this decoder reads ${ours}`);
+    throw fault(
+      spec.ERROR_VERSION,
+      AT.version_major,
+      'HDR-2',
+      `the file has version ${major}.${minor}, this decoder reads ${ours}`,
+    );
   }
-  const computed = crc32(bytes.subarray(0, 28));
+  const computed = crc32(bytes.subarray(0, AT.header_crc));
   if (header.header_crc !== computed) {
-    throw fault(spec.ERROR_CRC, 28, 'HDR-3', `found ${hex(header.header_crc)}, computed ${hex(computed)}`);
+    throw fault(spec.ERROR_CRC, AT.header_crc, 'HDR-3', `found ${hex(header.header_crc)}, computed ${hex(computed)}`);
   }
-  if (header.reserved_0) throw fault(spec.ERROR_RESERVED, 13, 'RES-1', `header: reserved_0 is ${header.reserved_0}`);
-  if (header.reserved_1) throw fault(spec.ERROR_RESERVED, 14, 'RES-1', `header: reserved_1 is ${header.reserved_1}`);
+  checkReserved(header, 0, spec.HEADER_RESERVED, 'the header');
   if (profile !== spec.PROFILE_BASE) {
     /** @type {Record<number, string>} */
     const names = spec.PROFILE_NAMES;
     throw fault(
       spec.ERROR_UNSUPPORTED,
-      12,
+      AT.profile,
       'HDR-4',
       `profile ${names[profile] ?? profile}: this decoder reads the profile base`,
     );
   }
   const fileSize = Number(header.file_size); // may round above 2^53; no data has that length
   const end = spec.HEADER_SIZE + indexSize;
-  if (indexSize < spec.INDEX_HEAD_SIZE + 4 || end > fileSize) {
-    throw fault(spec.ERROR_VALUE, 16, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
+  if (indexSize < spec.INDEX_HEAD_SIZE + CRC_SIZE || end > fileSize) {
+    throw fault(spec.ERROR_VALUE, AT.index_size, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
   }
   return { profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, digest: header.digest.slice(), end };
 }
@@ -83,10 +90,10 @@ export function checkFileSize(size, { fileSize }) {
  * @param {FileHeader} file
  */
 export async function checkDigest(bytes, file) {
-  const field = 32; // offset and size of the digest
-  const covered = allocate(() => new Uint8Array(bytes.length - field));
+  const field = AT.digest; // the last of the header
+  const covered = allocate(() => new Uint8Array(bytes.length - spec.HEADER_SIZE + field));
   covered.set(bytes.subarray(0, field));
-  covered.set(bytes.subarray(2 * field), field);
+  covered.set(bytes.subarray(spec.HEADER_SIZE), field);
   const computed = await sha256(covered);
   if (computed.some((byte, i) => byte !== file.digest[i])) {
     throw fault(spec.ERROR_DIGEST, field, 'HDR-8', 'the SHA-256 of the file is another');
@@ -118,15 +125,19 @@ export function openChunk(chunk, place) {
     throw fault(spec.ERROR_INDEX, offset, 'CHK-3', `a chunk ${JSON.stringify(type)} where the index has ${place.type}`);
   }
   if (header.flags !== place.flags) {
-    throw fault(spec.ERROR_INDEX, offset + 4, 'CHK-3', `flags ${header.flags}, the index says ${place.flags}`);
+    throw fault(
+      spec.ERROR_INDEX,
+      offset + AT_CHUNK.flags,
+      'CHK-3',
+      `flags ${header.flags}, the index says ${place.flags}`,
+    );
   }
-  if (header.reserved_0)
-    throw fault(spec.ERROR_RESERVED, offset + 6, 'RES-1', `chunk header: reserved_0 is ${header.reserved_0}`);
-  const payload = chunk.subarray(spec.CHUNK_HEADER_SIZE, chunk.length - 4);
+  checkReserved(header, offset, spec.CHUNK_HEADER_RESERVED, 'a chunk header');
+  const payload = chunk.subarray(spec.CHUNK_HEADER_SIZE, chunk.length - CRC_SIZE);
   if (header.payload_size !== payload.length) {
     throw fault(
       spec.ERROR_INDEX,
-      offset + 8,
+      offset + AT_CHUNK.payload_size,
       'CHK-3',
       `a payload of ${header.payload_size} bytes, the index says ${payload.length}`,
     );
@@ -135,12 +146,12 @@ export function openChunk(chunk, place) {
 }
 
 /**
- * @param {Uint8Array<ArrayBuffer>} bytes with their CRC in the last four
+ * @param {Uint8Array<ArrayBuffer>} bytes with their CRC at the end
  * @param {number} base
  * @param {string} clause
  */
 function checkCrc(bytes, base, clause) {
-  const at = bytes.length - 4;
+  const at = bytes.length - CRC_SIZE;
   const found = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength).getUint32(at, true);
   const computed = crc32(bytes.subarray(0, at));
   if (found !== computed)

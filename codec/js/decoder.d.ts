@@ -335,9 +335,32 @@ export class CsplatReader {
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
 }
 
-/** Base of all errors; `code` is one of the spec's, `clause` the broken requirement. */
+/** Codes of the spec, section 12. */
+// begin generated: error codes
+export type ErrorCode =
+  | 'E_MAGIC'
+  | 'E_VERSION'
+  | 'E_TRUNCATED'
+  | 'E_TRAILING'
+  | 'E_CRC'
+  | 'E_DIGEST'
+  | 'E_RESERVED'
+  | 'E_VALUE'
+  | 'E_INDEX'
+  | 'E_UNSUPPORTED'
+  | 'E_STREAM'
+  | 'E_CODER'
+  | 'E_RANGE'
+  | 'E_CODEBOOK'
+  | 'E_BOX'
+  | 'E_JSON'
+  | 'E_LIMIT'
+  | 'E_INPUT';
+// end generated
+
+/** Base of all errors; `clause` is the broken requirement. */
 export class CsplatError extends Error {
-  readonly code: string;
+  readonly code: ErrorCode;
   readonly offset: number | null;
   readonly clause: string | null;
 }

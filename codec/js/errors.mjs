@@ -2,6 +2,8 @@
 
 import { ERROR_INPUT, ERROR_LIMIT, ERROR_UNSUPPORTED } from './spec.mjs';
 
+/** @typedef {import('./decoder.d.ts').ErrorCode} ErrorCode */
+
 /**
  * Base of all errors of this package.
  *
@@ -10,7 +12,7 @@ import { ERROR_INPUT, ERROR_LIMIT, ERROR_UNSUPPORTED } from './spec.mjs';
  */
 export class CsplatError extends Error {
   /**
-   * @param {string} code
+   * @param {ErrorCode} code
    * @param {string} detail what was found and what was wanted
    * @param {{offset?: number | null, clause?: string | null, cause?: unknown}} [place]
    */
@@ -47,7 +49,7 @@ export class InputError extends CsplatError {
 /**
  * The error for a file, of the class that its code asks for.
  *
- * @param {string} code
+ * @param {ErrorCode} code
  * @param {number} offset byte of the file
  * @param {string} clause id of the requirement
  * @param {string} detail

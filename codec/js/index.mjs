@@ -1,5 +1,6 @@
 // The index (spec 4.3): records of the whole file. `tiles.mjs` reads the rest of it, the tiles.
 
+import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
 import { checkIndexCrc, typeName } from './container.mjs';
 import { STEP_MIN } from './lattice.mjs';
@@ -22,6 +23,9 @@ const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE
  * @typedef {ReturnType<typeof spec.unpackIndexHead>} IndexHead
  */
 
+const AT_HEAD = spec.INDEX_HEAD_OFFSETS;
+/** @type {Record<string, number | undefined>} Directions along one line. */
+const LINES = { R: 0, L: 0, U: 1, D: 1, F: 2, B: 2 };
 const INDEX_GROWTH = 8; // the objects made of an index take about so many times its bytes
 
 /**
@@ -34,7 +38,7 @@ const INDEX_GROWTH = 8; // the objects made of an index take about so many times
  */
 export function readIndex(bytes, file, limits) {
   checkIndexCrc(bytes);
-  const index = new Payload(bytes.subarray(0, -4), spec.HEADER_SIZE, 'IDX-2', ERROR_INDEX);
+  const index = new Payload(bytes.subarray(0, -CRC_SIZE), spec.HEADER_SIZE, 'IDX-2', ERROR_INDEX);
   const { fields: head } = index.read(spec.unpackIndexHead, spec.INDEX_HEAD_SIZE, {}, 'the head of the index');
   const scene = readScene(head);
   checkCounts(head, index, limits);
@@ -83,21 +87,25 @@ const omit = ({ profile, fileSize, indexSize }) => ({ profile, fileSize, indexSi
 function readScene(head) {
   const at = spec.HEADER_SIZE;
   if (head.sh_degree > spec.SH_DEGREE_MAX)
-    throw fault(ERROR_UNSUPPORTED, at + 19, 'IDX-3', `SH degree ${head.sh_degree}`);
+    throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', `SH degree ${head.sh_degree}`);
   const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT;
-  if (head.scene_flags & ~flags) throw fault(ERROR_RESERVED, at + 20, 'RES-1', `scene flags ${head.scene_flags}`);
+  if (head.scene_flags & ~flags)
+    throw fault(ERROR_RESERVED, at + AT_HEAD.scene_flags, 'RES-1', `scene flags ${head.scene_flags}`);
   const axes = [...head.axes];
-  const lines = new Set(axes.map((direction) => (direction + 1) >> 1)); // right–left 1, up–down 2, forward–back 3
-  const known = axes.every((direction) => direction >= 1 && direction <= 6) && lines.size === 3;
-  if (!known && axes.some((direction) => direction !== spec.DIRECTION_UNSPECIFIED)) {
-    throw fault(ERROR_VALUE, at + 21, 'IDX-4', `axes ${axes.join(', ')}`);
-  }
-  const unit = head.unit_metres;
-  if (!(unit >= 0 && Number.isFinite(unit))) throw fault(ERROR_VALUE, at + 24, 'IDX-5', `a unit of ${unit} metres`);
-  const bad = head.origin.findIndex((x) => !Number.isFinite(x));
-  if (bad >= 0) throw fault(ERROR_VALUE, at + 32 + 8 * bad, 'IDX-6', `an origin of ${head.origin[bad]}`);
   /** @type {Record<number, string>} */
   const letters = spec.DIRECTION_LETTER;
+  const lines = new Set(axes.map((direction) => LINES[letters[direction]]));
+  if ((lines.has(undefined) || lines.size < 3) && axes.some((direction) => direction !== spec.DIRECTION_UNSPECIFIED)) {
+    throw fault(ERROR_VALUE, at + AT_HEAD.axes, 'IDX-4', `axes ${axes.join(', ')}`);
+  }
+  const unit = head.unit_metres;
+  if (!(unit >= 0 && Number.isFinite(unit)))
+    throw fault(ERROR_VALUE, at + AT_HEAD.unit_metres, 'IDX-5', `a unit of ${unit} metres`);
+  const bad = head.origin.findIndex((x) => !Number.isFinite(x));
+  if (bad >= 0) {
+    const place = at + AT_HEAD.origin + spec.INDEX_HEAD_STRIDES.origin * bad;
+    throw fault(ERROR_VALUE, place, 'IDX-6', `an origin of ${head.origin[bad]}`);
+  }
   return {
     version: `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`,
     shDegree: head.sh_degree,
@@ -118,9 +126,14 @@ function readScene(head) {
  */
 function checkCounts(head, index, limits) {
   const at = spec.HEADER_SIZE;
-  const wanted = 5 + head.sh_degree;
+  const wanted = spec.ATTRIBUTE_SH0 + head.sh_degree;
   if (head.attribute_count !== wanted) {
-    throw fault(ERROR_INDEX, at + 18, 'ATT-1', `${head.attribute_count} attributes instead of ${wanted}`);
+    throw fault(
+      ERROR_INDEX,
+      at + AT_HEAD.attribute_count,
+      'ATT-1',
+      `${head.attribute_count} attributes instead of ${wanted}`,
+    );
   }
   const least =
     head.attribute_count * spec.ATTRIBUTE_RECORD_SIZE +
@@ -133,7 +146,7 @@ function checkCounts(head, index, limits) {
   if (index.bytes.length * INDEX_GROWTH > limits.bytes) {
     throw fault(
       ERROR_LIMIT,
-      16,
+      spec.HEADER_OFFSETS.index_size,
       'LIM-1',
       `an index of ${index.bytes.length} bytes, the budget is ${limits.bytes / INDEX_GROWTH}`,
     );
@@ -146,10 +159,11 @@ function checkCounts(head, index, limits) {
  * @returns {AttributeRecord}
  */
 function readAttribute(index, place) {
+  const places = spec.ATTRIBUTE_RECORD_OFFSETS;
   const { fields, offset } = index.read(
     spec.unpackAttributeRecord,
     spec.ATTRIBUTE_RECORD_SIZE,
-    { reserved_0: 3 },
+    spec.ATTRIBUTE_RECORD_RESERVED,
     'an attribute record',
   );
   const { attribute: id, levels, step, chroma_shift: chromaShift } = fields;
@@ -159,21 +173,28 @@ function readAttribute(index, place) {
   const mapping = nameOf(spec.MAPPING_NAMES, fields.mapping) ?? '';
   /** @type {readonly string[]} */
   const mappings = spec.ATTRIBUTE_MAPPINGS[known];
-  if (!mappings.includes(mapping)) throw fault(ERROR_VALUE, offset + 1, 'ATT-2', `mapping ${fields.mapping}`);
+  if (!mappings.includes(mapping))
+    throw fault(ERROR_VALUE, offset + places.mapping, 'ATT-2', `mapping ${fields.mapping}`);
   if (spec.ATTRIBUTE_KIND[known] === 'lattice') {
-    if (levels !== 0) throw fault(ERROR_RESERVED, offset + 4, 'ATT-5', `levels ${levels}`);
+    if (levels !== 0) throw fault(ERROR_RESERVED, offset + places.levels, 'ATT-5', `levels ${levels}`);
     if (!(step >= STEP_MIN && Number.isFinite(step)))
-      throw fault(ERROR_VALUE, offset + 8, 'ATT-6', `a step of ${step}`);
+      throw fault(ERROR_VALUE, offset + places.step, 'ATT-6', `a step of ${step}`);
   } else {
     const isQuats = id === spec.ATTRIBUTE_QUATS;
     const [low, high] = isQuats ? [spec.QUAT_LEVELS_MIN, spec.QUAT_LEVELS_MAX] : [1, spec.OPACITY_LEVELS_MAX];
     if (levels < low || levels > high)
-      throw fault(ERROR_VALUE, offset + 4, isQuats ? 'ATT-4' : 'ATT-3', `levels ${levels}`);
-    if (!Object.is(step, 0)) throw fault(ERROR_RESERVED, offset + 8, 'ATT-7', `a step of ${step}`);
+      throw fault(ERROR_VALUE, offset + places.levels, isQuats ? 'ATT-4' : 'ATT-3', `levels ${levels}`);
+    if (!Object.is(step, 0)) throw fault(ERROR_RESERVED, offset + places.step, 'ATT-7', `a step of ${step}`);
   }
-  if (chromaShift > spec.CHROMA_SHIFT_MAX) throw fault(ERROR_VALUE, offset + 2, 'ATT-8', `chroma shift ${chromaShift}`);
+  if (chromaShift > spec.CHROMA_SHIFT_MAX)
+    throw fault(ERROR_VALUE, offset + places.chroma_shift, 'ATT-8', `chroma shift ${chromaShift}`);
   if (chromaShift && fields.mapping !== spec.MAPPING_YCOCG) {
-    throw fault(ERROR_VALUE, offset + 2, 'ATT-9', `chroma shift ${chromaShift} of the mapping ${mapping}`);
+    throw fault(
+      ERROR_VALUE,
+      offset + places.chroma_shift,
+      'ATT-9',
+      `chroma shift ${chromaShift} of the mapping ${mapping}`,
+    );
   }
   return { id, name: spec.ATTRIBUTE_NAMES[known], mapping, chromaShift, levels, step };
 }
@@ -185,23 +206,33 @@ function readAttribute(index, place) {
  * @returns {CodebookRecord}
  */
 function readCodebook(index, before, shDegree) {
+  const places = spec.CODEBOOK_RECORD_OFFSETS;
   const { fields, offset } = index.read(
     spec.unpackCodebookRecord,
     spec.CODEBOOK_RECORD_SIZE,
-    { reserved_0: 6 },
+    spec.CODEBOOK_RECORD_RESERVED,
     'a codebook record',
   );
   const { codebook_id: id, band_first: bandFirst, band_last: bandLast, stage_count: stages, sizes } = fields;
   if (id <= before) throw fault(ERROR_INDEX, offset, 'CBR-1', `codebook ${id} after ${before}`);
   const kind = nameOf(spec.CODEBOOK_KIND_NAMES, fields.kind);
-  if (kind === undefined) throw fault(ERROR_UNSUPPORTED, offset + 2, 'RES-2', `codebook kind ${fields.kind}`);
+  if (kind === undefined) throw fault(ERROR_UNSUPPORTED, offset + places.kind, 'RES-2', `codebook kind ${fields.kind}`);
   const isSh = fields.kind === spec.CODEBOOK_KIND_SH;
   if (isSh ? !(bandFirst >= 1 && bandFirst <= bandLast && bandLast <= shDegree) : bandFirst || bandLast) {
-    throw fault(ERROR_VALUE, offset + 3, 'CBR-2', `bands ${bandFirst} to ${bandLast} of the kind ${kind}`);
+    throw fault(
+      ERROR_VALUE,
+      offset + places.band_first,
+      'CBR-2',
+      `bands ${bandFirst} to ${bandLast} of the kind ${kind}`,
+    );
   }
-  if (stages < 1 || stages > spec.STAGES_MAX) throw fault(ERROR_VALUE, offset + 5, 'CBR-3', `${stages} stages`);
+  if (stages < 1 || stages > spec.STAGES_MAX)
+    throw fault(ERROR_VALUE, offset + places.stage_count, 'CBR-3', `${stages} stages`);
   const bad = sizes.findIndex((size, i) => (i < stages ? size < 1 || size > spec.CODEBOOK_ENTRIES_MAX : size !== 0));
-  if (bad >= 0) throw fault(ERROR_VALUE, offset + 8 + 4 * bad, 'CBR-4', `a stage of ${sizes[bad]} entries`);
+  if (bad >= 0) {
+    const place = offset + places.sizes + spec.CODEBOOK_RECORD_STRIDES.sizes * bad;
+    throw fault(ERROR_VALUE, place, 'CBR-4', `a stage of ${sizes[bad]} entries`);
+  }
   /** @type {readonly string[]} */
   let attributes =
     spec.CODEBOOK_KIND_ATTRIBUTES[/** @type {keyof typeof spec.CODEBOOK_KIND_ATTRIBUTES} */ (fields.kind)];
@@ -215,23 +246,26 @@ function readCodebook(index, before, shDegree) {
  * @returns {ExtraRecord}
  */
 function readExtra(index, names) {
+  const places = spec.EXTRA_RECORD_OFFSETS;
   const { fields, offset } = index.read(spec.unpackExtraRecord, spec.EXTRA_RECORD_SIZE, {}, 'an extra column record');
   const dtype = nameOf(spec.EXTRA_DTYPE_NAMES, fields.dtype);
   if (dtype === undefined) throw fault(ERROR_UNSUPPORTED, offset, 'RES-2', `type ${fields.dtype} of an extra column`);
   const size = fields.name_size;
-  if (size < 1 || size > spec.EXTRA_NAME_MAX) throw fault(ERROR_VALUE, offset + 1, 'EXR-1', `a name of ${size} bytes`);
+  if (size < 1 || size > spec.EXTRA_NAME_MAX)
+    throw fault(ERROR_VALUE, offset + places.name_size, 'EXR-1', `a name of ${size} bytes`);
   const name = decodeUtf8(fields.name.slice(0, size));
   if (name === null) {
     let sound = size - 1; // bytes before the first that is not UTF-8
     while (decodeUtf8(fields.name.slice(0, sound)) === null) sound--;
-    throw fault(ERROR_VALUE, offset + 2 + sound, 'EXR-2', 'a name that is not UTF-8');
+    throw fault(ERROR_VALUE, offset + places.name + sound, 'EXR-2', 'a name that is not UTF-8');
   }
   if (/[\u0000-\u001f\u007f]/.test(name))
-    throw fault(ERROR_VALUE, offset + 2, 'EXR-2', 'a control character in a name');
-  if (names.has(name)) throw fault(ERROR_VALUE, offset + 2, 'EXR-2', `two columns ${JSON.stringify(name)}`);
+    throw fault(ERROR_VALUE, offset + places.name, 'EXR-2', 'a control character in a name');
+  if (names.has(name)) throw fault(ERROR_VALUE, offset + places.name, 'EXR-2', `two columns ${JSON.stringify(name)}`);
   names.add(name);
   const rest = fields.name.subarray(size).find((byte) => byte !== 0);
-  if (rest !== undefined) throw fault(ERROR_RESERVED, offset + 2 + size, 'EXR-3', `a byte of ${rest} behind the name`);
+  if (rest !== undefined)
+    throw fault(ERROR_RESERVED, offset + places.name + size, 'EXR-3', `a byte of ${rest} behind the name`);
   const bytes = spec.EXTRA_DTYPE_BYTES[/** @type {keyof typeof spec.EXTRA_DTYPE_BYTES} */ (fields.dtype)];
   return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes };
 }
@@ -253,10 +287,11 @@ function decodeUtf8(bytes) {
  * @returns {DirectoryRecord}
  */
 function readDirectory(index) {
+  const places = spec.DIRECTORY_RECORD_OFFSETS;
   const { fields, offset: at } = index.read(
     spec.unpackDirectoryRecord,
     spec.DIRECTORY_RECORD_SIZE,
-    { reserved_0: 9, reserved_1: 10 },
+    spec.DIRECTORY_RECORD_RESERVED,
     'a directory record',
   );
   const { flags, id, layer, size, offset } = fields;
@@ -265,14 +300,15 @@ function readDirectory(index) {
     throw fault(ERROR_VALUE, at, 'DIR-1', `the type ${JSON.stringify(type)} in the directory`);
   }
   if (flags & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
-    throw fault(ERROR_RESERVED, at + 4, 'RES-1', `chunk flags ${flags}`);
+    throw fault(ERROR_RESERVED, at + places.flags, 'RES-1', `chunk flags ${flags}`);
   }
   if (type === spec.CHUNK_PROBABILITIES || type === spec.CHUNK_TREE) {
     throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `a chunk ${type}`);
   }
   if (Object.hasOwn(spec.CHUNK_NAMES, type)) {
     const registered = registeredFlags(type);
-    if (flags !== registered) throw fault(ERROR_VALUE, at + 4, 'CHK-4', `flags ${flags} of ${type}, not ${registered}`);
+    if (flags !== registered)
+      throw fault(ERROR_VALUE, at + places.flags, 'CHK-4', `flags ${flags} of ${type}, not ${registered}`);
   } else if (flags & spec.CHUNK_FLAG_CRITICAL) {
     throw fault(ERROR_UNSUPPORTED, at, 'DIR-2', `an unknown critical chunk ${JSON.stringify(type)}`);
   }
@@ -284,8 +320,8 @@ function readDirectory(index) {
     size,
     offset: Number(offset),
     recordOffset: at,
-    offsetField: at + 16,
-    sizeField: at + 12,
+    offsetField: at + places.offset,
+    sizeField: at + places.size,
   };
 }
 

@@ -9,7 +9,7 @@ export class Payload {
    * @param {Uint8Array<ArrayBuffer>} bytes
    * @param {number} base offset of the first byte in the file
    * @param {string} clause the one that demands that the payload ends with its last part
-   * @param {string} [code]
+   * @param {import('./decoder.d.ts').ErrorCode} [code]
    */
   constructor(bytes, base, clause, code = ERROR_STREAM) {
     this.bytes = bytes;
@@ -49,21 +49,33 @@ export class Payload {
    * @template {Record<string, unknown>} T
    * @param {(view: DataView, at: number) => T} unpack
    * @param {number} size
-   * @param {Record<string, number>} reserved offsets of the reserved fields by name
+   * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
    * @param {string} what for the message
    * @returns {{fields: T, offset: number}} `offset` in the file
    */
   read(unpack, size, reserved, what) {
     const offset = this.offset;
     const fields = unpack(this.view, this.claim(size, what));
-    for (const name in reserved) {
-      if (fields[name] !== 0)
-        throw fault(ERROR_RESERVED, offset + reserved[name], 'RES-1', `${what}: ${name} is ${fields[name]}`);
-    }
+    checkReserved(fields, offset, reserved, what);
     return { fields, offset };
   }
 
   finish() {
     if (this.left) throw fault(this.code, this.offset, this.clause, `${this.left} bytes too many`);
+  }
+}
+
+/**
+ * RES-1: "A reserved field or bit MUST be 0".
+ *
+ * @param {Record<string, unknown>} fields of a structure
+ * @param {number} at where it begins in the file
+ * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
+ * @param {string} what for the message
+ */
+export function checkReserved(fields, at, reserved, what) {
+  for (const name in reserved) {
+    if (fields[name] !== 0)
+      throw fault(ERROR_RESERVED, at + reserved[name], 'RES-1', `${what}: ${name} is ${fields[name]}`);
   }
 }

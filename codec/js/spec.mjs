@@ -187,6 +187,8 @@ export const ERROR_INPUT = 'E_INPUT';
 export const ERROR_NAMES = Object.freeze({ 'E_MAGIC': 'magic', 'E_VERSION': 'version', 'E_TRUNCATED': 'truncated', 'E_TRAILING': 'trailing', 'E_CRC': 'crc', 'E_DIGEST': 'digest', 'E_RESERVED': 'reserved', 'E_VALUE': 'value', 'E_INDEX': 'index', 'E_UNSUPPORTED': 'unsupported', 'E_STREAM': 'stream', 'E_CODER': 'coder', 'E_RANGE': 'range', 'E_CODEBOOK': 'codebook', 'E_BOX': 'box', 'E_JSON': 'json', 'E_LIMIT': 'limit', 'E_INPUT': 'input' });
 
 export const HEADER_SIZE = 64;
+export const HEADER_OFFSETS = Object.freeze({ magic: 0, version_major: 8, version_minor: 10, profile: 12, reserved_0: 13, reserved_1: 14, index_size: 16, file_size: 20, header_crc: 28, digest: 32 });
+export const HEADER_RESERVED = Object.freeze({ reserved_0: 13, reserved_1: 14 });
 /**
  * File header. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -208,6 +210,8 @@ export function unpackHeader(view, at) {
 }
 
 export const INDEX_HEAD_SIZE = 56;
+export const INDEX_HEAD_OFFSETS = Object.freeze({ splat_count: 0, tile_count: 8, directory_count: 12, codebook_count: 14, extra_count: 16, attribute_count: 18, sh_degree: 19, scene_flags: 20, axes: 21, unit_metres: 24, origin: 32 });
+export const INDEX_HEAD_STRIDES = Object.freeze({ origin: 8 });
 /**
  * Head of the index. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -230,6 +234,8 @@ export function unpackIndexHead(view, at) {
 }
 
 export const ATTRIBUTE_RECORD_SIZE = 16;
+export const ATTRIBUTE_RECORD_OFFSETS = Object.freeze({ attribute: 0, mapping: 1, chroma_shift: 2, reserved_0: 3, levels: 4, step: 8 });
+export const ATTRIBUTE_RECORD_RESERVED = Object.freeze({ reserved_0: 3 });
 /**
  * Attribute record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -247,6 +253,9 @@ export function unpackAttributeRecord(view, at) {
 }
 
 export const CODEBOOK_RECORD_SIZE = 24;
+export const CODEBOOK_RECORD_OFFSETS = Object.freeze({ codebook_id: 0, kind: 2, band_first: 3, band_last: 4, stage_count: 5, reserved_0: 6, sizes: 8 });
+export const CODEBOOK_RECORD_STRIDES = Object.freeze({ sizes: 4 });
+export const CODEBOOK_RECORD_RESERVED = Object.freeze({ reserved_0: 6 });
 /**
  * Codebook record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -265,6 +274,7 @@ export function unpackCodebookRecord(view, at) {
 }
 
 export const EXTRA_RECORD_SIZE = 64;
+export const EXTRA_RECORD_OFFSETS = Object.freeze({ dtype: 0, name_size: 1, name: 2 });
 /**
  * Extra column record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -279,6 +289,8 @@ export function unpackExtraRecord(view, at) {
 }
 
 export const DIRECTORY_RECORD_SIZE = 24;
+export const DIRECTORY_RECORD_OFFSETS = Object.freeze({ type: 0, flags: 4, id: 6, layer: 8, reserved_0: 9, reserved_1: 10, size: 12, offset: 16 });
+export const DIRECTORY_RECORD_RESERVED = Object.freeze({ reserved_0: 9, reserved_1: 10 });
 /**
  * Directory record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -298,6 +310,9 @@ export function unpackDirectoryRecord(view, at) {
 }
 
 export const TILE_RECORD_SIZE = 52;
+export const TILE_RECORD_OFFSETS = Object.freeze({ splat_count: 0, level: 4, layer_count: 5, table_count: 6, exponent: 8, reserved_0: 10, corner: 12, extent: 36, max_scale: 48 });
+export const TILE_RECORD_STRIDES = Object.freeze({ corner: 8, extent: 4 });
+export const TILE_RECORD_RESERVED = Object.freeze({ reserved_0: 10 });
 /**
  * Tile record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -318,6 +333,8 @@ export function unpackTileRecord(view, at) {
 }
 
 export const LAYER_RECORD_SIZE = 16;
+export const LAYER_RECORD_OFFSETS = Object.freeze({ layer: 0, reserved_0: 1, reserved_1: 2, size: 4, offset: 8 });
+export const LAYER_RECORD_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2 });
 /**
  * Layer record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -334,6 +351,8 @@ export function unpackLayerRecord(view, at) {
 }
 
 export const CHUNK_HEADER_SIZE = 12;
+export const CHUNK_HEADER_OFFSETS = Object.freeze({ type: 0, flags: 4, reserved_0: 6, payload_size: 8 });
+export const CHUNK_HEADER_RESERVED = Object.freeze({ reserved_0: 6 });
 /**
  * Chunk header. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -349,6 +368,8 @@ export function unpackChunkHeader(view, at) {
 }
 
 export const TILE_HEAD_SIZE = 8;
+export const TILE_HEAD_OFFSETS = Object.freeze({ tile_index: 0, layer: 4, block_count: 5, reserved_0: 6 });
+export const TILE_HEAD_RESERVED = Object.freeze({ reserved_0: 6 });
 /**
  * Head of a TILE payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -364,6 +385,7 @@ export function unpackTileHead(view, at) {
 }
 
 export const CODEBOOK_HEAD_SIZE = 4;
+export const CODEBOOK_HEAD_OFFSETS = Object.freeze({ codebook_id: 0, layer: 2, stage_count: 3 });
 /**
  * Head of a CODB payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -378,6 +400,8 @@ export function unpackCodebookHead(view, at) {
 }
 
 export const BLOCK_HEAD_SIZE = 4;
+export const BLOCK_HEAD_OFFSETS = Object.freeze({ attribute: 0, coding: 1, reserved_0: 2 });
+export const BLOCK_HEAD_RESERVED = Object.freeze({ reserved_0: 2 });
 /**
  * Head of an attribute block. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -392,6 +416,8 @@ export function unpackBlockHead(view, at) {
 }
 
 export const LATTICE_PARAMS_SIZE = 4;
+export const LATTICE_PARAMS_OFFSETS = Object.freeze({ exponent: 0, reserved_0: 2 });
+export const LATTICE_PARAMS_RESERVED = Object.freeze({ reserved_0: 2 });
 /**
  * Parameters of OFFSET and SIGNED. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -405,6 +431,8 @@ export function unpackLatticeParams(view, at) {
 }
 
 export const MORTON_PARAMS_SIZE = 4;
+export const MORTON_PARAMS_OFFSETS = Object.freeze({ bits: 0, reserved_0: 1, reserved_1: 2 });
+export const MORTON_PARAMS_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2 });
 /**
  * Parameters of MORTON. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -419,6 +447,8 @@ export function unpackMortonParams(view, at) {
 }
 
 export const CODEBOOK_PARAMS_SIZE = 8;
+export const CODEBOOK_PARAMS_OFFSETS = Object.freeze({ codebook_id: 0, reserved_0: 2, escape_count: 4 });
+export const CODEBOOK_PARAMS_RESERVED = Object.freeze({ reserved_0: 2 });
 /**
  * Parameters of CODEBOOK. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -433,6 +463,8 @@ export function unpackCodebookParams(view, at) {
 }
 
 export const RAW_PARAMS_SIZE = 4;
+export const RAW_PARAMS_OFFSETS = Object.freeze({ column: 0, reserved_0: 2 });
+export const RAW_PARAMS_RESERVED = Object.freeze({ reserved_0: 2 });
 /**
  * Parameters of RAW. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -446,6 +478,8 @@ export function unpackRawParams(view, at) {
 }
 
 export const STREAM_HEAD_SIZE = 20;
+export const STREAM_HEAD_OFFSETS = Object.freeze({ width: 0, coder: 1, transforms: 2, reserved_0: 6, count: 8, packed_size: 12, coded_size: 16 });
+export const STREAM_HEAD_RESERVED = Object.freeze({ reserved_0: 6 });
 /**
  * Head of a stream. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -464,6 +498,7 @@ export function unpackStreamHead(view, at) {
 }
 
 export const STATED_ERRORS_HEAD_SIZE = 20;
+export const STATED_ERRORS_HEAD_OFFSETS = Object.freeze({ source_count: 0, pruned_count: 8, source_sh_degree: 16, error_flags: 17, record_count: 18 });
 /**
  * Head of a SERR payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -480,6 +515,8 @@ export function unpackStatedErrorsHead(view, at) {
 }
 
 export const STATED_ERROR_RECORD_SIZE = 24;
+export const STATED_ERROR_RECORD_OFFSETS = Object.freeze({ measure: 0, reserved_0: 1, reserved_1: 2, reserved_2: 4, max: 8, rms: 16 });
+export const STATED_ERROR_RECORD_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2, reserved_2: 4 });
 /**
  * Stated error record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view

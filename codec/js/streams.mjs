@@ -6,7 +6,7 @@ import { parseJson } from './json.mjs';
 import * as spec from './spec.mjs';
 import { elements, putIntegers, undoDelta, undoRunLength, undoZigzag } from './transforms.mjs';
 
-const RESERVED = { reserved_0: 6 };
+const AT = spec.STREAM_HEAD_OFFSETS;
 const { TRANSFORM_DELTA, TRANSFORM_ZIGZAG, TRANSFORM_RUN_LENGTH } = spec;
 
 /**
@@ -85,31 +85,31 @@ function readHead(payload, widthMax, checkItsCount) {
   const { fields: head, offset } = payload.read(
     spec.unpackStreamHead,
     spec.STREAM_HEAD_SIZE,
-    RESERVED,
+    spec.STREAM_HEAD_RESERVED,
     'a stream head',
   );
   const { width, coder, packed_size, coded_size } = head;
   if (width < 1 || width > widthMax) {
     throw fault(spec.ERROR_STREAM, offset, 'STR-2', `elements of ${width} bytes, 1 to ${widthMax} may be`);
   }
-  if (!(coder in spec.CODER_NAMES)) throw fault(spec.ERROR_UNSUPPORTED, offset + 1, 'RES-2', `coder ${coder}`);
+  if (!(coder in spec.CODER_NAMES)) throw fault(spec.ERROR_UNSUPPORTED, offset + AT.coder, 'RES-2', `coder ${coder}`);
   if (
     spec.CODER_PROFILE[/** @type {keyof typeof spec.CODER_PROFILE} */ (coder)] !== spec.PROFILE_NAMES[spec.PROFILE_BASE]
   ) {
-    throw fault(spec.ERROR_UNSUPPORTED, offset + 1, 'STR-7', `coder ${coder} in the profile base`);
+    throw fault(spec.ERROR_UNSUPPORTED, offset + AT.coder, 'STR-7', `coder ${coder} in the profile base`);
   }
-  checkTransforms(head.transforms, offset + 2);
-  checkItsCount(head.count, offset + 8);
+  checkTransforms(head.transforms, offset + AT.transforms);
+  checkItsCount(head.count, offset + AT.count);
   const plain = head.count * width; // below 2^35
   if (head.transforms.includes(TRANSFORM_RUN_LENGTH)) {
     if (packed_size < 3 || packed_size % 3 || packed_size > 3 * plain) {
-      throw fault(spec.ERROR_STREAM, offset + 12, 'STR-5', `runs of ${packed_size} bytes for ${plain}`);
+      throw fault(spec.ERROR_STREAM, offset + AT.packed_size, 'STR-5', `runs of ${packed_size} bytes for ${plain}`);
     }
   } else if (packed_size !== plain) {
-    throw fault(spec.ERROR_STREAM, offset + 12, 'STR-4', `${packed_size} bytes for ${plain}`);
+    throw fault(spec.ERROR_STREAM, offset + AT.packed_size, 'STR-4', `${packed_size} bytes for ${plain}`);
   }
   if (coded_size > payload.left) {
-    throw fault(spec.ERROR_STREAM, offset + 16, 'STR-6', `${coded_size} coded bytes, ${payload.left} left`);
+    throw fault(spec.ERROR_STREAM, offset + AT.coded_size, 'STR-6', `${coded_size} coded bytes, ${payload.left} left`);
   }
   return { head, offset };
 }

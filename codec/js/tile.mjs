@@ -9,6 +9,7 @@ import * as spec from './spec.mjs';
 import { readStream } from './streams.mjs';
 
 const { ERROR_BOX, ERROR_INDEX, ERROR_RANGE, ERROR_STREAM } = spec;
+const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
 
 /**
  * @typedef {import('./decoder.d.ts').Header} Header
@@ -99,17 +100,18 @@ export class Tile {
     const { fields, offset: at } = payload.read(
       spec.unpackTileHead,
       spec.TILE_HEAD_SIZE,
-      { reserved_0: 6 },
+      spec.TILE_HEAD_RESERVED,
       'the head of a tile',
     );
     const { index } = this.record;
     if (fields.tile_index !== index)
       throw fault(ERROR_INDEX, at, 'TLE-1', `tile ${fields.tile_index} instead of ${index}`);
-    if (fields.layer !== layer) throw fault(ERROR_INDEX, at + 4, 'TLE-1', `layer ${fields.layer} instead of ${layer}`);
+    if (fields.layer !== layer)
+      throw fault(ERROR_INDEX, at + AT_HEAD.layer, 'TLE-1', `layer ${fields.layer} instead of ${layer}`);
     const attributes = this.attributesOf(layer);
     const wanted = layer === spec.LAYER_EXTRA ? this.header.extras.length : attributes.length;
     if (fields.block_count !== wanted) {
-      throw fault(ERROR_STREAM, at + 5, 'TLE-2', `${fields.block_count} blocks instead of ${wanted}`);
+      throw fault(ERROR_STREAM, at + AT_HEAD.block_count, 'TLE-2', `${fields.block_count} blocks instead of ${wanted}`);
     }
     const blocks = [];
     for (const attribute of attributes) blocks.push(this.finish(await this.readBlock(payload, attribute, integers)));
@@ -159,7 +161,7 @@ export class Tile {
     const { fields, offset } = payload.read(
       spec.unpackRawParams,
       spec.RAW_PARAMS_SIZE,
-      { reserved_0: 2 },
+      spec.RAW_PARAMS_RESERVED,
       'raw parameters',
     );
     if (fields.column !== column)
@@ -213,7 +215,7 @@ export class Tile {
       // "The means' integers q MUST have on each axis the minimum 0 and the maximum extent."
       if (least !== 0 || most !== extent[axis]) {
         const what = `axis ${axis}: integers from ${least} to ${most}, the record says 0 to ${extent[axis]}`;
-        throw fault(ERROR_BOX, recordOffset + 12, 'TIL-10', what);
+        throw fault(ERROR_BOX, recordOffset + AT_RECORD.corner, 'TIL-10', what);
       }
       const first = corner[axis];
       for (let i = 0; i < n; i++) column[i] += first; // at most 2^53 by TIL-7
@@ -234,7 +236,12 @@ export class Tile {
     const value = Math.fround(largest * step);
     const { maxScale, recordOffset } = this.record;
     if (!Object.is(value, maxScale)) {
-      throw fault(ERROR_BOX, recordOffset + 48, 'TIL-11', `the largest scale is ${value}, the record says ${maxScale}`);
+      throw fault(
+        ERROR_BOX,
+        recordOffset + AT_RECORD.max_scale,
+        'TIL-11',
+        `the largest scale is ${value}, the record says ${maxScale}`,
+      );
     }
   }
 }

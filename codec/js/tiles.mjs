@@ -1,11 +1,14 @@
 // Tile and layer records (spec 4.3.5) and the coverage of the file by chunks (4.3.6).
 
+import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
 import { ldexp } from './lattice.mjs';
 import { nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
 
-const { ERROR_INDEX, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+const { ERROR_INDEX, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+const { TILE_RECORD_OFFSETS: AT, TILE_RECORD_STRIDES: STRIDES, LAYER_RECORD_OFFSETS: AT_LAYER } = spec;
+const TABLE_ID_SIZE = Uint16Array.BYTES_PER_ELEMENT;
 const AXES = [0, 1, 2];
 
 /**
@@ -27,23 +30,26 @@ export function readTile(index, header, place) {
   const { fields, offset } = index.read(
     spec.unpackTileRecord,
     spec.TILE_RECORD_SIZE,
-    { level: 4, reserved_0: 10 },
+    spec.TILE_RECORD_RESERVED,
     'a tile record',
   );
   const { splat_count: splatCount, exponent, extent, layer_count, table_count } = fields;
+  if (fields.level !== 0)
+    throw fault(ERROR_RESERVED, offset + AT.level, 'RES-1', `a tile of the level ${fields.level}`);
   if (splatCount < 1 || splatCount > spec.TILE_SPLATS_MAX) {
     throw fault(ERROR_VALUE, offset, 'TIL-1', `a tile of ${splatCount} splats`);
   }
-  const lists = layer_count * spec.LAYER_RECORD_SIZE + 2 * table_count;
+  const lists = layer_count * spec.LAYER_RECORD_SIZE + TABLE_ID_SIZE * table_count;
   if (lists > index.left) throw fault(ERROR_INDEX, offset, 'IDX-2', `lists of ${lists} bytes, ${index.left} are left`);
   const corner = readCorner(fields.corner, extent, offset);
   const step = ldexp(header.attributes[spec.ATTRIBUTE_MEANS - 1].step, exponent);
   if (!(step > 0 && step < Infinity))
-    throw fault(ERROR_VALUE, offset + 8, 'TIL-9', `a lattice with the exponent ${exponent}`);
+    throw fault(ERROR_VALUE, offset + AT.exponent, 'TIL-9', `a lattice with the exponent ${exponent}`);
   const layers = readLayers(index, layer_count, header);
   const tablesOffset = index.offset;
   const tables = [];
-  for (let i = 0; i < table_count; i++) tables.push(index.view.getUint16(index.claim(2, 'a table id'), true));
+  for (let i = 0; i < table_count; i++)
+    tables.push(index.view.getUint16(index.claim(TABLE_ID_SIZE, 'a table id'), true));
   return {
     index: place,
     first: header.splatCount, // N so far
@@ -72,10 +78,15 @@ function readCorner(corner, extent, offset) {
   for (const axis of AXES) {
     const end = corner[axis] + BigInt(extent[axis]);
     if (corner[axis] < -most || corner[axis] > most || end > most) {
-      throw fault(ERROR_VALUE, offset + 12 + 8 * axis, 'TIL-7', `a box from ${corner[axis]} to ${end}`);
+      throw fault(
+        ERROR_VALUE,
+        offset + AT.corner + STRIDES.corner * axis,
+        'TIL-7',
+        `a box from ${corner[axis]} to ${end}`,
+      );
     }
     if (extent[axis] >= 2 ** spec.AXIS_BITS_MAX) {
-      throw fault(ERROR_VALUE, offset + 36 + 4 * axis, 'TIL-8', `an extent of ${extent[axis]}`);
+      throw fault(ERROR_VALUE, offset + AT.extent + STRIDES.extent * axis, 'TIL-8', `an extent of ${extent[axis]}`);
     }
   }
   return corner.map(Number); // exact: at most 2^53
@@ -96,7 +107,7 @@ function readLayers(index, count, header) {
     const { fields, offset: at } = index.read(
       spec.unpackLayerRecord,
       spec.LAYER_RECORD_SIZE,
-      { reserved_0: 1, reserved_1: 2 },
+      spec.LAYER_RECORD_RESERVED,
       'a layer record',
     );
     const { layer, size, offset } = fields;
@@ -114,8 +125,8 @@ function readLayers(index, count, header) {
       flags,
       size,
       offset: Number(offset),
-      offsetField: at + 8,
-      sizeField: at + 4,
+      offsetField: at + AT_LAYER.offset,
+      sizeField: at + AT_LAYER.size,
     });
   }
   if (count === 0) throw fault(ERROR_INDEX, start, 'TIL-2', 'no layers');
@@ -140,7 +151,7 @@ function readLayers(index, count, header) {
 export function checkTables({ tables, tablesOffset }, codebooks) {
   tables.forEach((id, i) => {
     if ((i > 0 && id <= tables[i - 1]) || !codebooks.has(id)) {
-      throw fault(ERROR_INDEX, tablesOffset + 2 * i, 'TIL-6', `table id ${id}`);
+      throw fault(ERROR_INDEX, tablesOffset + TABLE_ID_SIZE * i, 'TIL-6', `table id ${id}`);
     }
   });
 }
@@ -154,7 +165,7 @@ export function checkTables({ tables, tablesOffset }, codebooks) {
 export function checkCoverage(header, start) {
   const places = [...header.directory, ...header.tiles.flatMap((tile) => tile.layers)];
   for (const { size, sizeField } of places) {
-    const least = spec.CHUNK_HEADER_SIZE + 4;
+    const least = spec.CHUNK_HEADER_SIZE + CRC_SIZE;
     if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its frame has ${least}`);
   }
   // Offsets of 2^53 and more are rounded. They lie behind the end of the file, or `end` misses it: either is refused.
@@ -166,5 +177,10 @@ export function checkCoverage(header, start) {
     end += size;
   }
   if (end !== header.fileSize)
-    throw fault(ERROR_INDEX, 20, 'COV-1', `the chunks end at ${end}, the file at ${header.fileSize}`);
+    throw fault(
+      ERROR_INDEX,
+      spec.HEADER_OFFSETS.file_size,
+      'COV-1',
+      `the chunks end at ${end}, the file at ${header.fileSize}`,
+    );
 }

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from csplat import _spec
 from csplat_conformance.builder import Built
 from csplat_conformance.coders import deflate_fixed, deflate_stored
-from csplat_conformance.fields import Field
+from csplat_conformance.fields import Field, Writer
 from csplat_conformance.repair import repair
 
 __all__ = ["mapped", "mutant", "mutant_of"]
@@ -61,8 +61,6 @@ def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[
 
 def mapped(data: bytes) -> Built:
     """Return a valid file of any origin with the fields of header, index records and chunk frames."""
-    from csplat_conformance.fields import Writer
-
     out = Writer()
     out.structure("header", "header", _spec.unpack_header(data))
     index_size = _spec.unpack_header(data).index_size

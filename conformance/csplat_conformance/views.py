@@ -47,7 +47,7 @@ def quantised(rgb: NDArray[Any]) -> U8:
 
 def reference_picture(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
     """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
-    from csplat_render.camera import Camera
+    from csplat_render.camera import Camera  # of the extra, which the suite does without
     from csplat_render.twin import render_exact
 
     splats: Any = SimpleNamespace(**floats)

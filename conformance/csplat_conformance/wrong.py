@@ -12,64 +12,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 from csplat.errors import InputError
 from csplat_conformance.adapter import answer
 from csplat_conformance.answers import PARTS, Answer, judge
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.report import Outcome, Status
+from csplat_conformance.mistakes import Caught, Mistake
+from csplat_conformance.report import Status
+from csplat_conformance.wrong_js import catch_all
+from csplat_conformance.wrong_python import MISTAKES
 
-__all__ = ["Caught", "Mistake", "catch", "main", "table"]
+__all__ = ["catch", "main", "table"]
 
 _SHOWN_CLAUSES = 4
-
-
-@dataclass(frozen=True)
-class Mistake:
-    """One thing that a decoder does wrong.
-
-    Attributes:
-        name: short.
-        what: what a hurried implementer might do.
-        clause: of the spec, that it breaks.
-        apply: makes the decoder wrong until the stack is closed.
-    """
-
-    name: str
-    what: str
-    clause: str
-    apply: Callable[[ExitStack], None]
-
-
-@dataclass(frozen=True)
-class Caught:
-    """What the suite says of a wrong decoder.
-
-    Attributes:
-        language: of the decoder.
-        mistake: what is wrong with it.
-        failed: the checks that failed.
-    """
-
-    language: str
-    mistake: Mistake
-    failed: Sequence[Outcome]
-
-    @property
-    def vectors(self) -> list[str]:
-        """Names of the vectors that failed."""
-        return list(dict.fromkeys(outcome.name for outcome in self.failed))
-
-    @property
-    def clauses(self) -> list[str]:
-        """Clauses that the failed vectors name, the most frequent first."""
-        by_vector = {outcome.name: outcome.clauses for outcome in self.failed}
-        counts = Counter(clause for clauses in by_vector.values() for clause in clauses)
-        return [clause for clause, _ in counts.most_common()]
 
 
 def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
@@ -107,9 +64,6 @@ def table(caught: Sequence[Caught]) -> str:
 
 def main() -> int:
     """Print the table; the exit status is 1 when a mistake goes unnoticed."""
-    from csplat_conformance.wrong_js import catch_all
-    from csplat_conformance.wrong_python import MISTAKES
-
     parser = argparse.ArgumentParser(
         prog="csplat_conformance.wrong", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

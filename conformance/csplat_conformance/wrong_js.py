@@ -11,8 +11,8 @@ from typing import Final
 
 from csplat_conformance.answers import PARTS, judge
 from csplat_conformance.manifest import Vector, load
+from csplat_conformance.mistakes import Caught, Mistake
 from csplat_conformance.node import JsDecoder, js_folder
-from csplat_conformance.wrong import Caught, Mistake
 
 __all__ = ["EDITS", "Edit", "catch_all", "catch_edit", "edited"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import numpy as np
 from csplat import _spec, decoder
 from csplat.decoder import blocks, container, reconstruct, streams
 from csplat.errors import UnsupportedError
-from csplat_conformance.wrong import Mistake
+from csplat_conformance.mistakes import Mistake
 
 __all__ = ["MISTAKES"]
 
@@ -70,8 +71,6 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
 
 
 def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - as the right one
-    import zlib
-
     return zlib.decompressobj(-zlib.MAX_WBITS).decompress(coded, size).ljust(size, b"\0")
 
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from csplat import __version__
-from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat_tools import VERSIONS
 
-__all__ = ["VERSIONS", "main"]
+__all__ = ["main"]
 
-#: Of the program and of the format.
-VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.decoder.streams import Ints
 
-if TYPE_CHECKING:
-    from csplat.decoder.codebooks import Codebook
-
-__all__ = ["Block", "Coded", "Columns", "Indices", "runs", "work_dtype"]
+__all__ = ["Block", "Codebook", "Coded", "Columns", "Indices", "runs", "work_dtype"]
 
 _RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
 _RUN_SPLATS = 1 << 14
@@ -67,6 +64,29 @@ class Columns:
         if any(self.offsets):
             out += np.array(self.offsets, dtype)[:, None]
         return out
+
+
+@dataclass
+class Codebook:
+    """One codebook, as far as it was asked for.
+
+    Attributes:
+        record: its record in the index.
+        entries: for each layer (0, or an SH band) the entries of each stage, [size, C] integers.
+        values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
+            on, for SH codebooks of one stage.
+        values_finite: whether all of `values` are.
+    """
+
+    record: _spec.CodebookRecord
+    entries: dict[int, tuple[Ints, ...]] = field(default_factory=dict)
+    values: NDArray[np.float32] | None = None
+    values_finite: bool = True
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Entries of each stage."""
+        return self.record.sizes[: self.record.stage_count]
 
 
 @dataclass(frozen=True)

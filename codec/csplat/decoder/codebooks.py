@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Columns
+from csplat.decoder.blocks import Codebook, Columns
 from csplat.decoder.container import open_chunk
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.reconstruct import write_colour
@@ -17,7 +15,6 @@ from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
 
 __all__ = [
-    "Codebook",
     "attribute_columns",
     "check_unnamed_codebooks",
     "layer_columns",
@@ -27,29 +24,6 @@ __all__ = [
 
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
 _ATTRIBUTE_OF = {name: attribute for attribute, name in _spec.ATTRIBUTE_NAMES.items()}
-
-
-@dataclass
-class Codebook:
-    """One codebook, as far as it was asked for.
-
-    Attributes:
-        record: its record in the index.
-        entries: for each layer (0, or an SH band) the entries of each stage, [size, C] integers.
-        values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
-            on, for SH codebooks of one stage.
-        values_finite: whether all of `values` are.
-    """
-
-    record: _spec.CodebookRecord
-    entries: dict[int, tuple[Ints, ...]] = field(default_factory=dict)
-    values: NDArray[np.float32] | None = None
-    values_finite: bool = True
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Entries of each stage."""
-        return self.record.sizes[: self.record.stage_count]
 
 
 def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder.blocks import Coded, Columns, Indices, runs
-from csplat.decoder.codebooks import Codebook, attribute_columns
+from csplat.decoder.blocks import Codebook, Coded, Columns, Indices, runs
+from csplat.decoder.codebooks import attribute_columns
 from csplat.decoder.container import Cursor, check_reserved
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.lattice import (

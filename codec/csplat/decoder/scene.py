@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.codebooks import Codebook, check_unnamed_codebooks, read_codebooks
+from csplat.decoder.blocks import Codebook
+from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
 from csplat.decoder.container import check_digest, check_length, open_chunk, read_file_header, view_of
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.index import read_header

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Block
-from csplat.decoder.codebooks import Codebook
+from csplat.decoder.blocks import Block, Codebook
 from csplat.decoder.coded import TileContext
 from csplat.decoder.codings import read_block, read_raw
 from csplat.decoder.container import check_reserved, open_chunk

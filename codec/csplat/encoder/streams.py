@@ -227,7 +227,7 @@ def _has_matches(raw: bytes) -> bool:
 
 
 def _zstandard(raw: bytes, effort: int) -> bytes:
-    import zstandard
+    import zstandard  # files of the profile base do without it
 
     level = min(22, max(1, 2 * effort - 5))
     parameters = zstandard.ZstdCompressionParameters.from_level(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from csplat_conformance.boundaries import boundary_recipes
 from csplat_conformance.recipes.extreme import extreme_recipes
 from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
 from csplat_conformance.recipes.invalid_blocks import block_recipes
@@ -33,6 +34,7 @@ def all_recipes() -> list[Recipe]:
     )
     invalid = (
         header_recipes,
+        boundary_recipes,
         index_recipes,
         record_recipes,
         tile_recipes,

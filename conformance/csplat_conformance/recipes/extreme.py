@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from sys import float_info
 
 from csplat import _spec
 from csplat_conformance.builder import build
@@ -22,17 +23,18 @@ from csplat_conformance.samples import (
     signed,
     tile,
 )
-from csplat_conformance.scene import Attribute, Block, Extra, Scene, Stream
+from csplat_conformance.scene import Attribute, Block, Chunk, Extra, Scene, StatedErrors, Stream
 
 __all__ = ["extreme_recipes"]
 
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _MAX = _spec.INTEGER_MAX
+_LARGEST = float_info.max
 
 
 def extreme_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_numbers(), *_tiles()]
+    return [*_numbers(), *_facts(), *_tiles()]
 
 
 def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
@@ -49,7 +51,7 @@ def _lattice(step: float, mapping: int = _spec.MAPPING_LATTICE, chroma_shift: in
 
 
 def _numbers() -> list[Recipe]:
-    tiny, huge = 2.0**-1022, 2.0**1023
+    tiny = 2.0**-1022
     far = {MEANS: _lattice(2.0**-30)}
     box = {MEANS: axis([[0, 2**24 - 1, 0], [2**24 - 1, 0, 5], [77, 1, 2**24 - 1]], Stream(3))}
     column = _spec.COLUMN_MAX
@@ -58,9 +60,9 @@ def _numbers() -> list[Recipe]:
     return [
         _recipe(
             "corner_at_2_53",
-            "lattice integers of 2^53 and one step below",
+            "lattice integers of 2^53, by a corner alone and with an extent, and of −2^53",
             "TIL-7 MEA-1",
-            _with({MEANS: axis([[0, 1, 0], [1, 0, 1], [0, 0, 0]])}, records=far, corner=(_MAX - 1, -_MAX, 0)),
+            _with({MEANS: axis([[0, 1, 0], [1, 0, 0], [0, 0, 0]])}, records=far, corner=(_MAX - 1, -_MAX, _MAX)),
         ),
         _recipe(
             "extent_24_bits",
@@ -73,6 +75,12 @@ def _numbers() -> list[Recipe]:
             "51-bit codes in seven bytes",
             "MOR-1 MOR-2",
             _with({MEANS: morton([[2**17 - 1, 0, 2**17 - 1], [0, 2**17 - 1, 0], [2**16, 1, 3]], 17, Stream(7))}),
+        ),
+        _recipe(
+            "morton_1_bit",
+            "codes of three bits",
+            "MOR-1 MOR-2",
+            _with({MEANS: morton([[1, 0, 0], [0, 1, 1], [1, 1, 0]], 1, Stream(1))}),
         ),
         _recipe(
             "morton_wide_bits",
@@ -111,9 +119,9 @@ def _numbers() -> list[Recipe]:
         ),
         _recipe(
             "step_largest_lattice_zero",
-            "a huge lattice whose only integer is 0",
+            "the largest step, on a lattice whose only integer is 0",
             "TIL-9 ATT-6",
-            _with({MEANS: axis([[0, 0, 0]] * 3)}, corner=(0, 0, 0), exponent=0, records={MEANS: _lattice(huge)}),
+            _with({MEANS: axis([[0, 0, 0]] * 3)}, corner=(0, 0, 0), exponent=0, records={MEANS: _lattice(_LARGEST)}),
         ),
         _recipe(
             "subnormal_values",
@@ -171,6 +179,24 @@ def _numbers() -> list[Recipe]:
                 {QUATS: signed([[32767, -32767, 0], [0, 0, 32767], [18918, 18918, -18918]], Stream(2))},
                 records={QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=32767)},
             ),
+        ),
+    ]
+
+
+def _facts() -> list[Recipe]:
+    errors = ((_spec.MEASURE_MEANS, _LARGEST, _LARGEST), (_spec.MEASURE_OPACITIES, 0.0, 0.0))
+    return [
+        _recipe(
+            "origin_largest",
+            "the largest numbers of binary64 as origin and unit",
+            "IDX-5 IDX-6",
+            scene(unit_metres=_LARGEST, origin=(_LARGEST, -_LARGEST, 0.0)),
+        ),
+        _recipe(
+            "error_bounds",
+            "stated errors of 0 and of the largest number, whose product with the components overflows",
+            "SER-2",
+            scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(2, records=errors)),)),
         ),
     ]
 

@@ -84,22 +84,10 @@ def _blocks() -> list[Recipe]:
             base,
             {coding("quats"): _spec.CODING_OFFSET},
         ),
-        patched(
-            "coding_reserved",
-            "the coding ADAPTIVE",
-            "BLK-1",
-            "E_UNSUPPORTED",
-            base,
-            {coding("sh0"): _spec.CODING_ADAPTIVE},
-        ),
-        patched("coding_unknown", "a coding beyond the registry", "BLK-1", "E_UNSUPPORTED", base, {coding("sh0"): 77}),
         patched("lattice_exponent_high", "step × 2^exponent overflows", "LAT-1", "E_VALUE", base, {exponent: 1100}),
         patched("lattice_exponent_low", "step × 2^exponent is subnormal", "LAT-1", "E_VALUE", base, {exponent: -1020}),
         patched("lattice_exponent_highest", "the largest exponent", "LAT-1", "E_VALUE", base, {exponent: 32767}),
         patched("lattice_exponent_lowest", "the smallest exponent", "LAT-1", "E_VALUE", base, {exponent: -32768}),
-        patched(
-            "quats_exponent", "an exponent for quats", "LAT-2", "E_VALUE", base, {"TILE.0.0/quats.params.exponent": 1}
-        ),
         patched(
             "escape_exponent",
             "an exponent in an escape block",
@@ -127,7 +115,6 @@ def _values() -> list[Recipe]:
     limit, far = Attribute(_spec.MAPPING_LATTICE, 1e-9), Attribute(_spec.MAPPING_LATTICE, 2.0**100)
     shifted = offset([[0, 2**34, 0], [0, 2**34 + 1, 0]], offsets=(0, 2**34, 0))
     rgb, m = scene().attributes[SH0], 127
-    bits = build(_with({MEANS: morton([[0, 1, 0], [1, 0, 1]], 1)}))
 
     def quats(name: str, why: str, clause: str, row: list[int], code: str = "E_RANGE") -> Recipe:
         made = _with({QUATS: signed([[0, 0, 0], row], Stream(2))})
@@ -141,15 +128,6 @@ def _values() -> list[Recipe]:
             "E_RANGE",
             _with({OPACITIES: levels([0, 256], Stream(2))}),
             f"{_STREAM}.width",
-        ),
-        patched("morton_no_bits", "no bits per axis", "MOR-1", "E_VALUE", bits, {"TILE.0.0/means.params.bits": 0}),
-        patched(
-            "morton_18_bits",
-            "18 bits per axis",
-            "MOR-1",
-            "E_VALUE",
-            bits,
-            {"TILE.0.0/means.params.bits": _spec.MORTON_BITS_MAX + 1},
         ),
         whole(
             "morton_code",

@@ -1,32 +1,21 @@
-"""Invalid files: the header and every reserved field."""
+"""Invalid files: the header."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from csplat import _spec
-from csplat_conformance.broken import patched, rich, small, whole
-from csplat_conformance.builder import build
+from csplat_conformance.broken import patched, small
 from csplat_conformance.repair import seal
 from csplat_conformance.samples import (
-    MEANS,
     Recipe,
-    morton,
-    scene,
-    tile,
 )
-from csplat_conformance.scene import Block, Chunk
 
 __all__ = ["header_recipes"]
 
 
 def header_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_header(), *_reserved()]
-
-
-def _header() -> list[Recipe]:
     base, size = small(), len(small().data)
     crc, digest = base.fields["header.header_crc"], base.fields["header.digest"]
     flip_crc = {"header.header_crc": b"\0\0\0\0"}
@@ -48,16 +37,6 @@ def _header() -> list[Recipe]:
             lambda d: bytes(b & 127 for b in d),
             0,
         ),
-        patched("version_major", "major version 1", "HDR-2", "E_VERSION", base, {"header.version_major": 1}),
-        patched(
-            "version_minor",
-            "minor version 2",
-            "HDR-2",
-            "E_VERSION",
-            base,
-            {"header.version_minor": 2},
-            at="header.version_major",
-        ),
         Recipe(
             "invalid/header_crc",
             "the header's CRC alone is wrong",
@@ -67,10 +46,6 @@ def _header() -> list[Recipe]:
             "E_CRC",
             crc.offset,
         ),
-        patched(
-            "profile_reserved", "profile MAIN", "HDR-4", "E_UNSUPPORTED", base, {"header.profile": _spec.PROFILE_MAIN}
-        ),
-        patched("profile_unknown", "profile 255", "HDR-4", "E_UNSUPPORTED", base, {"header.profile": 255}),
         _cut("truncated", "the last byte is missing", "HDR-5", "E_TRUNCATED", lambda d: d[:-1], size - 1),
         _cut(
             "truncated_after_header",
@@ -120,60 +95,3 @@ def _header() -> list[Recipe]:
 
 def _cut(name: str, why: str, clause: str, code: str, make: Callable[[bytes], bytes], at: int | None) -> Recipe:
     return Recipe(f"invalid/{name}", why, (clause,), lambda: make(small().data), None, code, at)
-
-
-def _reserved() -> list[Recipe]:
-    """Return a recipe for each reserved field of each structure."""
-    result, seen = [], set()
-    lone = build(replace(scene(tiles=[tile(changes=_morton())])))
-    for base in (rich(), lone):
-        for name, entry in base.fields.items():
-            key = (entry.structure, name.rsplit(".", 1)[-1])
-            if key[1].startswith("reserved_") and key not in seen:
-                seen.add(key)
-                why = f"{key[1]} of the structure {entry.structure} is 1"
-                result.append(
-                    patched(f"reserved_{entry.structure}_{key[1][-1]}", why, "RES-1", "E_RESERVED", base, {name: 1})
-                )
-    flags = {
-        "META/header.flags": 4 | _spec.CHUNK_FLAG_SAFE_TO_COPY,
-        "directory[META].flags": 4 | _spec.CHUNK_FLAG_SAFE_TO_COPY,
-    }
-    unknown = scene(chunks=(Chunk(b"priv", payload=b"x", flags=0x8000),))
-    return [
-        *result,
-        patched("reserved_level", "a level of detail", "RES-1", "E_RESERVED", rich(), {"tile[1].level": 1}),
-        patched(
-            "reserved_scene_flag", "an unlisted scene flag", "RES-1", "E_RESERVED", rich(), {"index.scene_flags": 4}
-        ),
-        patched(
-            "reserved_chunk_flag",
-            "an unlisted flag of a known chunk",
-            "RES-1",
-            "E_RESERVED",
-            rich(),
-            flags,
-            ("E_VALUE",),
-            at="directory[META].flags",
-        ),
-        whole(
-            "reserved_chunk_flag_unknown",
-            "an unlisted flag of an unknown chunk",
-            "RES-1",
-            "E_RESERVED",
-            unknown,
-            "directory[priv].flags",
-        ),
-        patched(
-            "reserved_error_flag",
-            "an unlisted flag of the stated errors",
-            "RES-1",
-            "E_RESERVED",
-            rich(),
-            {"SERR/head.error_flags": 2},
-        ),
-    ]
-
-
-def _morton() -> dict[int, Block]:
-    return {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)}

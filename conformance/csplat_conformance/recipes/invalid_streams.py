@@ -41,9 +41,9 @@ def _heads() -> list[Recipe]:
     five = Stream(1, _RUNS, packed=bytes([7, 8, 0, 0, 0]))
     nine = Stream(1, _RUNS, packed=bytes([7, 8, 8, 0, 0, 0, 0, 0, 0]))
 
-    def transforms(name: str, why: str, values: tuple[int, ...], clause: str, code: str) -> Recipe:
-        changes = {f"{_STREAM}.transforms": bytes(values).ljust(4, b"\0")}
-        return patched(f"transforms_{name}", why, clause, code, base, changes)
+    def transforms(name: str, why: str, values: tuple[int, ...]) -> Recipe:
+        changes = {f"{_STREAM}.transforms": bytes(values).ljust(_spec.TRANSFORMS_MAX, b"\0")}
+        return patched(f"transforms_{name}", why, "STR-3", "E_STREAM", base, changes)
 
     return [
         patched("count", "one element more than splats", "STR-1", "E_STREAM", base, {f"{_STREAM}.count": 3}),
@@ -89,10 +89,9 @@ def _heads() -> list[Recipe]:
             _with({MEANS: axis([[0, 1, 0], [1, 0, 1]], Stream(4))}),
             "TILE.0.0/means.stream.width",
         ),
-        transforms("descending", "zigzag before delta", (2, 1), "STR-3", "E_STREAM"),
-        transforms("twice", "delta twice", (1, 1), "STR-3", "E_STREAM"),
-        transforms("gap", "NONE before delta", (0, 1), "STR-3", "E_STREAM"),
-        transforms("unknown", "a transform beyond the registry", (5,), "RES-2", "E_UNSUPPORTED"),
+        transforms("descending", "zigzag before delta", (2, 1)),
+        transforms("twice", "delta twice", (1, 1)),
+        transforms("gap", "NONE before delta", (0, 1)),
         patched(
             "packed_size",
             "one byte too many without runs",
@@ -139,22 +138,6 @@ def _heads() -> list[Recipe]:
             "E_UNSUPPORTED",
             _opacities(Stream(coder="zstd_raw")),
             f"{_STREAM}.coder",
-        ),
-        patched(
-            "coder_reserved",
-            "the coder RANS",
-            "RES-2 STR-7",
-            "E_UNSUPPORTED",
-            base,
-            {f"{_STREAM}.coder": _spec.CODER_RANS},
-        ),
-        patched(
-            "coder_unknown",
-            "a coder beyond the registry",
-            "RES-2 STR-7",
-            "E_UNSUPPORTED",
-            base,
-            {f"{_STREAM}.coder": 200},
         ),
     ]
 

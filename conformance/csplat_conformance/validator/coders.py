@@ -94,7 +94,7 @@ def _has_spare_bits(before: zlib._Decompress, last: int, rest: bytes) -> bool:
 
 def _unframed(coded: memoryview, size: int) -> bytes:
     """COD-3. The frame is walked block by block before it is decompressed, so that its extent is known."""
-    import zstandard
+    import zstandard  # files of the profile base do without it
 
     _check_frame(coded, size)
     try:

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
-from csplat_tools.__main__ import VERSIONS
+from csplat_tools import VERSIONS
 from csplat_tools.files.console import say
 
 __all__ = ["app"]
