@@ -18,6 +18,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 # They lie in the folder that is named above.
 from captures import H, W, cameras, photograph, shell  # noqa: E402
+
 from compression import main  # noqa: E402
 from compression_controls import Unquantised, cluster_colours, eight_bits, histogram  # noqa: E402
 from compression_memory import with_splats  # noqa: E402
@@ -32,7 +33,6 @@ from compression_sizes import (  # noqa: E402
     ply_bytes,
 )
 from compression_tables import tables  # noqa: E402
-
 from csplat import EncodeOptions  # noqa: E402 - wants what is looked for above; so do all below
 from csplat.encoder import Draft  # noqa: E402
 from csplat.errors import InputError  # noqa: E402

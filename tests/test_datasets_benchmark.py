@@ -21,7 +21,6 @@ import dataset_folders  # noqa: E402
 import dataset_protocols  # noqa: E402
 import dataset_tables  # noqa: E402
 import datasets  # noqa: E402
-
 from csplat_render.cameras import intrinsics, look_at  # noqa: E402
 
 W, H = 48, 32

@@ -13,13 +13,13 @@ pytest.importorskip("matplotlib", reason="the benchmark plots: pip install 'cspl
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
 
 # They lie in the folder that is named above, and need what is looked for there.
+from distortion_curves import Point, Rate, bracket, front, psnr_at, rate_at
+
 import distortion
 import distortion_plot
 import distortion_tables
-from distortion_curves import Point, Rate, bracket, front, psnr_at, rate_at
-from kept import Kept
-
 from csplat_tools.optimise.report import Optimised, Report
+from kept import Kept
 
 SCALAR = (Point(38.0, 1000), Point(42.0, 4000))
 CODEBOOK = (Point(39.0, 1500), Point(41.0, 6000))

@@ -1,13 +1,13 @@
 """What splats are to pictures: the removal pass against its twin, and colours fitted to pictures."""
 
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+from oracle import adversarial, extreme_splats, facing
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, sh_degree_of
@@ -18,11 +18,6 @@ from csplat_render.cameras import intrinsics, load_cameras, look_at
 from csplat_render.contributions import Contributions
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.removal import measure_removal, removal_exact
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
-
-# It lies in the folder that is named above.
-from oracle import adversarial, extreme_splats, facing
 
 
 def views(count=3, width=40, height=30, distance=4.0):

@@ -17,18 +17,18 @@ BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 # They lie in the folder that is named above.
-import study_scenes  # noqa: E402
 from captures import cameras, photograph, shell  # noqa: E402
+
+import study  # noqa: E402
+import study_scenes  # noqa: E402
 from compression_scenes import Scene  # noqa: E402
+from csplat_render.metrics import psnr  # noqa: E402 - wants what is looked for above; so do all below
+from csplat_tools.study import Reduction  # noqa: E402
 from study_claims import CLAIMS, claims  # noqa: E402
 from study_judge import Views, renders_at  # noqa: E402
 from study_rows import Row, measure_row, measure_taus, rows_of_baseline, rows_of_scene  # noqa: E402
 from study_scenes import Subject, baselines, larger  # noqa: E402
 from study_tables import MIB, PUBLISHED  # noqa: E402
-
-import study  # noqa: E402
-from csplat_render.metrics import psnr  # noqa: E402 - wants what is looked for above; so do all below
-from csplat_tools.study import Reduction  # noqa: E402
 
 BLACK = (0.0, 0.0, 0.0)
 

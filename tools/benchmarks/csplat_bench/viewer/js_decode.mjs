@@ -1,6 +1,6 @@
 // Throughput of the JavaScript decoder.
 //
-//   node tools/benchmarks/js_decode.mjs [--repeat 5] [--inflate stream] [--python .venv/bin/python] FILE.csplat ...
+//   node tools/benchmarks/csplat_bench/viewer/js_decode.mjs [--repeat 5] [--inflate stream] [--python .venv/bin/python] FILE.csplat ...
 //
 // Each file is decoded whole from memory, all checks included: once to warm up, then `repeat` times. Times are medians.
 // With --python the same is done with csplat.decode in that interpreter, after the JavaScript.
@@ -11,8 +11,8 @@ import { cpus } from 'node:os';
 import { basename } from 'node:path';
 import { parseArgs } from 'node:util';
 
-import { decode } from '../../codec/js/decoder.mjs';
-import { streamInflate } from '../../codec/js/inflate.mjs';
+import { decode } from '../../../../codec/js/decoder.mjs';
+import { streamInflate } from '../../../../codec/js/inflate.mjs';
 
 const { values, positionals: files } = parseArgs({
   allowPositionals: true,
