@@ -62,7 +62,7 @@ class Quality:
 def main(
     *,
     scenes: SCENES = _SCENES,
-    extra: EXTRA = [],  # noqa: B006 - typer's way of saying that there are none
+    extra: EXTRA = [],
     presets: PRESETS = "fast,balanced,small",
     no_peers: Annotated[bool, typer.Option("--no-peers", help="leave SPZ out")] = False,
     seeds: Annotated[str, typer.Option(help="of virtual cameras to compare with, separated by commas")] = "",

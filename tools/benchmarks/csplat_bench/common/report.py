@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from csplat_bench.common.command import tell
 from csplat_tools.files.console import format_table
 from csplat_tools.tradeoff.machine import describe_machine
 
-__all__ = ["Machine", "describe", "machines", "optional", "table", "tell_machine", "titled", "write_json"]
+__all__ = ["Machine", "Table", "describe", "laid_out", "machines", "optional", "table", "tell_machine", "write_json"]
 
 #: What figures were taken on, in lines by name.
 Machine = dict[str, str]
@@ -29,9 +30,24 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, markdown: 
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, ["---"] * len(header), *lines))
 
 
-def titled(title: str, text: str) -> str:
-    """A table below its title; nothing where it is empty."""
-    return f"{title}\n\n{text}" if text else ""
+@dataclass(frozen=True)
+class Table:
+    """A table that is not laid out yet, and what stands above it."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    title: str = ""
+
+
+def laid_out(parts: Iterable[Table | str], *, markdown: bool) -> str:
+    """Lay out tables and texts, one below the other; those without rows, and empty texts, are left out."""
+    found = []
+    for part in parts:
+        if isinstance(part, str):
+            found.append(part)
+        elif part.rows:
+            found += [part.title, table(part.header, part.rows, markdown=markdown)]
+    return "\n\n".join(text for text in found if text)
 
 
 def optional(value: float | None, say: str | Callable[[float], str], none: str = "-") -> str:
@@ -67,7 +83,8 @@ def machines(found: Iterable[Machine]) -> str:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Replace a file. NaN and infinities do not occur in it: JSON has none."""
+    """Replace a file, in a folder that is made for it. NaN and infinities do not occur in it: JSON has none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(path) as stream:
         stream.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 

@@ -79,7 +79,7 @@ def main(
     what: Annotated[Part, typer.Argument(help="what to measure, or tables of what is known")],
     *,
     scenes: SCENES = _SCENES,
-    extra: EXTRA = [],  # noqa: B006 - typer's way of saying that there are none
+    extra: EXTRA = [],
     gone: Annotated[str, typer.Option(help="per cent removed, separated by commas")] = "40,60",
     views: VIEWS = 160,
     out: OUT = EVERYTHING / "removal",

@@ -27,7 +27,7 @@ __all__ = ["STAGES", "Steps", "measured"]
 STAGES = ("forward", "loss", "backward", "Adam", "other")
 
 _DEGREE = 3
-_START_VIEWS = 10  # that hulls and sizes of the splats are found by
+_WARM_SPLATS = 10  # enough to compile what a step runs
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: 
         return Parameters.starting_at(starting_splats(pictures, scene, splats, _DEGREE, rng))
 
     with thread_count(threads):
-        _walk(pictures[:1], options, start(_START_VIEWS), 2)
+        _walk(pictures[:1], options, start(_WARM_SPLATS), 2)
         before = reset_peak()
         parameters = start(count)
         _walk(pictures, options, parameters, warm)

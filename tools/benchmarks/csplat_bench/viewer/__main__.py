@@ -56,7 +56,7 @@ def main(
     presets: PRESETS = "balanced,fast",
     first: Annotated[str, typer.Option(help="scenes for the first picture")] = "fox120k,fox60k_noreg,lego60k,plane3",
     decoded: Annotated[str, typer.Option(help="scenes for the decoders")] = "fox120k,lego60k,donut,donut-1M",
-    extra: EXTRA = [],  # noqa: B006 - typer's way of saying that there are none
+    extra: EXTRA = [],
     runs: Annotated[int, typer.Option(help="of each measurement")] = 5,
     gpu: Annotated[bool, typer.Option("--gpu", help="do not ask for SwiftShader")] = False,
     chromium: Annotated[str, typer.Option(help="the program")] = shutil.which("chromium") or "chromium",

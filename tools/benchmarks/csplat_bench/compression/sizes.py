@@ -18,7 +18,7 @@ from csplat.encoder import Frozen, Held
 from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.finetune.rate import colour_integers_of
 
-__all__ = ["Book", "books_of", "coded_colour_bytes", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]
+__all__ = ["Book", "books_of", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]
 
 _FLOAT = 4
 _SHAPE = 7  # floats of rotation and scales
@@ -65,20 +65,6 @@ def _in_book(splats: int, floats: int, book: Book | None, own: int) -> int:
         return splats * floats * _FLOAT
     rows = book.entries + book.escaped
     return splats * (_index_bytes(book.entries) + own * _FLOAT) + rows * floats * _FLOAT
-
-
-def coded_colour_bytes(splats: int, coefficients: int, book: Book, *, base: bool) -> int:
-    """All colours of a scene, a byte per value, with a codebook of SH.
-
-    Args:
-        splats: how many.
-        coefficients: values of the SH bands above 0, per splat.
-        book: the codebook.
-        base: whether the base colour is in it, or each splat's own.
-    """
-    width = coefficients + (3 if base else 0)
-    own = 0 if base else 3
-    return splats * (_index_bytes(book.entries) + own) + (book.entries + book.escaped) * width
 
 
 def _index_bytes(entries: int) -> int:

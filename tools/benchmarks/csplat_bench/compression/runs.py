@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compression_scenes import Scene
-from compression_sizes import books_of
 from numpy.typing import NDArray
 
 from csplat.decoder import decode, read_header
@@ -19,7 +17,10 @@ from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Held, Imp
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_render.judge import renderer
+from csplat_bench.common.captures import Capture
+from csplat_bench.common.making import ARRAYS
+from csplat_bench.compression.rows import Row, Scores
+from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
 from csplat_render.removal import measure_removal
 from csplat_tools.inspect.layout import describe
@@ -29,18 +30,12 @@ from csplat_tools.training.finetune import Clock
 from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.finetune import FinetuneOptions, Views, finetune
-from csplat_trainer.report import save_picture, side_by_side
 from csplat_trainer.sensitivity import Sensitivity
 
-__all__ = ["ARRAYS", "Bench", "Tuned"]
-
-#: Arrays of a model.
-ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+__all__ = ["Bench", "Tuned"]
 
 #: Splats, and the seconds that it took to choose them, by stage.
 Pick = tuple[Chosen, dict[str, float]]
-
-Scores = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +73,13 @@ class Bench:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Capture,
         ply: Path,
         encoding: EncodeOptions,
         tuning: FinetuneOptions,
         lpips: Lpips | None,
     ) -> None:
-        self.scene, self.encoding, self.tuning, self._lpips = scene, encoding, tuning, lpips
+        self.encoding, self.tuning, self._lpips = encoding, tuning, lpips
         self.source = read_ply(ply)
         data = DataOptions(str(scene.data), scene.size)
         self.looks = find_view_set(self.source, data=data, background=scene.background, aside=0)
@@ -163,8 +158,8 @@ class Bench:
             result = frozen.coded(run.held).write()
         return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
 
-    def row(self, tuned: Tuned) -> dict[str, Any]:
-        """What came of it, JSON-compatible: sizes and scores before and after tuning."""
+    def row(self, tuned: Tuned) -> Row:
+        """What came of it: sizes and scores before and after tuning."""
         before, after = decode(tuned.plain.data), decode(tuned.result.data)
         assert _same(tuned, after), "the decoded file is not what was tuned"
         scores = self.judge({"before": before, "after": after})
@@ -188,21 +183,12 @@ class Bench:
             "encoding": tuned.result.report.options,
         }
 
-    def judge(self, models: Mapping[str, SplatModel]) -> Scores:
+    def judge(self, models: Mapping[str, SplatModel]) -> dict[str, Scores]:
         """Scores on the held-out photographs, by name."""
         judged = judge_models(self.source, models, self.looks, self._lpips, self.threads)
         assert judged is not None
-        return {name: dict(one) for name, one in judged.scores.items()}
-
-    def picture(self, tuned: Tuned, path: Path) -> None:
-        """The middle one of the held-out photographs, beside source, file before tuning, and file."""
-        judge = self.looks.photograph_judge(threads=self.threads)
-        middle = len(judge.cameras) // 2
-        panels = [judge.look(middle).picture]
-        for model in (self.source, decode(tuned.plain.data), decode(tuned.result.data)):
-            draw = renderer(model, self.looks.background, threads=self.threads)
-            panels.append(draw(judge.cameras[middle]).rgb)
-        save_picture(path, side_by_side(*panels))
+        found: dict[str, Any] = {name: dict(one) for name, one in judged.scores.items()}
+        return found
 
 
 class _Stages:

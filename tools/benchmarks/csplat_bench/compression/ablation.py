@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from compression_runs import ARRAYS, Bench, Tuned
-from compression_sizes import books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
 from csplat.encoder import EncodeResult, Frozen, Held
 from csplat.model import SplatModel
+from csplat_bench.common.making import ARRAYS
+from csplat_bench.compression.rows import Step
+from csplat_bench.compression.runs import Bench, Tuned
+from csplat_bench.compression.sizes import books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 
 __all__ = ["ablation"]
 
 
-def ablation(bench: Bench, tuned: Tuned) -> list[dict[str, Any]]:
+def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
     """The steps of the pipeline, one after the other, and what each of them leaves.
 
     Args:
@@ -25,8 +26,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[dict[str, Any]]:
         tuned: what came of all of them.
 
     Returns:
-        A row for each: `row`, `stored` (a PLY, floats or integers in memory, a decoded file), `size_bytes` (see
-        compression_sizes), `seconds` of the step, and scores.
+        A row for each; its size is as `sizes` counts it.
     """
     frozen, start, log = tuned.frozen, tuned.frozen.start(), tuned.seconds
     before = frozen.seen(start)
