@@ -201,7 +201,7 @@ def test_everything_is_measured_and_printed(capture, tmp_path, capsys):
 def test_wrong_words_are_refused_before_anything_is_measured(capture, tmp_path, capsys):
     for words, message in (
         (("mian",), "mian cannot be measured"),
-        (("main", "--keep", "1.5"), "a share of splats is 1.5"),
+        (("main", "--keep", "1.5"), "a share of splats is to be more than 0"),
         (("main", "--bits", "40"), "position_bits is 40"),
         (("main", "--sizes", "x"), "invalid literal"),
     ):

@@ -1,7 +1,6 @@
 """The benchmark of simple strategies: its arithmetic, and a whole run on a small data set."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,22 +12,19 @@ pytest.importorskip("scipy", reason="data sets want the extra [render]")
 pytest.importorskip("matplotlib", reason="plots want the extra [render]")
 Image = pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
-BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
+from captures import cameras, photograph, shell
 
-# They lie in the folder that is named above.
-from captures import cameras, photograph, shell  # noqa: E402
-
-import study  # noqa: E402
-import study_scenes  # noqa: E402
-from compression_scenes import Scene  # noqa: E402
-from csplat_render.metrics import psnr  # noqa: E402 - wants what is looked for above; so do all below
-from csplat_tools.study import Reduction  # noqa: E402
-from study_claims import CLAIMS, claims  # noqa: E402
-from study_judge import Views, renders_at  # noqa: E402
-from study_rows import Row, measure_row, measure_taus, rows_of_baseline, rows_of_scene  # noqa: E402
-from study_scenes import Subject, baselines, larger  # noqa: E402
-from study_tables import MIB, PUBLISHED  # noqa: E402
+from csplat_bench.common.captures import Capture
+from csplat_bench.common.command import run as command
+from csplat_bench.study import __main__ as study
+from csplat_bench.study import scenes as study_scenes
+from csplat_bench.study.claims import CLAIMS, claims
+from csplat_bench.study.judge import Views, renders_at
+from csplat_bench.study.rows import Row, measure_row, measure_taus, rows_of_baseline, rows_of_scene
+from csplat_bench.study.scenes import Subject, baselines, larger
+from csplat_bench.study.tables import MIB, PUBLISHED
+from csplat_render.metrics import psnr
+from csplat_tools.study import Reduction
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -119,7 +115,8 @@ def small(tmp_path, monkeypatch):
 
     def known(iterations, count):
         return {
-            name: Scene(name, folder, None, training=one.training) for name, one in baselines(iterations, count).items()
+            name: Capture(name, folder, None, training=one.training)
+            for name, one in baselines(iterations, count).items()
         }
 
     monkeypatch.setattr(study, "baselines", known)
@@ -131,7 +128,7 @@ def small(tmp_path, monkeypatch):
 
 def run(folder, *words):
     quick = ("--iterations", "30", "--splats", "80", "--lpips", "none", "--scenes", "")
-    return study.main([*words, *quick, "--out", str(folder / "out"), "--plots", str(folder / "plots")])
+    return command(study.main, [*words, *quick, "--out", str(folder / "out"), "--plots", str(folder / "plots")])
 
 
 def test_everything_is_trained_measured_printed_and_drawn(small, capsys):
@@ -172,8 +169,7 @@ def test_a_row_that_is_told_otherwise_is_measured_again(small, monkeypatch, caps
 
 
 def test_wrong_words_are_refused(small, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run(small, "bseline")
-    assert 2 == ended.value.code
-    assert 1 == study.main(["scenes", "--scenes", "nowhere", "--lpips", "none", "--out", str(small / "out")])
+    assert 2 == run(small, "bseline")
+    assert "bseline cannot be measured" in capsys.readouterr().err
+    assert 1 == command(study.main, ["scenes", "--scenes", "nowhere", "--lpips", "none", "--out", str(small / "out")])
     assert "no scene is called nowhere" in capsys.readouterr().err

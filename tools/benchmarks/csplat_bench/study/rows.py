@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict, dataclass, field
-from typing import Any
-
-from study_judge import Views
-from study_scenes import Subject
 
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
+from csplat_bench.common.measuring import timed
+from csplat_bench.study.judge import Views
+from csplat_bench.study.records import How, Measured, Survivors
+from csplat_bench.study.scenes import Subject
 from csplat_tools.inspect.layout import describe
 from csplat_tools.study import (
     ATTRIBUTES,
@@ -66,10 +65,16 @@ class Row:
     decoded: bool = False
 
     @property
-    def how(self) -> dict[str, Any]:
-        """All that the line depends on, as JSON has it."""
-        document: dict[str, Any] = json.loads(json.dumps({**asdict(self), "kmeans": _sizes(self.reduction.kmeans)}))
-        return document
+    def how(self) -> How:
+        """All that the line depends on."""
+        kmeans = self.reduction.kmeans
+        sizes = None
+        if kmeans is not None:
+            sizes = {"sizes": dict(kmeans.sizes), "stages": kmeans.stages, "gauge": kmeans.gauge}
+        reduction = asdict(self.reduction)
+        return {
+            "name": self.name, "reduction": reduction, "preset": self.preset, "decoded": self.decoded, "kmeans": sizes,
+        }  # fmt: skip
 
 
 def rows_of_baseline() -> list[Row]:
@@ -122,22 +127,16 @@ _RENDERED = (
 )  # fmt: skip
 
 
-def measure_row(subject: Subject, row: Row) -> dict[str, Any]:
-    """Do it, write the file, score it.
-
-    Returns:
-        What `Views.score` returns, and: splats; study_bytes by the published rule; csplat_bytes, and PSNR of the
-        decoded file, file_psnr_mean, file_psnr_std; codebooks; seconds of the strategy, of encoding, in all.
-    """
+def measure_row(subject: Subject, row: Row) -> Measured:
+    """Do it, write the file, score it."""
     start = time.perf_counter()
     views = None
     if subject.teachers is not None:
         views = with_deciders(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
-    reduced = reduce_model(subject.source, row.reduction, views)
-    done = time.perf_counter()
-    data = encode_reduced(subject.source, row.reduction, EncodeOptions(preset=row.preset), views=views).data
-    encoded = time.perf_counter()
-    decoded = decode(data)
+    reduced, strategy = timed(reduce_model, subject.source, row.reduction, views)
+    options = EncodeOptions(preset=row.preset)
+    encoded, encoding = timed(encode_reduced, subject.source, row.reduction, options, views=views)
+    decoded = decode(encoded.data)
     scores = subject.views.score(decoded if row.decoded else reduced.model)
     file = scores if row.decoded else subject.views.score(decoded, quick=True)
     return {
@@ -145,19 +144,19 @@ def measure_row(subject: Subject, row: Row) -> dict[str, Any]:
         **scores,
         "splats": len(reduced.model),
         "study_bytes": reduced.size_bytes,
-        "csplat_bytes": len(data),
+        "csplat_bytes": len(encoded.data),
         "file_psnr_mean": file["psnr_mean"],
         "file_psnr_std": file["psnr_std"],
         "books": {} if reduced.clustered is None else reduced.clustered.as_json(),
-        "strategy_seconds": done - start,
-        "encode_seconds": encoded - done,
+        "strategy_seconds": strategy.wall,
+        "encode_seconds": encoding.wall,
         "seconds": time.perf_counter() - start,
     }
 
 
-def measure_taus(source: SplatModel, views: Views) -> list[dict[str, Any]]:
+def measure_taus(source: SplatModel, views: Views) -> list[Survivors]:
     """Survivors and PSNR by threshold, SH as it is."""
-    found = []
+    found = list[Survivors]()
     for tau in TAUS:
         if float(source.opacities.max()) <= tau:
             break
@@ -196,7 +195,3 @@ def _gathered(used: dict[str, int]) -> dict[str, int]:
 
 def _distilled(tau: float | None = None) -> Reduction:
     return Reduction(tau, sh_degree=0, distil=True)
-
-
-def _sizes(kmeans: KMeans | None) -> dict[str, Any] | None:
-    return None if kmeans is None else {"sizes": dict(kmeans.sizes), "stages": kmeans.stages, "gauge": kmeans.gauge}

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat_bench.study.records import Scored
 from csplat_render import Camera
+from csplat_render.judge import renderer
 from csplat_render.metrics import psnr_of_mse, squared_error, ssim
-from csplat_render.rasterise import Rasteriser
 
-__all__ = ["Views", "renders_at"]
+__all__ = ["Distance", "Views", "renders_at"]
 
 F32 = NDArray[np.float32]
 Distance = Callable[[F32, F32], float]
@@ -37,45 +37,47 @@ class Views:
     background: tuple[float, float, float]
     lpips: Distance | None = None
 
-    def score(self, model: SplatModel, *, quick: bool = False) -> dict[str, Any]:
+    def score(self, model: SplatModel, *, quick: bool = False) -> Scored:
         """Mean and standard deviation over views (of these views: divided by their number) of each figure.
 
         Args:
             model: what is judged.
             quick: PSNR alone.
-
-        Returns:
-            psnr: pooled over views, dB; psnr_mean, psnr_std, ssim, ssim_std, lpips, lpips_std; None where not measured.
         """
-        rasteriser = Rasteriser(gradients=False)
         errors, alike, distances = list[float](), list[float](), list[float]()
-        for camera, wanted in zip(self.cameras, self.wanted, strict=True):
-            drawn = rasteriser.forward(model, camera, background=self.background, antialiased=model.antialiased).rgb
-            picture = np.clip(drawn, 0.0, 1.0)
+        for picture, wanted in zip(_pictures(model, self.cameras, self.background), self.wanted, strict=True):
             errors.append(float(np.mean(squared_error(wanted, picture))))
             if not quick:
                 alike.append(ssim(wanted, picture))
                 if self.lpips is not None:
                     distances.append(self.lpips(wanted, picture))
         mean, std = _spread([psnr_of_mse(error) for error in errors])
-        scores = {"views": len(errors), "psnr": psnr_of_mse(math.fsum(errors) / len(errors))}
-        scores |= {"psnr_mean": mean, "psnr_std": std}
-        for name, values in (("ssim", alike), ("lpips", distances)):
-            scores[name], scores[f"{name}_std"] = _spread(values) if values else (None, None)
-        return scores
+        (alike_mean, alike_std), (distance, distance_std) = _spread(alike), _spread(distances)
+        assert mean is not None
+        assert std is not None
+        return {
+            "views": len(errors),
+            "psnr": psnr_of_mse(math.fsum(errors) / len(errors)),
+            "psnr_mean": mean,
+            "psnr_std": std,
+            "ssim": alike_mean,
+            "ssim_std": alike_std,
+            "lpips": distance,
+            "lpips_std": distance_std,
+        }
 
 
 def renders_at(
     model: SplatModel, cameras: Sequence[Camera], background: tuple[float, float, float], lpips: Distance | None
 ) -> Views:
     """Views of a scene itself: whoever is judged by them is compared with it."""
-    rasteriser = Rasteriser(gradients=False)
-    wanted = [
-        np.clip(rasteriser.forward(model, one, background=background, antialiased=model.antialiased).rgb, 0.0, 1.0)
-        for one in cameras
-    ]
-    return Views(cameras, wanted, background, lpips)
+    return Views(cameras, list(_pictures(model, cameras, background)), background, lpips)
 
 
-def _spread(values: Sequence[float]) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values))
+def _pictures(model: SplatModel, cameras: Sequence[Camera], background: tuple[float, float, float]) -> Iterator[F32]:
+    draw = renderer(model, background)
+    return (np.clip(draw(camera).rgb, 0.0, 1.0) for camera in cameras)
+
+
+def _spread(values: Sequence[float]) -> tuple[float | None, float | None]:
+    return (float(np.mean(values)), float(np.std(values))) if values else (None, None)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from printing import laid_out
+from csplat_bench.common.report import Table, laid_out, optional
+from csplat_bench.study.records import Facts, Measured, Results
 
 __all__ = ["MIB", "PUBLISHED", "Published", "tables"]
-
-Results = dict[str, dict[str, Any]]
 
 MIB = 1 << 20
 
@@ -53,7 +52,7 @@ def tables(results: Results, *, markdown: bool = False) -> str:
     """Everything that is known, scene by scene.
 
     Args:
-        results: by name of the scene, what `study.py` keeps.
+        results: by name of the scene, what is kept of it.
         markdown: as documents have tables.
     """
     parts = []
@@ -63,24 +62,22 @@ def tables(results: Results, *, markdown: bool = False) -> str:
         head = f"{name}{how}; {facts['splats']:,} splats, SH {facts['sh_degree']}, judged by {facts['judged_by']}"
         published = PUBLISHED if name == "study1k" else {}
         lines = [_line(key, one["rows"][key], facts, published.get(key)) for key in one["order"]]
-        header: list[str] = list(_HEADER)
+        header = list(_HEADER)
         if published:
             header[1:7] = [f"{title} (published)" for title in _HEADER[1:7]]
-        parts.append(f"{head}\n\n{laid_out(header, lines, markdown=markdown)}")
-    parts.append(_books(results, markdown=markdown))
-    parts.append(_times(results, markdown=markdown))
-    return "\n\n".join(part for part in parts if part)
+        parts.append(Table(header, lines, head))
+    return laid_out([*parts, _books(results), _times(results)], markdown=markdown)
 
 
-def _line(key: str, row: dict[str, Any], facts: dict[str, Any], published: Published | None) -> list[str]:
+def _line(key: str, row: Measured, facts: Facts, published: Published | None) -> list[str]:
     decoded = row["how"]["decoded"]
     cells = [
         f"{row['splats']:,}",
         "–" if decoded else f"{row['study_bytes'] / MIB:.4f}",
         "–" if decoded else f"{facts['bytes'] / row['study_bytes']:.2f}×",
         _with_std(row["psnr_mean"], row["psnr_std"]),
-        f"{row['ssim']:.4f}",
-        "–" if row["lpips"] is None else f"{row['lpips']:.4f}",
+        optional(row["ssim"], ".4f", "–"),
+        optional(row["lpips"], ".4f", "–"),
     ]
     if published is not None:
         theirs = (
@@ -97,7 +94,7 @@ def _with_std(mean: float, std: float) -> str:
     return f"{mean:.2f} ± {std:.2f}"
 
 
-def _books(results: Results, *, markdown: bool) -> str:
+def _books(results: Results) -> Table:
     """Entries of each codebook, as they came to be."""
     lines = []
     for name, one in results.items():
@@ -106,11 +103,7 @@ def _books(results: Results, *, markdown: bool) -> str:
             if books:
                 sizes = ", ".join(f"{attribute} {_entries(book)}" for attribute, book in sorted(books.items()))
                 lines.append((name, key, sizes))
-    if not lines:
-        return ""
-    return "Codebooks: entries (share of the variance that is lost)\n\n" + laid_out(
-        ("", "row", "entries"), lines, markdown=markdown
-    )
+    return Table(("", "row", "entries"), lines, "Codebooks: entries (share of the variance that is lost)")
 
 
 def _entries(book: dict[str, Any]) -> str:
@@ -118,18 +111,15 @@ def _entries(book: dict[str, Any]) -> str:
     return f"{sizes} ({book['error_share']:.2g})"
 
 
-def _times(results: Results, *, markdown: bool) -> str:
+def _times(results: Results) -> Table:
     lines, total = list[tuple[str, ...]](), 0.0
     for name, one in results.items():
-        trained = (
-            None if "@" in name else one["facts"]["training_seconds"]
-        )  # renders are of a scene that counts already
+        # Renders are of a scene that counts already.
+        trained = None if "@" in name else one["facts"]["training_seconds"]
         spent = sum(row["seconds"] for row in one["rows"].values())
         total += spent + (trained if trained is not None and name.startswith("study1k") else 0.0)
         each = spent / max(1, len(one["rows"]))
-        lines.append((name, "–" if trained is None else f"{trained:.0f}", f"{spent:.0f}", f"{each:.1f}"))
-    if not lines:
-        return ""
-    table = laid_out(("", "training, s", "rows, s", "s per row"), lines, markdown=markdown)
+        lines.append((name, optional(trained, ".0f", "–"), f"{spent:.0f}", f"{each:.1f}"))
     title = f"Time (published: {_PUBLISHED_MINUTES}): {total / 60:.1f} minutes in all"
-    return f"{title}, without the training of scenes that were trained for another benchmark\n\n{table}"
+    without = "without the training of scenes that were trained for another benchmark"
+    return Table(("", "training, s", "rows, s", "s per row"), lines, f"{title}, {without}")

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import Literal, TypedDict
 
-from printing import laid_out
+from csplat_bench.common.report import Table, laid_out
+from csplat_bench.study.records import Known, Results
 
 __all__ = ["CLAIMS", "claims", "format_claims"]
 
-Results = dict[str, dict[str, Any]]
-Numbers = dict[str, Any]
+#: What is looked up by title, and under `holds` whether the claim does.
+Numbers = dict[str, float]
+
+
+class Claim(TypedDict):
+    """Where a claim holds, in words, and what was looked up, by scene."""
+
+    holds_where: str
+    scenes: dict[str, Numbers]
+
 
 #: Decibels against photographs that count as nothing.
 FREE_DB = 0.1
@@ -31,52 +39,42 @@ CLAIMS = {
 }
 
 
-def claims(results: Results) -> dict[str, Any]:
-    """Look every claim up.
-
-    Args:
-        results: by name of the scene, what `study.py` keeps.
-
-    Returns:
-        By claim, `holds_where` in words and `scenes`: by scene the numbers, and `holds`.
-    """
-    looked_up: dict[str, Callable[[dict[str, Any]], Numbers | None]] = dict(
-        zip(CLAIMS, (_sh_free, _most_gone, _more_is_free, _best_ratio, _kmeans_fails, _sh_first), strict=True)
-    )
-    found: dict[str, Any] = {}
-    for claim, look in looked_up.items():
+def claims(results: Results) -> dict[str, Claim]:
+    """Look every claim up."""
+    looks = (_sh_free, _most_gone, _more_is_free, _best_ratio, _kmeans_fails, _sh_first)
+    found: dict[str, Claim] = {}
+    for (claim, holds_where), look in zip(CLAIMS.items(), looks, strict=True):
         scenes = {name: look(one) for name, one in results.items() if "baseline" in one["rows"]}
-        found[claim] = {
-            "holds_where": CLAIMS[claim],
-            "scenes": {name: numbers for name, numbers in scenes.items() if numbers is not None},
-        }
+        known = {name: numbers for name, numbers in scenes.items() if numbers is not None}
+        found[claim] = {"holds_where": holds_where, "scenes": known}
     return found
 
 
-def format_claims(found: dict[str, Any], *, markdown: bool = False) -> str:
+def format_claims(found: dict[str, Claim], *, markdown: bool = False) -> str:
     """A table for each claim, or two: scenes with photographs have other figures than those without."""
-    parts = []
+    parts: list[Table] = []
     for claim, one in found.items():
         kinds: dict[tuple[str, ...], list[list[str]]] = {}
         for name, numbers in one["scenes"].items():
             titles = tuple(title for title in numbers if title != "holds")
             line = [name, *(_shown(numbers[title]) for title in titles), "yes" if numbers["holds"] else "no"]
             kinds.setdefault(titles, []).append(line)
-        tables = [laid_out(("", *titles, "holds"), lines, markdown=markdown) for titles, lines in kinds.items()]
-        if tables:
-            parts.append("\n\n".join([f"Claim: {claim} (holds where: {one['holds_where']})", *tables]))
-    return "\n\n".join(parts)
+        title = f"Claim: {claim} (holds where: {one['holds_where']})"
+        for titles, lines in kinds.items():
+            parts.append(Table(("", *titles, "holds"), lines, title))
+            title = ""
+    return laid_out(parts, markdown=markdown)
 
 
 def _shown(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1.0 else f"{value:.2f}"
 
 
-def _by_photographs(one: dict[str, Any]) -> bool:
+def _by_photographs(one: Known) -> bool:
     return "photographs" in one["facts"]["judged_by"]
 
 
-def _loss(one: dict[str, Any], name: str) -> tuple[str, float]:
+def _loss(one: Known, name: str) -> tuple[str, float]:
     """What a row costs, and how to call it: decibels against photographs, or PSNR against the source."""
     row = one["rows"][name]
     if _by_photographs(one):
@@ -84,32 +82,34 @@ def _loss(one: dict[str, Any], name: str) -> tuple[str, float]:
     return "PSNR", float(row["psnr_mean"])
 
 
-def _is_free(one: dict[str, Any], name: str) -> bool:
+def _is_free(one: Known, name: str) -> bool:
     _, value = _loss(one, name)
     return value <= FREE_DB if _by_photographs(one) else value >= FREE_PSNR
 
 
-def _has(one: dict[str, Any], *names: str) -> bool:
+def _has(one: Known, *names: str) -> bool:
     return all(name in one["rows"] for name in names)
 
 
-def _named(one: dict[str, Any], name: str, word: str) -> Numbers:
+def _named(one: Known, name: str, word: str) -> Numbers:
     title, value = _loss(one, name)
     return {f"{word}: {title}": value}
 
 
-def _sh_free(one: dict[str, Any]) -> Numbers | None:
+def _sh_free(one: Known) -> Numbers | None:
     if not _has(one, "SH 0", "SH 0 distilled"):
         return None
     rows = one["rows"]
     numbers = {**_named(one, "SH 0", "truncated"), **_named(one, "SH 0 distilled", "distilled")}
-    for score in ("ssim", "lpips"):
-        if rows["SH 0"][score] is not None:
-            numbers[f"{score.upper()} lost"] = abs(rows["baseline"][score] - rows["SH 0"][score])
+    scores: tuple[Literal["ssim", "lpips"], ...] = ("ssim", "lpips")
+    for score in scores:
+        before, after = rows["baseline"][score], rows["SH 0"][score]
+        if before is not None and after is not None:
+            numbers[f"{score.upper()} lost"] = abs(before - after)
     return {**numbers, "holds": _is_free(one, "SH 0")}
 
 
-def _most_gone(one: dict[str, Any]) -> Numbers | None:
+def _most_gone(one: Known) -> Numbers | None:
     if not _has(one, "SH 0, τ 0.005"):
         return None
     gone = {
@@ -119,7 +119,7 @@ def _most_gone(one: dict[str, Any]) -> Numbers | None:
     return {**gone, "holds": gone["% gone at 0.005"] > 100.0 * _MOST_GONE}
 
 
-def _more_is_free(one: dict[str, Any]) -> Numbers | None:
+def _more_is_free(one: Known) -> Numbers | None:
     if not _has(one, "SH 0, τ 0.005"):
         return None
     before = "SH 0" if _has(one, "SH 0") else "baseline"
@@ -131,7 +131,7 @@ def _more_is_free(one: dict[str, Any]) -> Numbers | None:
     return {**numbers, "holds": more <= FREE_DB or unseen}
 
 
-def _best_ratio(one: dict[str, Any]) -> Numbers | None:
+def _best_ratio(one: Known) -> Numbers | None:
     names = [name for name in ("SH 0", "SH 0, τ 0.005", "SH 0, τ 0.02", "k-means") if _has(one, name)]
     if "SH 0, τ 0.02" not in names or "k-means" not in names:
         return None
@@ -146,7 +146,7 @@ def _best_ratio(one: dict[str, Any]) -> Numbers | None:
     return {**numbers, "holds": ratios["SH 0, τ 0.02"] == max(ratios.values())}
 
 
-def _kmeans_fails(one: dict[str, Any]) -> Numbers | None:
+def _kmeans_fails(one: Known) -> Numbers | None:
     if not _has(one, "k-means", "τ 0.02", "τ 0.02, k-means"):
         return None
     numbers = _named(one, "k-means", "alone")
@@ -156,7 +156,7 @@ def _kmeans_fails(one: dict[str, Any]) -> Numbers | None:
     return {**numbers, "holds": value > _FAILS_DB if _by_photographs(one) else value < FREE_PSNR}
 
 
-def _sh_first(one: dict[str, Any]) -> Numbers | None:
+def _sh_first(one: Known) -> Numbers | None:
     """SH 0 beside steps that leave SH alone: the share of the bytes that each takes away, and what it costs."""
     if not _has(one, "SH 0"):
         return None

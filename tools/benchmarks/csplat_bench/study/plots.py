@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from study_tables import MIB, PUBLISHED
+from csplat_bench.common.plots import new_figure, save_svg
+from csplat_bench.study.records import Known, Measured, Results
+from csplat_bench.study.tables import MIB, PUBLISHED
 
-from csplat.files import atomic_writer
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["draw"]
-
-Results = dict[str, dict[str, Any]]
 
 # Okabe and Ito's colours, which differ for everyone.
 _ORANGE, _SKY, _GREEN, _YELLOW, _BLUE, _RED, _PINK, _BLACK = (
@@ -34,7 +34,7 @@ def draw(results: Results, folder: Path) -> list[Path]:
     """Draw what is known; return the files.
 
     Args:
-        results: by name of the scene, what `study.py` keeps.
+        results: by name of the scene, what is kept of it.
         folder: where they go, as SVG.
     """
     known = {name: one for name, one in results.items() if "baseline" in one["rows"]}
@@ -42,43 +42,22 @@ def draw(results: Results, folder: Path) -> list[Path]:
     for name, plot in (("sh", _draw_sh), ("pruning", _draw_pruning), ("attributes", _draw_attributes)):
         figure = plot(known)
         if figure is not None:
-            drawn.append(_saved(figure, folder / f"{name}.svg"))
+            drawn.append(save_svg(figure, folder / f"{name}.svg"))
     return drawn
 
 
-def _figure(height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _saved(figure: Any, path: Path) -> Path:
-    """Write an SVG that depends on nothing but what it shows."""
-    from matplotlib import rc_context
-
-    buffer = io.BytesIO()
-    with rc_context({"svg.hashsalt": path.stem}):
-        figure.savefig(buffer, format="svg", dpi=100, metadata={"Date": None})
-    with atomic_writer(path) as stream:
-        stream.write(b"\n".join(line.rstrip() for line in buffer.getvalue().split(b"\n")))
-    return path
-
-
-def _draw_sh(known: Results) -> Any:
+def _draw_sh(results: Results) -> Figure | None:
     """SH 1 against SH 0 on four figures: as published, and for our baselines."""
     ways = {
         "SH 1": ("baseline", _BLUE),
         "SH 0, truncated": ("SH 0", _ORANGE),
         "SH 0, distilled": ("SH 0 distilled", _GREEN),
     }
-    ours = {name: one for name, one in known.items() if name.startswith("study1k") and one["facts"]["sh_degree"] == 1}
+    ours = {name: one for name, one in results.items() if name.startswith("study1k") and one["facts"]["sh_degree"] == 1}
     if not any("SH 0" in one["rows"] for one in ours.values()):
         return None
-    figure = _figure(3.6)
-    panels: dict[str, Callable[[dict[str, Any]], float | None]] = {
+    figure = new_figure(_WIDTH, 3.6)
+    panels: dict[str, Callable[[Measured], float | None]] = {
         "PSNR, dB": lambda row: row["psnr_mean"],
         "SSIM": lambda row: row["ssim"],
         "LPIPS (less is better)": lambda row: row["lpips"],
@@ -92,14 +71,19 @@ def _draw_sh(known: Results) -> Any:
                 _published(row, title),
                 *(value(one["rows"][row]) if row in one["rows"] else None for one in ours.values()),
             ]
-            places = [place for place, height in enumerate(heights) if height is not None]
+            known = {place: height for place, height in enumerate(heights) if height is not None}
             spans = None
             if number == 0:
-                spans = [_spread(row, None if not place else ours[scenes[place]]) for place in places]
+                spans = [_spread(row, None if not place else ours[scenes[place]]) for place in known]
             axes.bar(
-                [place + 0.27 * (offset - 1) for place in places], [heights[place] for place in places], 0.25,
-                color=colour, label=label, yerr=spans, error_kw={"elinewidth": 0.8},
-            )  # fmt: skip
+                [place + 0.27 * (offset - 1) for place in known],
+                list(known.values()),
+                0.25,
+                color=colour,
+                label=label,
+                yerr=spans,
+                error_kw={"elinewidth": 0.8},
+            )
         axes.set_title(title, fontsize=9)
         axes.set_xticks(range(len(scenes)), [_short(name) for name in scenes], rotation=60, ha="right", fontsize=8)
         axes.tick_params(axis="y", labelsize=8)
@@ -116,7 +100,7 @@ def _published(row: str, title: str) -> float | None:
     return {"PSNR, dB": one.psnr, "SSIM": one.ssim, "MiB of float32": one.mib}.get(title, one.lpips)
 
 
-def _spread(row: str, one: dict[str, Any] | None) -> float:
+def _spread(row: str, one: Known | None) -> float:
     return float(PUBLISHED[row].psnr_std if one is None else one["rows"][row]["psnr_std"])
 
 
@@ -124,17 +108,22 @@ def _short(name: str) -> str:
     return "study1k" if name == "study1k" else name.removeprefix("study1k-")
 
 
-def _draw_pruning(known: Results) -> Any:
+def _draw_pruning(known: Results) -> Figure | None:
     """Survivors by threshold; what that costs against photographs; how far it is from the source."""
     scenes = {name: one for name, one in known.items() if one.get("taus", {}).get("all") and name not in _SAME}
     if not scenes:
         return None
-    figure = _figure(4.0)
+    figure = new_figure(_WIDTH, 4.0)
     left, middle, right = (figure.add_subplot(1, 3, number + 1) for number in range(3))
     colours = (_BLUE, _ORANGE, _GREEN, _RED, _PINK, _SKY, _BLACK, "0.5", "#8B5A2B", _YELLOW)
     for number, (name, one) in enumerate(scenes.items()):
         taus = one["taus"]["all"]
-        style = {"color": colours[number % 10], "marker": _MARKERS[number % 10], "markersize": 4, "linewidth": 1.2}
+        style: dict[str, Any] = {
+            "color": colours[number % 10],
+            "marker": _MARKERS[number % 10],
+            "markersize": 4,
+            "linewidth": 1.2,
+        }
         x = [point["tau"] for point in taus]
         left.plot(x, [100.0 * point["splats"] / one["facts"]["splats"] for point in taus], label=name, **style)
         if "photographs" in one["facts"]["judged_by"]:
@@ -158,7 +147,7 @@ def _draw_pruning(known: Results) -> Any:
     return figure
 
 
-def _draw_attributes(known: Results) -> Any:
+def _draw_attributes(known: Results) -> Figure | None:
     """Bytes per source splat by attribute, of three files of each scene."""
     scenes = {
         name: one["attributes"]["all"]
@@ -173,7 +162,7 @@ def _draw_attributes(known: Results) -> Any:
         for kind in sizes
         if kind != "float32"
     ]
-    figure = _figure(0.9 + 0.2 * len(bars))
+    figure = new_figure(_WIDTH, 0.9 + 0.2 * len(bars))
     axes = figure.add_subplot()
     ends = [0.0] * len(bars)
     for attribute, colour in _PARTS.items():

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from compression_scenes import SCENES, Scene, trained
-from scenes import DATA, ROOT
-from study_judge import Distance, Views, renders_at
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat_bench.common.captures import CAPTURES, Capture, Training, trained
+from csplat_bench.common.scenes import DATA, OUT, cameras_of
+from csplat_bench.study.judge import Distance, Views, renders_at
 from csplat_render import Camera
-from csplat_render.cameras import load_cameras
-from csplat_tools.views import DataOptions, comparison_cameras, find_view_set
+from csplat_tools.views import BLACK, DataOptions, find_view_set
 from csplat_trainer.options import TrainOptions
 
 __all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "larger", "open_subject"]
 
-Colour = tuple[float, float, float]
-Tell = Callable[[str], object]
-
-_BLACK = (0.0, 0.0, 0.0)
 _LPIPS_WEIGHT = 0.1
 
 #: What the published study trains, and variants of it, by name: how each differs.
@@ -66,13 +60,13 @@ class Subject:
     name: str
     source: SplatModel
     ply: Path
-    training: dict[str, Any]
+    training: Training
     views: Views
     teachers: Sequence[Camera] | None
     judged_by: str
 
 
-def baselines(iterations: int, count: int) -> dict[str, Scene]:
+def baselines(iterations: int, count: int) -> dict[str, Capture]:
     """How the baseline and its variants are trained.
 
     Args:
@@ -89,12 +83,10 @@ def baselines(iterations: int, count: int) -> dict[str, Scene]:
         "study1k-lpips": replace(plain, lpips_weight=_LPIPS_WEIGHT),
     }
     data = DATA / "images" / "lego200"
-    return {name: Scene(name, data, (200, 200), training=options) for name, options in how.items()}
+    return {name: Capture(name, data, (200, 200), training=options) for name, options in how.items()}
 
 
-def open_subject(
-    name: str, known: dict[str, Scene], out: Path, lpips: Distance | None, tell: Tell, views: int = 0
-) -> Subject:
+def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Distance | None, views: int = 0) -> Subject:
     """Find a scene, train it where it has to be trained, and read what it is judged by.
 
     Args:
@@ -102,7 +94,6 @@ def open_subject(
         known: by name, how the baselines are trained.
         out: folder of the scenes that are trained for the study; others lie where the compression benchmark has them.
         lpips: measures the perceptual distance.
-        tell: gets lines for the user.
         views: test views at most, evenly spread; 0: all.
 
     Raises:
@@ -112,12 +103,11 @@ def open_subject(
         return _by_itself(name, lpips)
     if name == "study1k-lpips" and importlib.util.find_spec("torch") is None:
         raise InputError(f"{name}: a loss with LPIPS needs torch (pip install csplat[train])")
-    scene = known[name] if name in known else SCENES[name]
-    folder = out if name in known else ROOT / "out" / "compression"
+    scene = known[name] if name in known else CAPTURES[name]
+    folder = out if name in known else OUT / "compression"
     if not scene.data.exists():
         raise InputError(f"{name}: {scene.data} does not exist")
-    folder.mkdir(parents=True, exist_ok=True)
-    ply, training = trained(scene, folder, tell)
+    ply, training = trained(scene, folder)
     source = read_ply(ply)
     found = find_view_set(source, data=DataOptions(str(scene.data), scene.size), background=scene.background, aside=0)
     judge, teachers = found.photograph_judge(), list(found.teaches)
@@ -149,9 +139,8 @@ def _by_itself(name: str, lpips: Distance | None) -> Subject:
     if not ply.exists():
         raise InputError(f"{name}: {ply} does not exist")
     source = read_ply(ply)
-    listed = DATA / "psnr_cameras" / f"{name}.json"
-    cameras = load_cameras(listed) if listed.exists() else comparison_cameras(source)
-    views = renders_at(source, cameras, _BLACK, lpips)
+    cameras = cameras_of(name, source)
+    views = renders_at(source, cameras, BLACK, lpips)
     return Subject(name, source, ply, {}, views, None, f"{len(cameras)} virtual views of the source itself")
 
 
