@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("numba", reason="the study wants the extra [render]")
 pytest.importorskip("scipy", reason="data sets want the extra [render]")
 pytest.importorskip("matplotlib", reason="plots want the extra [render]")
-Image = pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
 from captures import cameras, photograph, shell
 

@@ -16,8 +16,8 @@ from csplat.errors import CsplatError
 from csplat_tools.files.console import note as tell
 
 __all__ = [
-    "AGAIN", "CACHE", "EXTRA", "JSON", "LPIPS", "MARKDOWN", "OUT", "PEERS", "PRESETS", "SCENES", "THREADS", "VIEWS",
-    "WrongWords", "listed", "numbers", "run", "tell",
+    "AGAIN", "CACHE", "EXTRA", "JSON", "LPIPS", "MARKDOWN", "OUT", "PEERS", "PRESETS", "SCENES", "TABLES", "THREADS",
+    "VIEWS", "WrongWords", "listed", "numbers", "run", "tell",
 ]  # fmt: skip
 
 T = TypeVar("T")
@@ -30,6 +30,7 @@ JSON = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write
 OUT = Annotated[Path, typer.Option(help="folder where what was measured is kept")]
 CACHE = Annotated[Path, typer.Option(help="folder for made scenes and files")]
 PEERS = Annotated[Path, typer.Option(help="folder for npm packages")]
+TABLES = Annotated[bool, typer.Option("--tables", help="measure nothing, print what is known")]
 AGAIN = Annotated[bool, typer.Option("--again", help="forget what was measured of these scenes")]
 THREADS = Annotated[int | None, typer.Option(help="default: one per core")]
 VIEWS = Annotated[int, typer.Option(help="virtual views at most")]

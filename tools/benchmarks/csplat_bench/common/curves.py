@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 __all__ = ["Point", "Rate", "Series", "bracket", "bytes_between", "front", "psnr_at", "rate_at"]
 
@@ -33,10 +32,6 @@ class Point:
     size_bytes: int
     quality: float = 0.0
     seconds: float = 0.0
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields."""
-        return asdict(self)
 
 
 Series = Mapping[str, Sequence[Point]]  # by what was chosen beside the quality

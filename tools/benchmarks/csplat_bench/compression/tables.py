@@ -118,20 +118,20 @@ def _file_cells(name: str, row: Row, facts: Facts) -> tuple[str, ...]:
 
 def _control(one: Known) -> Table:
     """What as many steps do without quantisers, beside those that tune the file."""
+    facts, main = one["facts"]["scene"], one.get("main", {}).get("main")
     lines = []
-    if "main" in one.get("control", {}):
-        facts, found = one["facts"]["scene"], one["control"]["main"]
-        rows = [("source", facts["splats"] * ply_splat_bytes(3), found["scores"]["source"], "")]
-        if "main" in one.get("main", {}):
-            row = one["main"]["main"]
-            rows.append(("file of the source", row["before_bytes"], row["before"], ""))
+    for found in one.get("control", {}).values():
         steps, scores, seconds = f"{found['steps']} steps on floats", found["scores"], f"{found['seconds']:.1f}"
-        rows.append((steps, found["splats"] * ply_splat_bytes(3), scores["trained on"], seconds))
-        rows.append((f"{steps}, then a file", found["size_bytes"], scores["then a file"], ""))
-        if "main" in one.get("main", {}):
-            tuning = f"{row['seconds']['tuning']:.1f}"
-            rows.append((f"{row['steps']} steps on the file", row["after_bytes"], row["after"], tuning))
-        lines = [(name, *_sizes(size, facts), *_scores(score), spent) for name, size, score, spent in rows]
+        rows = [
+            ("source", facts["splats"] * ply_splat_bytes(3), scores["source"], ""),
+            (steps, found["splats"] * ply_splat_bytes(3), scores["trained on"], seconds),
+            (f"{steps}, then a file", found["size_bytes"], scores["then a file"], ""),
+        ]
+        if main is not None:
+            tuning = f"{main['seconds']['tuning']:.1f}"
+            rows.insert(1, ("file of the source", main["before_bytes"], main["before"], ""))
+            rows.append((f"{main['steps']} steps on the file", main["after_bytes"], main["after"], tuning))
+        lines += [(name, *_sizes(size, facts), *_scores(score), spent) for name, size, score, spent in rows]
     return Table(("", "B/splat", "ratio", *_SCORES, "s"), lines, "Control: as many steps unquantised")
 
 

@@ -187,7 +187,7 @@ def baseline_bytes(source: SplatModel) -> int:
 def _gathered(used: dict[str, int]) -> dict[str, int]:
     """The bands of SH above 0 together."""
     names = {"sh1": "shN", "sh2": "shN", "sh3": "shN"}
-    together = dict.fromkeys(ATTRIBUTES, 0)
+    together: dict[str, int] = dict.fromkeys(ATTRIBUTES, 0)
     for name, size in used.items():
         together[names.get(name, name)] = together.get(names.get(name, name), 0) + size
     return together

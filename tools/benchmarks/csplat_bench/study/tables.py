@@ -62,7 +62,7 @@ def tables(results: Results, *, markdown: bool = False) -> str:
         head = f"{name}{how}; {facts['splats']:,} splats, SH {facts['sh_degree']}, judged by {facts['judged_by']}"
         published = PUBLISHED if name == "study1k" else {}
         lines = [_line(key, one["rows"][key], facts, published.get(key)) for key in one["order"]]
-        header = list(_HEADER)
+        header: list[str] = list(_HEADER)
         if published:
             header[1:7] = [f"{title} (published)" for title in _HEADER[1:7]]
         parts.append(Table(header, lines, head))

@@ -1,4 +1,4 @@
-"""The plot of what `distortion.py` measured: a panel per scene, PSNR over bytes per splat."""
+"""The plot of what was measured of curves: a panel per scene, PSNR over bytes per splat."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from distortion_curves import Point, front
-from distortion_tables import FIGURES, Measured
+from csplat_bench.common.curves import Point, front
+from csplat_bench.common.plots import new_figure, save_svg
+from csplat_bench.distortion.known import FIGURES, Measured
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,35 +28,31 @@ def plot(results: Mapping[str, Measured], path: Path) -> None:
 
     Args:
         results: by scene.
-        path: .svg or .png; replaced. The same results give the same bytes.
+        path: an SVG, replaced. The same results give the same bytes.
     """
     drawn = {name: one for name, one in results.items() if one.plain()}
     if not drawn:
         return
-    import matplotlib as mpl
+    from matplotlib import rc_context
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    mpl.rcParams.update({"svg.hashsalt": "csplat", "svg.fonttype": "none", "font.size": 9})  # text stays text: small
     rows = -(-len(drawn) // _COLUMNS)
-    figure, axes = plt.subplots(rows, _COLUMNS, figsize=(7.2, 2.5 * rows + 0.7), squeeze=False)
-    for axis in axes.flat[len(drawn) :]:
-        axis.set_visible(False)
-    for axis, (name, one) in zip(axes.flat, drawn.items(), strict=False):
-        _panel(axis, name, one)
-    entries: dict[str, Any] = {}
-    for axis in axes.flat:
-        handles, labels = axis.get_legend_handles_labels()
-        entries.update(zip(labels, handles, strict=True))
-    order = sorted(entries, key=list(_LEGEND).index)
-    figure.legend(
-        [entries[label] for label in order], [_LEGEND[label] for label in order], loc="upper center", ncols=3,
-        frameon=False, fontsize=8.5,
-    )  # fmt: skip
-    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.5 / (2.5 * rows + 0.7)))
-    figure.savefig(path, dpi=110, metadata={"Date": None} if path.suffix == ".svg" else None)
-    plt.close(figure)
+    with rc_context({"svg.fonttype": "none", "font.size": 9}):  # text stays text: small
+        figure = new_figure(7.2, 2.5 * rows + 0.7)
+        axes = figure.subplots(rows, _COLUMNS, squeeze=False)
+        for axis in axes.flat[len(drawn) :]:
+            axis.set_visible(False)
+        for axis, (name, one) in zip(axes.flat, drawn.items(), strict=False):
+            _panel(axis, name, one)
+        entries: dict[str, Any] = {}
+        for axis in axes.flat:
+            handles, labels = axis.get_legend_handles_labels()
+            entries.update(zip(labels, handles, strict=True))
+        labels = sorted(entries, key=list(_LEGEND).index)
+        figure.legend(
+            [entries[label] for label in labels], [_LEGEND[label] for label in labels], loc="outside upper center",
+            ncols=3, frameon=False, fontsize=8.5,
+        )  # fmt: skip
+        save_svg(figure, path)
 
 
 _LEGEND = {

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dataset_protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
-
 from csplat.errors import InputError
+from csplat_bench.common.command import listed, tell
+from csplat_bench.datasets.protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import Found
 from csplat_trainer.data.pixels import image_size
@@ -66,12 +66,10 @@ class PictureChoice:
     remarks: tuple[str, ...] = ()
 
 
-def find_scene_folders(root: Path, warn: Callable[[str], object]) -> list[SceneFolder]:
-    """Find all scenes that the trainer's readers recognise, in `root` itself or some folders below.
+def find_scene_folders(root: Path) -> list[SceneFolder]:
+    """Find all scenes that the trainer's readers recognise, in a folder itself or some folders below.
 
-    Args:
-        root: a folder.
-        warn: told what looks like a scene and is none.
+    What looks like a scene and is none is told of.
 
     Returns:
         Scenes of the benchmark sets first, in the order of their tables.
@@ -81,8 +79,7 @@ def find_scene_folders(root: Path, warn: Callable[[str], object]) -> list[SceneF
     """
     if not root.is_dir():
         raise InputError(f"{root} is not a folder")
-    found: list[SceneFolder] = []
-    _walk(root, _DEPTH, found, warn)
+    found = list(_walk(root, _DEPTH))
     if not found:
         raise InputError(
             f"no data set in {root}: wanted folders with sparse/0 beside images, images_2 or images_4 (Mip-NeRF 360, "
@@ -102,7 +99,7 @@ def choose_scenes(found: list[SceneFolder], names: str | None) -> list[SceneFold
     """
     if names is None:
         return found
-    wanted = [name.strip().lower() for name in names.split(",") if name.strip()]
+    wanted = listed(names.lower())
     labels = {one.key: {one.title.lower(), one.scene, one.key.lower()} for one in found}
     for name in wanted:
         if not any(name in own for own in labels.values()):
@@ -140,20 +137,18 @@ def choose_pictures(folder: SceneFolder, size: tuple[int, int] | None, downscale
     return PictureChoice(images, chosen, wanted, tuple(remarks))
 
 
-def _walk(folder: Path, depth: int, found: list[SceneFolder], warn: Callable[[str], object]) -> None:
-    kind = _kind(folder, warn)
+def _walk(folder: Path, depth: int) -> Iterator[SceneFolder]:
+    kind = _kind(folder)
     if kind is not None:
-        found.append(_scene(folder, kind))
-        return
-    if depth == 0:
-        return
-    try:
-        inside = sorted(path for path in folder.iterdir() if path.is_dir() and not _is_part(path.name))
-    except OSError as error:
-        warn(f"{folder} is left out: {error.strerror or error}")
-        return
-    for path in inside:
-        _walk(path, depth - 1, found, warn)
+        yield _scene(folder, kind)
+    elif depth:
+        try:
+            inside = sorted(path for path in folder.iterdir() if path.is_dir() and not _is_part(path.name))
+        except OSError as error:
+            tell(f"{folder} is left out: {error.strerror or error}")
+            return
+        for path in inside:
+            yield from _walk(path, depth - 1)
 
 
 def _is_part(name: str) -> bool:
@@ -161,7 +156,7 @@ def _is_part(name: str) -> bool:
     return name.startswith(".") or name in ("sparse", "colmap", "distorted")
 
 
-def _kind(folder: Path, warn: Callable[[str], object]) -> str | None:
+def _kind(folder: Path) -> str | None:
     """How a folder is laid out, in the order in which `csplat_trainer.data.load` looks; `None`: no scene."""
     if (folder / "transforms_train.json").is_file():
         return BLENDER
@@ -171,7 +166,7 @@ def _kind(folder: Path, warn: Callable[[str], object]) -> str | None:
         return None
     if any(path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name) for path in folder.iterdir()):
         return COLMAP
-    warn(f"{folder} is left out: a COLMAP model without a folder of pictures")
+    tell(f"{folder} is left out: a COLMAP model without a folder of pictures")
     return None
 
 

@@ -1,24 +1,60 @@
-"""Tables of what `targets.py` measured: two builds at equal PSNR, files that others beat, and means."""
+"""Tables of what was measured of targets: two builds at equal PSNR, files that others beat, and means."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
-from distortion_curves import Point, bytes_between
-from printing import laid_out
+from csplat_bench.common.curves import Point, bytes_between
+from csplat_bench.common.report import Table, laid_out
 
-__all__ = ["Ratio", "at_equal_psnr", "dominated", "kind_of", "tables"]
+__all__ = ["Build", "File", "Known", "Ratio", "at_equal_psnr", "dominated", "kind_of", "tables"]
 
 _BUILDS = ("before", "now")
 _BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs, where no two files say it
 _SMALLER, _BETTER = 0.01, 0.1  # share of the bytes, and dB, by which one file beats another
 _GUESSED = "≈ "  # before what they say
 
-Rows = Mapping[str, Mapping[str, Any]]
-Known = Mapping[str, Mapping[str, Any]]
+
+class File(TypedDict, total=False):
+    """A file; or why there is none, and how long that took to find out.
+
+    Attributes:
+        psnr: by cameras that no search knows, dB. stated: by the command.
+        all_splats: whether every splat of the source had to be there.
+        machine: where another one than that of the build measured it.
+    """
+
+    bytes: int
+    splats: int
+    psnr: float
+    stated: float | None
+    seconds: float
+    all_splats: bool
+    error: str
+    machine: str
+
+
+class Build(TypedDict):
+    """What a build of the program made, by name."""
+
+    machine: str
+    rows: dict[str, File]
+
+
+class Known(TypedDict, total=False):
+    """A scene, and by their names what builds made of it."""
+
+    splats: int
+    sh_degree: int
+    ply_bytes: int
+    builds: dict[str, Build]
+
+
+Rows = Mapping[str, File]
+Results = Mapping[str, Known]
 
 
 @dataclass(frozen=True)
@@ -34,15 +70,15 @@ class Ratio:
     guessed: bool = False
 
 
-def tables(known: Known, *, markdown: bool) -> str:
+def tables(known: Results, *, markdown: bool) -> str:
     """Everything that is known, as text.
 
     Args:
-        known: by scene, what `targets.py` keeps of it.
+        known: by scene.
         markdown: as a guide has it.
     """
-    every = (_bytes_tables, _seconds_tables, _means_table, _dominated_table, _failed_table)
-    return "\n\n".join(part for part in (table(known, markdown=markdown) for table in every) if part)
+    parts = [*_bytes_tables(known), *_seconds_tables(known), _means_table(known)]
+    return laid_out([*parts, _dominated_table(known), _failed_table(known)], markdown=markdown)
 
 
 def kind_of(name: str) -> str:
@@ -95,7 +131,7 @@ def dominated(rows: Rows) -> dict[str, str]:
     return found
 
 
-def _bytes_tables(known: Known, *, markdown: bool) -> str:
+def _bytes_tables(known: Results) -> list[Table | str]:
     """Of each kind of target a table of bytes, PSNRs and ratios, scenes by numbers."""
 
     def cell(before: Rows, now: Rows, name: str) -> str:
@@ -104,50 +140,48 @@ def _bytes_tables(known: Known, *, markdown: bool) -> str:
         share = "" if ratio is None else f", {_GUESSED * ratio.guessed}{ratio.value:.3f}"
         return sizes + _said(now, name, lambda row: f" at {row['psnr']:.2f}", none="") + share
 
-    title = "kB before → now at dB now, and the share of the bytes before at the same dB"
-    text = _by_kind(known, title, cell, markdown=markdown)
-    if _GUESSED in text:
-        text += f"\n\n{_GUESSED}by {100.0 * _BYTES_PER_DB:g} % of the bytes per dB: files of now lie on one side only."
-    return text
+    parts = _by_kind(known, "kB before → now at dB now, and the share of the bytes before at the same dB", cell)
+    guessed = any(_GUESSED in str(part.rows) for part in parts)
+    by = f"{_GUESSED}by {100.0 * _BYTES_PER_DB:g} % of the bytes per dB: files of now lie on one side only."
+    return [*parts, by if guessed else ""]
 
 
-def _seconds_tables(known: Known, *, markdown: bool) -> str:
+def _seconds_tables(known: Results) -> list[Table]:
     """The same of seconds."""
 
     def cell(before: Rows, now: Rows, name: str) -> str:
         return " → ".join(_said(rows, name, lambda row: f"{row['seconds']:.0f}") for rows in (before, now))
 
-    return _by_kind(known, "seconds before → now", cell, markdown=markdown)
+    return _by_kind(known, "seconds before → now", cell)
 
 
-def _by_kind(known: Known, title: str, cell: Callable[[Rows, Rows, str], str], *, markdown: bool) -> str:
+def _by_kind(known: Results, title: str, cell: Callable[[Rows, Rows, str], str]) -> list[Table]:
     """A table for each kind of row that has a number, with a line for each scene."""
     builds = {scene: tuple(_rows(one, build) for build in _BUILDS) for scene, one in known.items()}
     names = dict.fromkeys(name for pair in builds.values() for rows in pair for name in rows)
-    texts = []
+    parts = []
     for kind in dict.fromkeys(kind_of(name) for name in names if kind_of(name) != name):
         columns = sorted((name for name in names if kind_of(name) == kind), key=_number)
         lines = [
-            (scene, *(cell(*pair, name) for name in columns))
-            for scene, pair in builds.items()
-            if any(name in rows for name in columns for rows in pair)
+            (scene, *(cell(before, now, name) for name in columns))
+            for scene, (before, now) in builds.items()
+            if any(name in rows for name in columns for rows in (before, now))
         ]
-        header = ("scene", *(f"{_number(name):g}" for name in columns))
-        texts.append(f"{kind}: {title}\n\n{laid_out(header, lines, markdown=markdown)}")
-    return "\n\n".join(texts)
+        parts.append(Table(("scene", *(f"{_number(name):g}" for name in columns)), lines, f"{kind}: {title}"))
+    return parts
 
 
 def _number(name: str) -> float:
     return next(float(word) for word in name.split() if word.replace(".", "", 1).isdigit())
 
 
-def _said(rows: Rows, name: str, say: Callable[[Mapping[str, Any]], str], *, none: str = "-") -> str:
+def _said(rows: Rows, name: str, say: Callable[[File], str], *, none: str = "-") -> str:
     """What is to be said of a file; `none` where there is none."""
     row = dict(_files(rows)).get(name)
     return none if row is None else say(row)
 
 
-def _means_table(known: Known, *, markdown: bool) -> str:
+def _means_table(known: Results) -> Table:
     """Geometric means over scenes of what was measured twice, by kind of row."""
     ratios, seconds = dict[str, list[float]](), dict[str, list[tuple[float, float]]]()
     for one in known.values():
@@ -165,10 +199,10 @@ def _means_table(known: Known, *, markdown: bool) -> str:
         share = f"{_geometric(ratios[kind]):.3f}"
         lines.append((kind, f"{len(ratios[kind])}", share, f"{earlier:.1f}", f"{later:.1f}", f"{later / earlier:.2f}"))
     header = ("geometric means", "files", "bytes, same dB", "s before", "s now", "now of before")
-    return laid_out(header, lines, markdown=markdown)
+    return Table(header, lines)
 
 
-def _dominated_table(known: Known, *, markdown: bool) -> str:
+def _dominated_table(known: Results) -> Table | str:
     """Results of searches that other files of the same scene and build beat; or that there are none."""
     lines, count = [], 0
     for scene, one in known.items():
@@ -183,10 +217,10 @@ def _dominated_table(known: Known, *, markdown: bool) -> str:
     if count and not lines:
         return f"None of {count} results of searches is beaten by another file of its scene and build."
     header = ("scene", "build", "beaten", "kB", "dB", "by", "kB", "dB")
-    return laid_out(header, lines, markdown=markdown)
+    return Table(header, lines)
 
 
-def _failed_table(known: Known, *, markdown: bool) -> str:
+def _failed_table(known: Results) -> Table:
     """What could not be made, and why."""
     lines = [
         (scene, build, name, row["error"])
@@ -195,19 +229,18 @@ def _failed_table(known: Known, *, markdown: bool) -> str:
         for name, row in _rows(one, build).items()
         if "error" in row
     ]
-    return laid_out(("scene", "build", "not made", "why"), lines, markdown=markdown)
+    return Table(("scene", "build", "not made", "why"), lines)
 
 
-def _beside(name: str, row: Mapping[str, Any]) -> tuple[str, str, str]:
+def _beside(name: str, row: File) -> tuple[str, str, str]:
     return name, f"{row['bytes'] / 1e3:.1f}", f"{row['psnr']:.2f}"
 
 
-def _rows(one: Mapping[str, Any], build: str) -> Rows:
-    rows: Rows = one["builds"].get(build, {}).get("rows", {})
-    return rows
+def _rows(one: Known, build: str) -> Rows:
+    return one["builds"][build]["rows"] if build in one["builds"] else {}
 
 
-def _files(rows: Rows) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _files(rows: Rows) -> Iterator[tuple[str, File]]:
     """Rows of which there is a file."""
     return ((name, row) for name, row in rows.items() if "error" not in row)
 
