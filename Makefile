@@ -46,10 +46,9 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).rendering
-	$(BENCH).rendering.compiling
 	$(BENCH).rendering.removal pass
 	$(BENCH).rendering.removal removal --gone 20,40,60,80
-	$(BIN)/pytest -rP tests/test_render_forward.py tests/test_render_gradients.py
+	$(BIN)/pytest -rP tests/test_render_forward.py tests/test_render_gradients.py tests/test_removal.py
 	$(BENCH).training
 	$(BENCH).viewer
 	$(BENCH).compression

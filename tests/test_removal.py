@@ -71,7 +71,9 @@ def test_the_pass_agrees_on_real_scenes(data_dir, name):
     found = measure_removal(model, [camera], transmittance_min=0.0)
     rows = np.argsort(-found.error)[:400:80]
     expected = removal_exact(model, [camera], rows, transmittance_min=0.0)
-    assert relative(found.error[rows], expected).max() < 1e-4
+    off = relative(found.error[rows], expected).max()
+    print(f"{off:.1e} off taking splats away one by one")
+    assert off < 1e-4
 
 
 def test_finished_pixels_are_all_that_it_leaves_out():

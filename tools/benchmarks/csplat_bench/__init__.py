@@ -1,7 +1,7 @@
 """Benchmarks, in packages by topic: `python -m csplat_bench.TOPIC`, with `--help`.
 
 codec             throughput, memory and size beside other programs; quality, decoders
-rendering         time of a picture and of its gradients; gradients, compiling, removal
+rendering         time of a picture and of its gradients; removal
 training          a step of training, stage by stage; lego
 viewer            culling, sorting, drawing, decoding in JavaScript
 compression       a whole compression of trained scenes, step by step, on held-out photographs

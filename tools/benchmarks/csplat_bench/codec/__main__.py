@@ -12,25 +12,21 @@ of the scene's arrays.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from csplat.decoder import read_header
 from csplat_bench.codec.process import Run, decoded, encoded
 from csplat_bench.common.command import CACHE, JSON, PEERS, PRESETS, SCENES, THREADS, listed, run
 from csplat_bench.common.measuring import Timing, alone, run_timed
-from csplat_bench.common.peers import CAP_SECONDS, Peer, compress_general, find_splat_transform, transform
+from csplat_bench.common.peers import CAP_SECONDS, Peer, find_splat_transform, transform
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
-from csplat_tools.inspect.layout import describe
 
 _SCENES = "sample,lego60k,fox120k,fox60k_noreg,plane3,donut,horse,jacket,fox-1M,donut-1M,fox-4M,donut-4M"
 _LARGE = 2_000_000  # splats: one run, fewer programs
-_ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "sh1", "sh2", "sh3")
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,6 @@ class Measured:
         size_bytes: of the file; 0 where there is none.
         whole: seconds of a whole process; `None` where it did not come through.
         encode, decode: of presets.
-        attribute_bytes: by attribute, of presets.
         remark: why there is no file.
     """
 
@@ -49,7 +44,6 @@ class Measured:
     whole: Timing | None
     encode: Run | None = None
     decode: Run | None = None
-    attribute_bytes: dict[str, int] | None = None
     remark: str = ""
 
 
@@ -73,8 +67,7 @@ def main(
         large = scene.splat_count > _LARGE
         times = 1 if quick or large else runs
         ours = {preset: _measured(scene, preset, times, threads, cache) for preset in listed(presets)}
-        others = [] if no_peers else compress_general(scene, slow=not large)
-        others += [] if command is None else transform(command, scene, cache, times)
+        others = [] if command is None else transform(command, scene, cache, times)
         results[scene.name] = {**ours, **{peer.name: _measured_peer(peer) for peer in others}}
         print(_tables(scene, times, ours, results[scene.name]), flush=True)
     if json is not None:
@@ -91,9 +84,7 @@ def _measured(scene: Scene, preset: str, runs: int, threads: int | None, cache: 
     command = [sys.executable, "-m", "csplat_tools", "encode", str(scene.path), str(output)]
     command += ["--preset", preset, "--force", "--quiet", *(["--threads", str(threads)] if threads else [])]
     whole = run_timed(command, encode_runs, CAP_SECONDS)
-    data = output.read_bytes()
-    attributes = describe(data, read_header(data))["attributes"]
-    return Measured(len(data), whole, encode, decode, {name: one["size_bytes"] for name, one in attributes.items()})
+    return Measured(output.stat().st_size, whole, encode, decode)
 
 
 def _measured_peer(peer: Peer) -> Measured:
@@ -105,16 +96,11 @@ def _tables(scene: Scene, runs: int, ours: dict[str, Measured], every: dict[str,
     title = f"{scene.name}: {count} splats, SH {scene.sh_degree}, PLY {ply / 1e6:.1f} MB, {runs} runs"
     way = ("s", "Msplats/s", "MB/s", "peak/arrays")
     sizes = [(*_size_cells(name, one, count, ply), one.remark) for name, one in every.items()]
-    used = [name for name in _ATTRIBUTES if any(name in (one.attribute_bytes or {}) for one in ours.values())]
     return "\n\n".join(
         (
             f"\n=== {title}",
             table(
                 ("from arrays", "enc s", *way[1:], "dec s", *way[1:]), [_way_cells(*one, count) for one in ours.items()]
-            ),
-            table(
-                ("bytes per splat", *used, "other", "file"),
-                [_attribute_cells(name, one, used, count) for name, one in ours.items()],
             ),
             table(("PLY -> file", "bytes", "B/splat", "times smaller", "wall s", "CPU s", ""), sizes),
         )
@@ -132,13 +118,6 @@ def _way_cells(name: str, one: Measured, count: int) -> list[str]:
         ]
         cells.append(f"{way.growth_bytes / way.array_bytes:.2f}")
     return cells
-
-
-def _attribute_cells(name: str, one: Measured, used: Sequence[str], count: int) -> list[str]:
-    known = one.attribute_bytes or {}
-    sizes = [known.get(attribute, 0) for attribute in used]
-    sizes += [one.size_bytes - sum(sizes), one.size_bytes]
-    return [name, *(f"{size / count:.3f}" for size in sizes)]
 
 
 def _size_cells(name: str, one: Measured, count: int, ply: int) -> list[str]:

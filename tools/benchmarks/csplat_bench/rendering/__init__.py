@@ -1,1 +1,1 @@
-"""What pictures, their gradients, the removal of splats and the first call of anything cost."""
+"""What pictures, their gradients and the removal of splats cost."""

@@ -1,7 +1,7 @@
 """Measure the removal of splats: what is left of a scene, by method; and what the pass costs that says in which order.
 
     python -m csplat_bench.rendering.removal removal --scenes plane3,donut      # PSNR by share removed and method
-    python -m csplat_bench.rendering.removal pass                               # the pass beside a render, and its twin
+    python -m csplat_bench.rendering.removal pass                               # the pass beside a render
     python -m csplat_bench.rendering.removal tables                             # print what was measured
 
 What was measured is kept scene by scene in out/removal/NAME.json: a run that is interrupted goes on where it ended.
@@ -29,11 +29,10 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes, judge_of
-from csplat_render.conventions import TRANSMITTANCE_MIN
 from csplat_render.judge import Judge, Look, renderer
 from csplat_render.rasterise import Rasteriser
 from csplat_render.refit import ColourOperator
-from csplat_render.removal import measure_removal, removal_exact
+from csplat_render.removal import measure_removal
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.simplify.colours import fit
 from csplat_tools.optimise.simplify.order import removal_order
@@ -43,7 +42,6 @@ from csplat_tools.views.agreeing import find_views
 _SCENES = "plane3,lego60k,fox120k,fox60k_noreg,donut,jacket,statue"
 _METHODS = ("opacity", "opacity-area", "exact", "rounds")
 _PASS_VIEWS = 24
-_TWIN_SPLATS, _TWIN_ROWS = 3000, 40  # of a thinned scene; those that are removed one by one
 
 
 class Part(StrEnum):
@@ -90,8 +88,7 @@ def main(
         for scene in find_scenes(listed(scenes), extra=extra):
             source, kept = read_ply(scene.path), Kept(out / f"{scene.name}.json")
             if what == Part.passes:
-                kept.measure("pass", "seconds", partial(_pass_seconds, source))
-                kept.measure("pass", "twin", partial(_off_the_twin, source))
+                kept.measure("pass", "milliseconds", partial(_pass_milliseconds, source))
                 continue
             bench = _Bench(source, judge_of(scene.name, source), SimplifyOptions(views=views, bands=False))
             for percent in numbers(gone, int):
@@ -136,7 +133,7 @@ class _Bench:
         return result
 
 
-def _pass_seconds(source: SplatModel) -> dict[str, float]:
+def _pass_milliseconds(source: SplatModel) -> dict[str, float]:
     """Milliseconds for each view of a plain render, of the pass, of a step of a fit: the best of three, by turns."""
     cameras, rasteriser = camera_sequence(source, _PASS_VIEWS, VIEW_SIZE), Rasteriser(gradients=False)
     draw = renderer(source, BLACK)
@@ -157,33 +154,9 @@ def _pass_seconds(source: SplatModel) -> dict[str, float]:
     return {name: 1000.0 * min(turn[name] for turn in turns) / len(cameras) for name in calls}
 
 
-def _off_the_twin(source: SplatModel) -> dict[str, float]:
-    """How far the pass is off removing splats one by one, where pixels are never finished early and where they are."""
-    thin = source.select(slice(0, None, max(1, len(source) // _TWIN_SPLATS)))
-    camera = camera_sequence(source, 1, VIEW_SIZE)[0]
-    view = replace(camera, K=np.diag([64 / 240, 64 / 240, 1.0]) @ camera.K, W=64, H=48)
-    seen = np.flatnonzero(measure_removal(thin, [view]).error > 0.0)
-    rows = np.random.default_rng(0).choice(seen, min(len(seen), _TWIN_ROWS), replace=False)
-    off, sums = {}, {}
-    for rule, least in (("never", 0.0), ("early", TRANSMITTANCE_MIN)):
-        error = measure_removal(thin, [view], transmittance_min=least).error[rows]
-        exact = removal_exact(thin, [view], rows, transmittance_min=least)
-        off[rule] = np.abs(error - exact) / np.maximum(exact, 1e-9 * exact.max())
-        sums[rule] = abs(float(error.sum() / exact.sum()) - 1.0)
-    return {"largest": float(off["never"].max()), "median": float(np.median(off["early"])), "sum": sums["early"]}
-
-
 def _pass_table(found: Mapping[str, Mapping[str, dict[str, float]]]) -> str:
-    rows = [
-        (
-            name,
-            *(f"{one['seconds'][key]:.1f}" for key in ("render", "pass", "step")),
-            *(f"{one['twin'][key]:.1e}" for key in ("largest", "median", "sum")),
-        )
-        for name, one in found.items()
-    ]
-    costs = ("render ms", "pass ms", "step of a fit ms")
-    return table(("the pass, per view", *costs, "off twin: largest", "with stop: median", "of the sum"), rows)
+    rows = [(name, *(f"{value:.1f}" for value in one["milliseconds"].values())) for name, one in found.items()]
+    return table(("the pass, per view", "render ms", "pass ms", "step of a fit ms"), rows)
 
 
 def _removal_table(name: str, found: Mapping[str, Left]) -> str:

@@ -2,7 +2,7 @@
 
     python -m csplat_bench.study                        # everything: about half an hour on two cores
     python -m csplat_bench.study baseline --markdown    # the published rows and the first of the others
-    python -m csplat_bench.study tables claims plots    # what is known already, and the plots of tools/STUDY.md
+    python -m csplat_bench.study tables plots           # what is known already, and the plots of tools/STUDY.md
     python -m csplat_bench.study baseline --iterations 200 --views 10 --out out/quick
 
 The baseline is trained first: Lego at 200×200, 1,000 splats from first to last, SH degree 1, 7,000 iterations, white
@@ -28,10 +28,9 @@ from csplat.errors import CsplatError, InputError
 from csplat_bench.common.captures import Capture
 from csplat_bench.common.command import MARKDOWN, OUT, SCENES, WrongWords, listed, run, tell
 from csplat_bench.common.kept import Kept, file_digest
-from csplat_bench.common.report import machines, tell_machine, write_json
+from csplat_bench.common.report import machines, tell_machine
 from csplat_bench.common.scenes import DATA, ROOT
 from csplat_bench.common.scenes import OUT as EVERYTHING
-from csplat_bench.study.claims import claims, format_claims
 from csplat_bench.study.judge import Distance
 from csplat_bench.study.plots import draw
 from csplat_bench.study.records import Facts, Results
@@ -53,7 +52,7 @@ from csplat_render.warmup import warm_up
 _FIRST = "study1k"
 _LAST = "study1k-lpips"
 _PARTS = ("baseline", "variants", "scenes", "renders", "lpips")
-_SHOWN = ("tables", "claims", "plots")
+_SHOWN = ("tables", "plots")
 _SCENES = ",".join((*OTHERS, *OWN))
 _WHAT = f"{', '.join(_PARTS)}; or {', '.join(_SHOWN)} of what is known; default: all"
 _WEIGHTS = str(DATA / "lpips" / "lpips_alex.npz")
@@ -73,7 +72,7 @@ def main(
     out: OUT = EVERYTHING / "study",
     plots: Annotated[Path, typer.Option(help="folder for them")] = ROOT / "tools" / "study",
 ) -> int:
-    """Measure what the command line names; print tables and claims, draw plots."""
+    """Measure what the command line names; print tables, draw plots."""
     unknown = set(what) - {*_PARTS, *_SHOWN}
     if unknown:
         raise WrongWords(f"{', '.join(sorted(unknown))} cannot be measured, wanted some of {', '.join(_PARTS)}")
@@ -90,7 +89,7 @@ def main(
                 except (CsplatError, OSError) as error:  # the others are measured all the same
                     tell(f"error: {error}")
                     failed = True
-    _show(set(what) or {"tables", "claims", "plots"}, out, plots, markdown=markdown)
+    _show(set(what) or set(_SHOWN), out, plots, markdown=markdown)
     return int(failed)
 
 
@@ -162,12 +161,8 @@ def _show(what: set[str], out: Path, plots: Path, *, markdown: bool) -> None:
     paths = {name: out / f"{name}.json" for name in dict.fromkeys(order)}
     results: Results = {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
     results = {name: one for name, one in results.items() if "order" in one}
-    if what - {"claims", "plots"}:
+    if what != {"plots"}:
         print(tables(results, markdown=markdown))
-    if "claims" in what:
-        found = claims(results)
-        write_json(out / "claims.json", found)
-        print("\n" + format_claims(found, markdown=markdown))
     print("\n" + machines(one["machine"] for one in results.values()))
     if "plots" in what:
         plots.mkdir(parents=True, exist_ok=True)

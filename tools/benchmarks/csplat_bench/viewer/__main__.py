@@ -1,8 +1,8 @@
-"""Measure the viewer: culling, sorting, drawing, memory on the GPU, the first picture, decoding in JavaScript.
+"""Measure the viewer: culling, sorting, drawing, memory on the GPU, decoding in JavaScript.
 
     python -m csplat_bench.viewer                             # everything that is there; a quarter of an hour
     python -m csplat_bench.viewer --quick                     # the sample alone
-    python -m csplat_bench.viewer --only first --extra statue.ply
+    python -m csplat_bench.viewer --only decode --extra statue.ply
     python -m csplat_bench.viewer --gpu                       # let Chromium use the machine's GPU
 
 Wants Chromium, playwright, and Node.js for the table of decoders. Without --gpu pictures are drawn by SwiftShader, a
@@ -27,14 +27,10 @@ from csplat_bench.common.command import CACHE, EXTRA, JSON, PRESETS, listed, num
 from csplat_bench.common.making import blow_up
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, Scene, find_scenes
-from csplat_bench.viewer.page import HEIGHT, WIDTH, Drawn, File, First, drawn, first_picture, open_page
+from csplat_bench.viewer.page import HEIGHT, WIDTH, Drawn, File, drawn, open_page
 
-_PARTS = "draw,first,decode"
+_PARTS = "draw,decode"
 _SCRIPT = Path(__file__).with_name("js_decode.mjs")
-
-#: Bytes per splat that the first picture is to take at most.
-_AT_MOST = {"lego60k": 11.5}
-_AT_MOST_ELSEWHERE = 10.0
 
 
 class Decoded(TypedDict):
@@ -54,7 +50,6 @@ def main(
     sources: Annotated[str, typer.Option(help="scenes to draw")] = "fox120k,donut",
     sizes: Annotated[str, typer.Option(help="splats to draw")] = "100000,500000,1000000",
     presets: PRESETS = "balanced,fast",
-    first: Annotated[str, typer.Option(help="scenes for the first picture")] = "fox120k,fox60k_noreg,lego60k,plane3",
     decoded: Annotated[str, typer.Option(help="scenes for the decoders")] = "fox120k,lego60k,donut,donut-1M",
     extra: EXTRA = [],
     runs: Annotated[int, typer.Option(help="of each measurement")] = 5,
@@ -65,26 +60,21 @@ def main(
 ) -> None:
     """Measure what the command line names, and print a table of each."""
     machine, parts = tell_machine(), listed(only)
-    draw, opened, rows = list[Drawn](), list[First](), list[Decoded]()
-    if {"draw", "first"} & set(parts):
+    draw, rows = list[Drawn](), list[Decoded]()
+    if "draw" in parts:
+        size = [None] if quick else numbers(sizes, int)
+        scenes = find_scenes(["sample"] if quick else listed(sources), cache)
         with open_page(chromium, gpu=gpu) as page:
-            if "draw" in parts:
-                size = [None] if quick else numbers(sizes, int)
-                scenes = find_scenes(["sample"] if quick else listed(sources), cache)
-                for file in _draw_files(scenes, size, listed(presets), cache):
-                    draw.append(drawn(page, file, runs))
-                    tell(f"{file.name} {file.preset}: done")
-                print(_draw_table(draw), flush=True)
-            if "first" in parts:
-                scenes = find_scenes(["sample"] if quick else listed(first), cache, extra)
-                opened = [first_picture(page, _encoded(scene, "balanced", cache)) for scene in scenes]
-                print(_first_table(opened), flush=True)
+            for file in _draw_files(scenes, size, listed(presets), cache):
+                draw.append(drawn(page, file, runs))
+                tell(f"{file.name} {file.preset}: done")
+        print(_draw_table(draw), flush=True)
     if "decode" in parts:
         scenes = find_scenes(["sample"] if quick else listed(decoded), cache, extra)
         rows = _decoders([_encoded(scene, "balanced", cache).path for scene in scenes], runs)
         print(_decode_table(rows))
     if json is not None:
-        write_json(json, {"machine": machine, "draw": draw, "first": opened, "decode": rows})
+        write_json(json, {"machine": machine, "draw": draw, "decode": rows})
 
 
 def _draw_files(
@@ -146,32 +136,6 @@ def _draw_table(found: Sequence[Drawn]) -> str:
     title = f"Drawing at {WIDTH}x{HEIGHT} into {found[0]['pictureFormat']} by {found[0]['glRenderer']}"
     more = "4 B/splat for the order and at most 8 MiB of projected splats come on top of the attributes"
     return f"\n{title}\n{table(header, rows)}\n{more}"
-
-
-def _first_table(found: Sequence[First]) -> str:
-    rows = []
-    for one in found:
-        splats, bound = one["splats"], _AT_MOST.get(one["name"], _AT_MOST_ELSEWHERE)
-        first = one["firstBytes"] / splats
-        rows.append(
-            (
-                one["name"],
-                f"{splats:,}",
-                f"{one['fileBytes'] / splats:.2f}",
-                f"{first:.2f}",
-                f"{bound:g}",
-                "ok" if first <= bound else "MORE",
-                f"{one['firstBytes'] / one['fileBytes']:.0%}",
-                f"{one['firstPictureBytes'] / splats:.2f}",
-                f"{one['firstPictureMs']:.0f}",
-                f"{one['wholeMs']:.0f}",
-            )
-        )
-    header = (
-        "first picture", "splats", "file B/splat", "layer 0 B/splat", "at most", "", "share of file", "received then",
-        "first ms", "whole ms",
-    )  # fmt: skip
-    return f"\n{table(header, rows)}"
 
 
 def _decode_table(found: Sequence[Decoded]) -> str:

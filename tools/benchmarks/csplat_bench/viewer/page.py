@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict
 
-from csplat.decoder import decode, read_header
+from csplat.decoder import decode
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
-from csplat_tools.tradeoff.fetching import fetched_bytes
 
-__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "First", "drawn", "first_picture", "open_page"]
+__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn", "open_page"]
 
 WIDTH, HEIGHT = 640, 480
 
@@ -80,18 +79,6 @@ class Drawn(TypedDict):
     glRenderer: str
 
 
-class First(TypedDict):
-    """When a scene is seen first. `firstBytes` is what it needs; `firstPictureBytes` what had come by then."""
-
-    name: str
-    splats: int
-    fileBytes: int
-    firstBytes: int
-    firstPictureBytes: int
-    firstPictureMs: float
-    wholeMs: float
-
-
 @contextmanager
 def open_page(chromium: str, *, gpu: bool) -> Iterator[Any]:
     """Start a browser; yields playwright's page.
@@ -130,22 +117,6 @@ def drawn(page: Any, file: File, runs: int) -> Drawn:
     stats["frameMs"] = statistics.median(frames)
     result: Drawn = {name: stats[name] for name in Drawn.__annotations__}  # type: ignore[assignment]  # all of its names
     return result
-
-
-def first_picture(page: Any, file: File) -> First:
-    """Open a file, and see when there is something to be seen."""
-    data = file.path.read_bytes()
-    header, camera = read_header(data), virtual_cameras(decode(data), 1, WIDTH, HEIGHT)[0]
-    with _served(page, file, _pinhole(camera)) as stats:
-        return {
-            "name": file.name,
-            "splats": header.splat_count,
-            "fileBytes": len(data),
-            "firstBytes": fetched_bytes(header, 0),
-            "firstPictureBytes": stats["firstPictureBytes"],
-            "firstPictureMs": stats["firstPictureMs"],
-            "wholeMs": stats["wholeMs"],
-        }
 
 
 @contextmanager
