@@ -5,6 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; 
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
+BENCH := $(BIN)/python -m csplat_bench
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
@@ -42,22 +43,20 @@ sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, trai
 	$(BIN)/python tools/sample/make_sample.py
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
-	$(BIN)/python tools/benchmarks/codec.py
-	$(BIN)/python tools/benchmarks/render.py
-	$(BIN)/python tools/benchmarks/training.py
-	$(BIN)/python tools/benchmarks/gradients.py
-	$(BIN)/python tools/benchmarks/compiling.py
-	$(BIN)/python tools/benchmarks/virtual_cameras.py
-	$(BIN)/python tools/benchmarks/viewer.py
-	$(BIN)/python tools/benchmarks/simplify.py pass
-	$(BIN)/python tools/benchmarks/simplify.py removal --gone 20,40,60,80
-	$(BIN)/python tools/benchmarks/sensitivity.py
-	$(BIN)/python tools/benchmarks/compression.py
-	$(BIN)/python tools/benchmarks/targets.py --sizes 4,8
-	$(BIN)/python tools/benchmarks/grades.py
-	$(BIN)/python tools/benchmarks/distortion.py plain
-	$(BIN)/python tools/benchmarks/operating.py
-	$(BIN)/python tools/benchmarks/study.py
+	$(BENCH).codec
+	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
+	$(BENCH).rendering
+	$(BENCH).rendering.removal pass
+	$(BENCH).rendering.removal removal --gone 20,40,60,80
+	$(BIN)/pytest -rP tests/test_render_forward.py tests/test_render_gradients.py tests/test_removal.py
+	$(BENCH).training
+	$(BENCH).viewer
+	$(BENCH).compression
+	$(BENCH).targets --sizes 4,8
+	$(BENCH).distortion plain
+	$(BENCH).distortion.grades
+	$(BENCH).distortion.operating
+	$(BENCH).study
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

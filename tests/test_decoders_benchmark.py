@@ -1,16 +1,13 @@
-"""`tools/benchmarks/decoders.py`: equal decoders pass, and one that gives anything else is found out."""
+"""`csplat_bench.codec.decoders`: equal decoders pass, and one that gives anything else is found out."""
 
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from benching import bench
 from chromium import absent
 
 from csplat import EncodeOptions, encode
-
-SCRIPT = Path(__file__).resolve().parent.parent / "tools" / "benchmarks" / "decoders.py"
 
 # A decoder behind the protocol of codec/js/test/adapter.mjs that gives the same answer to every file.
 STUB = """#!{python}
@@ -22,7 +19,7 @@ while head := sys.stdin.buffer.read(4):
 
 
 def run(*words):
-    return subprocess.run([sys.executable, str(SCRIPT), *map(str, words)], capture_output=True, text=True, check=False)
+    return bench("codec.decoders", *words, check=False)
 
 
 @pytest.fixture

@@ -1,24 +1,21 @@
-"""`tools/benchmarks/distortion.py`: what curves say between points, which point is next, and its tables."""
+"""`csplat_bench.distortion`: what curves say between points, which point is next, and its tables."""
 
 import json
 import math
-import sys
-from pathlib import Path
+from dataclasses import asdict
 
 import pytest
 
 pytest.importorskip("numba", reason="the benchmark renders: pip install 'csplat[render]'")
 pytest.importorskip("matplotlib", reason="the benchmark plots: pip install 'csplat[render]'")
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
-
-# They lie in the folder that is named above, and need what is looked for there.
-import distortion
-import distortion_plot
-import distortion_tables
-from distortion_curves import Point, Rate, bracket, front, psnr_at, rate_at
-from kept import Kept
-
+from csplat_bench.common.command import run as command
+from csplat_bench.common.curves import Point, Rate, bracket, front, psnr_at, rate_at
+from csplat_bench.common.kept import Kept
+from csplat_bench.distortion import __main__ as distortion
+from csplat_bench.distortion import plot as distortion_plot
+from csplat_bench.distortion import tables as distortion_tables
+from csplat_bench.distortion.known import Measured
 from csplat_tools.optimise.report import Optimised, Report
 
 SCALAR = (Point(38.0, 1000), Point(42.0, 4000))
@@ -125,8 +122,8 @@ def file_of(size_bytes):
 
 
 def results():
-    plain = {"balanced, codebook": [Point(38.0, 1000).as_json(), Point(42.0, 4000).as_json()]}
-    peers = {"SPZ": Point(40.0, 4000).as_json(), "SOG": {"remark": "stopped"}}
+    plain = {"balanced, codebook": [asdict(Point(38.0, 1000)), asdict(Point(42.0, 4000))]}
+    peers = {"SPZ": asdict(Point(40.0, 4000)), "SOG": {"remark": "stopped"}}
     files = {
         "+0": file_of(1900),
         "+20": {"goal": 60.0, "remark": "out of reach", "seconds": 1.0},
@@ -134,9 +131,9 @@ def results():
     whole = {"splats": 100, "sh_degree": 3, "plain": plain, "peers": peers}
     simplified = {**whole, "simplified": files}
     return {
-        "plane3": distortion_tables.Measured(simplified),
-        "lego60k": distortion_tables.Measured(simplified),
-        "donut": distortion_tables.Measured({**whole, "sh_degree": 0}),
+        "plane3": Measured(simplified),
+        "lego60k": Measured(simplified),
+        "donut": Measured({**whole, "sh_degree": 0}),
     }
 
 
@@ -164,7 +161,7 @@ def test_tables_state_the_psnr_at_the_bytes_that_are_aimed_at():
 
 def test_whole_files_count_where_simplified_ones_are_larger():
     values = results()["plane3"].values
-    one = distortion_tables.Measured({**values, "simplified": {"+0": file_of(2500)}})
+    one = Measured({**values, "simplified": {"+0": file_of(2500)}})
     assert "balanced, codebook" == one.simplified_rate(40.0).how
     assert one.simplified_rate(40.1) is None  # nothing was simplified to that
 
@@ -175,9 +172,11 @@ def test_markdown_has_a_rule_below_each_header():
 
 
 def test_plots_the_same_bytes_for_the_same_results(tmp_path):
-    for name in ("a.svg", "b.svg"):
-        distortion_plot.plot(results(), tmp_path / name)
-    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    written = []
+    for _ in range(2):
+        distortion_plot.plot(results(), tmp_path / "curves.svg")
+        written.append((tmp_path / "curves.svg").read_bytes())
+    assert written[0] == written[1]
     distortion_plot.plot({}, tmp_path / "none.svg")
     assert not (tmp_path / "none.svg").exists()
 
@@ -198,7 +197,7 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
     """The scene that ships, beside a peer that was judged before."""
     known = tmp_path / "sample.json"
-    known.write_text(json.dumps({"peers": {"SPZ": Point(36.0, 60_000).as_json()}}))
+    known.write_text(json.dumps({"peers": {"SPZ": asdict(Point(36.0, 60_000))}}))
     monkeypatch.setattr(distortion, "find_splat_transform", lambda _: (["none"], "judged before"))
     monkeypatch.setattr(distortion, "_GRID", (-3.0,))
     chosen = {"psnr": 36.1, "size_bytes": 30_000, "splats": 900, "sh_coding": "scalar"}
@@ -212,14 +211,13 @@ def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_
 
     def run(what):
         args = ["--views", "20", "--scenes", "sample", "--cache", str(tmp_path / "scenes"), "--out", str(tmp_path)]
-        monkeypatch.setattr(sys, "argv", ["distortion.py", what, *args])
-        distortion.main()
+        assert 0 == command(distortion.main, [what, *args])
         return capsys.readouterr()
 
     assert "sample balanced" in run("plain").err
     assert "0.500" in run("simplified").out
     assert [(36.0, 36, 8)] == searches
-    one = distortion_tables.Measured(json.loads(known.read_text()))
+    one = Measured(json.loads(known.read_text()))
     assert rate_at(one.plain(), 36.0).measured is None  # enclosed
     before = known.read_bytes()
     assert "sample balanced" not in run("plain").err  # nothing is left to do

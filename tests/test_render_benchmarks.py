@@ -1,9 +1,6 @@
 """The benchmarks of renderer and trainer: that they measure what they say, on little."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,21 +9,13 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 pytest.importorskip("scipy", reason="training wants the extra [render]")
 pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
+from benching import bench
+from oracle import cropped, difference
+
 from csplat.ply import read_ply
+from csplat_bench.common.making import crowd, split
 from csplat_render import render
 from csplat_render.virtual import virtual_cameras
-
-BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
-
-# They lie in the folder that is named above.
-from crowds import crowd, split  # noqa: E402
-from oracle import cropped, difference  # noqa: E402
-
-
-def run(script, *arguments):
-    command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
-    return subprocess.run(command, check=True, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -68,41 +57,28 @@ def test_the_middle_of_a_picture_is_the_same_pixel_for_pixel(sample):
 
 
 def test_the_renderer_is_measured(tmp_path):
-    run("render.py", "--scenes", "sample", "--views", 1, "--rounds", 1, "--pairs", 1e6, "--json", tmp_path / "r.json")
+    bench("rendering", "--scenes", "sample", "--views", 1, "--rounds", 1, "--json", tmp_path / "r.json")
     results = json.loads((tmp_path / "r.json").read_text())["results"]
-    assert ["standard", "fast", "antialiased"] == [one["mode"] for one in results]
-    assert all(one["forward_ms"] > 0.0 and one["backward_ms"] > 0.0 for one in results)
-    assert results[0]["off"]["most"] <= 1 / 255
-    assert results[1]["off"]["mean"] > results[0]["off"]["mean"]
+    assert ["sample standard", "sample fast", "sample antialiased"] == list(results)
+    assert all(one["forward"]["wall"] > 0.0 and one["backward"]["wall"] > 0.0 for one in results.values())
+    assert results["sample standard"]["psnr"] is None
+    assert 30.0 < results["sample fast"]["psnr"] < 60.0
 
 
 def test_training_is_measured(data_dir, tmp_path):
     folder = data_dir / "images" / "lego200"
     if not folder.is_dir():
         pytest.skip("the Lego pictures are absent")
-    run("training.py", folder, "--rows", "200:40x40", "--warm", 2, "--steps", 5, "--json", tmp_path / "t.json")
+    bench("training", folder, "--rows", "200:40x40", "--warm", 2, "--steps", 5, "--json", tmp_path / "t.json")
     (result,) = json.loads((tmp_path / "t.json").read_text())["results"]
-    times = result["milliseconds"]
-    assert all(times[name] > 0.0 for name in ("forward", "loss", "backward", "Adam"))
-    assert result["bytes_per_splat"] == result["memory_bytes"] / 200
+    assert all(result["seconds"][name] > 0.0 for name in ("step", "forward", "loss", "backward", "Adam"))
+    assert result["memory_bytes"] > 0
 
 
 def test_cameras_are_compared(data_dir, tmp_path):
     if not (data_dir / "psnr_cameras" / "plane3.json").exists():
         pytest.skip("plane3 is absent")
-    out = tmp_path / "v.json"
-    run(
-        "virtual_cameras.py",
-        "--scenes",
-        "plane3",
-        "--presets",
-        "fast",
-        "--seeds",
-        "0",
-        "--json",
-        out,
-        "--cache",
-        tmp_path,
-    )
-    (result,) = json.loads(out.read_text())["results"]
-    assert abs(result["own"] - result["given"]) <= 1.0
+    words = ("--scenes", "plane3", "--presets", "fast", "--seeds", "0", "--no-peers", "--cache", tmp_path)
+    bench("codec.quality", *words, "--json", tmp_path / "q.json")
+    ((one,),) = json.loads((tmp_path / "q.json").read_text())["scenes"].values()
+    assert abs(one["differences"][0]) <= 1.0

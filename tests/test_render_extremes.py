@@ -1,23 +1,18 @@
 """What breaks rasterisers: pictures and gradients stay finite, and nothing is written out of bounds."""
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
+from oracle import extreme_splats, facing
+
 from csplat.errors import LimitError
 from csplat_render import rasterise, render
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_render.warmup import warm_up
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
-
-# It lies in the folder that is named above.
-from oracle import extreme_splats, facing
 
 W, H = 50, 37
 

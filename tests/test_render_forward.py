@@ -2,14 +2,14 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+from oracle import cropped, difference
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -19,11 +19,6 @@ from csplat_render.conventions import ALPHA_CAP, DILATION
 from csplat_render.harmonics import SH_C0
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_render.twin import render_exact
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
-
-# It lies in the folder that is named above.
-from oracle import cropped, difference
 
 
 def camera(width=64, height=48, focal=60.0, distance=4.0, **fields):
@@ -62,6 +57,7 @@ def assert_same_picture(model, view, **options):
     fast, exact = render(model, view, **options), render(model, view, mode="exact", **options)
     for found, wanted in ((fast.rgb, exact.rgb), (fast.alpha[..., None], exact.alpha[..., None])):
         off = difference(found, wanted)
+        print(f"differs from the twin by {off.most:.1e} at most")
         assert off.share <= 1e-3
         assert off.mean <= 1e-5
     assert np.abs(fast.depth - exact.depth).mean() <= 1e-5 * max(1.0, exact.depth.max())

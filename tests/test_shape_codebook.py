@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benching import bench
 from checked import encoded
 from chromium import absent
 
@@ -203,9 +204,6 @@ def test_the_javascript_decoder_reads_them_too(make_model, tmp_path):
         result, _ = encoded(model, seen_more(model), shape_codebook_size=40, **options)
         assert books(result.data)
         (tmp_path / f"{name}.csplat").write_bytes(result.data)
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tools/benchmarks/decoders.py"), *map(str, sorted(tmp_path.glob("*.csplat")))],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = bench("codec.decoders", *sorted(tmp_path.glob("*.csplat")), check=False)
     assert 0 == done.returncode, done.stderr
     assert "3 of 3 files agree" == done.stdout.splitlines()[-1]

@@ -1,19 +1,15 @@
-"""`tools/benchmarks/targets.py`: two builds at equal PSNR, files that others beat, and what goes on where it ended."""
+"""`csplat_bench.targets`: two builds at equal PSNR, files that others beat, and what goes on where it ended."""
 
 import json
 import math
-import sys
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("numba", reason="the benchmark renders: pip install 'csplat[render]'")
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
-
-# They lie in the folder that is named above, and need what is looked for there.
-import targets
-from targets_tables import Ratio, at_equal_psnr, dominated, kind_of, tables
+from csplat_bench.common.command import run as command
+from csplat_bench.targets import __main__ as targets
+from csplat_bench.targets.tables import Ratio, at_equal_psnr, dominated, kind_of, tables
 
 
 def row(size, psnr, *, all_splats=True, seconds=1.0):
@@ -120,31 +116,30 @@ def test_tables_state_what_is_beaten_and_what_was_not_made():
     assert not tables({}, markdown=True)
 
 
-def run(monkeypatch, kept, *words):
-    monkeypatch.setattr(sys, "argv", ["targets.py", "--scenes", "sample", "--kept", str(kept), *words])
-    targets.main()
+def run(kept, *words):
+    return command(targets.main, ["--scenes", "sample", "--kept", str(kept), *words])
 
 
-def test_makes_what_is_missing_and_keeps_each_row(tmp_path, monkeypatch, capsys):
+def test_makes_what_is_missing_and_keeps_each_row(tmp_path, capsys):
     """The scene that ships, by presets alone; then nothing is left to do."""
-    run(monkeypatch, tmp_path, "--psnr", "", "--build", "before")
+    run(tmp_path, "--psnr", "", "--build", "before")
     rows = json.loads((tmp_path / "sample.json").read_text())["builds"]["before"]["rows"]
     assert ["fast", "balanced", "small"] == list(rows)
     assert all(one["all_splats"] and one["bytes"] > 0 and one["psnr"] > 20.0 for one in rows.values())
     capsys.readouterr()
-    run(monkeypatch, tmp_path, "--psnr", "", "--build", "before")
+    run(tmp_path, "--psnr", "", "--build", "before")
     assert not capsys.readouterr().err
 
 
-def test_a_program_that_is_missing_ends_it_at_once(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match="no such program"):
-        run(monkeypatch, tmp_path, "--csplat", str(tmp_path / "absent"))
+def test_a_program_that_is_missing_ends_it_at_once(tmp_path, capsys):
+    assert 1 == run(tmp_path, "--csplat", str(tmp_path / "absent"))
+    assert "no such program" in capsys.readouterr().err
 
 
-def test_a_file_that_cannot_be_made_is_a_row(tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_made_is_a_row(tmp_path):
     program = tmp_path / "fails"
     program.write_text("#!/bin/sh\necho 'error: too small' >&2\nexit 1\n")
     program.chmod(0o755)
-    run(monkeypatch, tmp_path, "--psnr", "", "--sizes", "4", "--csplat", str(program))
+    run(tmp_path, "--psnr", "", "--sizes", "4", "--csplat", str(program))
     rows = json.loads((tmp_path / "sample.json").read_text())["builds"]["now"]["rows"]
     assert "error: too small" == rows["4 B/splat, every splat"]["error"]

@@ -1,0 +1,15 @@
+"""Benchmarks as commands: they are no part of the wheel, and lie on pytest's path alone."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
+
+
+def bench(topic, *words, check=True):
+    """Run `python -m csplat_bench.TOPIC WORDS` in a process of its own."""
+    path = os.pathsep.join(filter(None, (str(BENCHMARKS), os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-m", f"csplat_bench.{topic}", *map(str, words)]
+    return subprocess.run(command, check=check, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})

@@ -1,0 +1,108 @@
+"""Scenes made of others: copies side by side, splats split into smaller ones, so many splats in view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.model import SplatModel, normalise_quats
+from csplat_render import Camera
+from csplat_render.rasterise import Rasteriser
+
+__all__ = ["ARRAYS", "blow_up", "crowd", "split", "with_splats"]
+
+F32 = NDArray[np.float32]
+
+#: Arrays of a model.
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def blow_up(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
+    """Lay copies of a scene side by side, each a little different in every number.
+
+    Args:
+        model: a scene.
+        count: splats of the result.
+        seed: of the differences.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = np.quantile(model.means, (0.01, 0.99), axis=0)
+    copies = math.ceil(count / len(model))
+    columns = math.ceil(math.sqrt(copies))
+    parts = []
+    for copy in range(copies):
+        part = model.select(slice(0, min(len(model), count - copy * len(model))))
+        shift = (high - low) * 1.5 * np.array([copy % columns, copy // columns, 0])
+        parts.append(_vary(part, rng, shift.astype(np.float32)) if copy else part)
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+    return replace(model, **arrays)
+
+
+def _vary(model: SplatModel, rng: np.random.Generator, shift: F32) -> SplatModel:
+    def noise(like: F32, sigma: float) -> F32:
+        return rng.standard_normal(like.shape, np.float32) * np.float32(sigma)
+
+    size = np.exp(model.scales.max(axis=1, keepdims=True))
+    return replace(
+        model,
+        means=model.means + shift + noise(model.means, 0.1) * np.minimum(size, np.float32(1.0)),
+        quats=normalise_quats(model.quats + noise(model.quats, 0.01)),
+        scales=model.scales + noise(model.scales, 0.02),
+        opacities=np.clip(model.opacities * (1 + noise(model.opacities, 0.02)), 0, 1),
+        sh0=model.sh0 + noise(model.sh0, 0.01),
+        shN=model.shN * (1 + noise(model.shN, 0.05)),
+    )
+
+
+def crowd(model: SplatModel, cameras: Sequence[Camera], count: int, seed: int = 0) -> SplatModel:
+    """Make a scene of which so many splats lie in view, looking much as it did.
+
+    Splats are split as training does it; those that no camera sees are left out, and so are others by chance.
+
+    Args:
+        model: a scene.
+        cameras: who sees it.
+        count: median over the cameras of the splats in view.
+        seed: of everything by chance.
+    """
+    rng = np.random.default_rng(seed)
+    rasteriser = Rasteriser(gradients=False)
+    seen = np.median([rasteriser.forward(model, camera).drawn for camera in cameras])
+    model = split(model, math.ceil(1.1 * count / seen), rng)
+    views = np.array([rasteriser.forward(model, camera).radii > 0 for camera in cameras])
+    share = count / float(np.median(views.sum(axis=1)))
+    return model.select(np.flatnonzero(views.any(axis=0) & (rng.random(len(model)) < share)))
+
+
+def with_splats(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
+    """A scene that looks much like another, with so many splats: some of them, or all split into smaller ones.
+
+    Args:
+        model: the other.
+        count: splats.
+        seed: of everything by chance.
+    """
+    rng = np.random.default_rng(seed)
+    if count > len(model):
+        model = split(model, math.ceil(count / len(model)), rng)
+    return model.select(np.sort(rng.choice(len(model), count, replace=False)))
+
+
+def split(model: SplatModel, parts: int, rng: np.random.Generator) -> SplatModel:
+    """Replace each splat by some that are smaller, at places drawn from it."""
+    many = model.select(np.repeat(np.arange(len(model)), parts))
+    smaller = parts**-0.5
+    quats = normalise_quats(many.quats).astype(np.float64)
+    step = rng.standard_normal((len(many), 3)) * np.exp(many.scales.astype(np.float64)) * math.sqrt(1.0 - smaller**2)
+    w, v = quats[:, :1], quats[:, 1:]
+    twice = 2.0 * np.cross(v, step)
+    return replace(
+        many,
+        means=(many.means + step + w * twice + np.cross(v, twice)).astype(np.float32),
+        scales=(many.scales + math.log(smaller)).astype(np.float32),
+    )

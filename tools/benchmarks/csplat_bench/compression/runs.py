@@ -1,0 +1,211 @@
+"""One scene compressed in many ways, each judged on its held-out photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode, read_header
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Held, Importance, Origin
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_bench.common.captures import Capture
+from csplat_bench.common.making import ARRAYS
+from csplat_bench.compression.rows import Row, Scores
+from csplat_bench.compression.sizes import books_of
+from csplat_render.lpips import Lpips
+from csplat_render.removal import measure_removal
+from csplat_tools.inspect.info import byte_shares
+from csplat_tools.optimise.sensitivity import measure_views
+from csplat_tools.training.choosing import Chosen, choose_splats, training_views
+from csplat_tools.training.finetune import Clock
+from csplat_tools.training.report import judge_models
+from csplat_tools.views import DataOptions, find_view_set
+from csplat_trainer.finetune import FinetuneOptions, Views, finetune
+from csplat_trainer.sensitivity import Sensitivity
+
+__all__ = ["Bench", "Tuned"]
+
+#: Splats, and the seconds that it took to choose them, by stage.
+Pick = tuple[Chosen, dict[str, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """A scene that was frozen and tuned.
+
+    Attributes:
+        chosen: its splats.
+        frozen: what the encoder decided.
+        held: the values that were tuned.
+        plain: the file before tuning. result: the file.
+        log: of the tuning.
+        seconds: by stage, without those of judging.
+    """
+
+    chosen: Chosen
+    frozen: Frozen
+    held: Held
+    plain: EncodeResult
+    result: EncodeResult
+    log: Mapping[str, Any]
+    seconds: Mapping[str, float]
+
+
+class Bench:
+    """Compresses one scene over and over. Owns what all ways have in common, found once.
+
+    Args:
+        scene: what is compressed.
+        ply: its splats.
+        encoding: what the encoder is told where a way does not say otherwise.
+        tuning: how is tuned.
+        lpips: weights, or `None`: not measured.
+    """
+
+    def __init__(
+        self,
+        scene: Capture,
+        ply: Path,
+        encoding: EncodeOptions,
+        tuning: FinetuneOptions,
+        lpips: Lpips | None,
+    ) -> None:
+        self.encoding, self.tuning, self._lpips = encoding, tuning, lpips
+        self.source = read_ply(ply)
+        data = DataOptions(str(scene.data), scene.size)
+        self.looks = find_view_set(self.source, data=data, background=scene.background, aside=0)
+        if not (self.looks.photographs and self.looks.judges):
+            raise InputError(f"{scene.data} holds out no photographs to judge by")
+        self._picks: dict[tuple[float | None, bool], Pick] = {}
+
+    @property
+    def threads(self) -> int | None:
+        """How many; `None` for all."""
+        return self.encoding.threads
+
+    @cached_property
+    def views(self) -> Views:
+        """What teaches, and what judges on the way."""
+        return training_views(self.source, self.looks, self.threads)
+
+    @cached_property
+    def sensitivity(self) -> Sensitivity:
+        """Of the whole source, measured from the training views."""
+        return measure_views(
+            self.source, self.looks.teaches, self.looks.background, matrices=True, threads=self.threads
+        )
+
+    def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
+        """The splats that stay, and the seconds that it took to find them.
+
+        Args:
+            keep: share of the source's splats; `None`: all that any view shows.
+            told: whether the encoder is told the sensitivities; otherwise the squared shares of pixels.
+        """
+        if (keep, told) not in self._picks:
+            self._picks[keep, told] = self._pick(keep, told=told)
+        return self._picks[keep, told]
+
+    def _pick(self, keep: float | None, *, told: bool) -> Pick:
+        clock = Clock()
+        with clock.stage("choosing"):
+            chosen = choose_splats(self.source, self.looks, keep=keep, threads=self.threads)
+        if told:
+            return chosen, clock.seconds
+        clock = Clock()  # it would not have measured what it is not told
+        with clock.stage("choosing"):
+            removal = measure_removal(
+                chosen.model, self.looks.teaches, background=self.looks.background, threads=self.threads
+            )
+        return replace(chosen, importance=removal.squared_weight), clock.seconds
+
+    def frozen(
+        self, model: SplatModel, rows: NDArray[np.int64], encoding: EncodeOptions,
+        importance: NDArray[Any] | Importance, progress: _Stages | None = None,
+    ) -> Frozen:  # fmt: skip
+        """Freeze splats that are some of the source's."""
+        draft = Draft.of(
+            model, encoding, importance=importance, origin=Origin(len(self.source), rows), graded=False,
+            progress=progress,
+        )  # fmt: skip
+        return draft.frozen(self.source, progress)
+
+    def tuned(self, encoding: EncodeOptions, pick: Pick | None = None) -> Tuned:
+        """Freeze, tune, write.
+
+        Args:
+            encoding: what the encoder is told.
+            pick: splats, and the seconds that they took; `None`: all that are seen.
+        """
+        chosen, seconds = pick or self.chosen()
+        views, stages = self.views, _Stages()
+        clock = Clock(dict(seconds))
+        with clock.stage("clustering"):
+            frozen = self.frozen(chosen.model, chosen.rows, encoding, chosen.importance, stages)
+        plain = frozen.coded(frozen.start()).write()  # not a part of the work: what it would have been without
+        with clock.stage("tuning"):
+            run = finetune(frozen, views, self.tuning, threads=self.threads)
+        with clock.stage("encoding"):
+            result = frozen.coded(run.held).write()
+        return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
+
+    def row(self, tuned: Tuned) -> Row:
+        """What came of it: sizes and scores before and after tuning."""
+        before, after = decode(tuned.plain.data), decode(tuned.result.data)
+        assert _same(tuned, after), "the decoded file is not what was tuned"
+        scores = self.judge({"before": before, "after": after})
+        colours, shapes = books_of(tuned.frozen)
+        kept = len(tuned.frozen.source_index)
+        described = byte_shares(tuned.result.data, read_header(tuned.result.data))
+        return {
+            "splats": kept,
+            "before_bytes": len(tuned.plain.data),
+            "after_bytes": len(tuned.result.data),
+            "before": scores["before"],
+            "after": scores["after"],
+            "sh_entries": 0 if colours is None else colours.entries,
+            "sh_escapes": None if colours is None else colours.escaped / kept,
+            "shapes": 0 if shapes is None else shapes.entries,
+            "shape_escapes": None if shapes is None else shapes.escaped / kept,
+            "attribute_bytes": {name: size for name, size in described.items() if name != "overhead"},
+            "steps": tuned.log["steps"],
+            "best_step": tuned.log["best_iteration"],
+            "seconds": dict(tuned.seconds),
+            "encoding": tuned.result.report.options,
+        }
+
+    def judge(self, models: Mapping[str, SplatModel]) -> dict[str, Scores]:
+        """Scores on the held-out photographs, by name."""
+        judged = judge_models(self.source, models, self.looks, self._lpips, self.threads)
+        assert judged is not None
+        found: dict[str, Any] = {name: dict(one) for name, one in judged.scores.items()}
+        return found
+
+
+class _Stages:
+    """When the encoder has done with shapes: what it tells while it decides."""
+
+    def __init__(self) -> None:
+        self._begin, self.shapes = time.perf_counter(), 0.0
+
+    def __call__(self, stage: str, done: float) -> None:
+        if stage == "shapes" and done == 1.0:
+            self.shapes = round(time.perf_counter() - self._begin, 3)
+
+
+def _same(tuned: Tuned, decoded: SplatModel) -> bool:
+    """Whether a decoded file holds what was tuned, bit for bit."""
+    seen = tuned.frozen.seen(tuned.held)
+    places = np.argsort(tuned.frozen.source_index)[
+        np.searchsorted(np.sort(tuned.frozen.source_index), tuned.result.source_index)
+    ]
+    return all(np.array_equal(getattr(decoded, name), getattr(seen, name)[places]) for name in ARRAYS)

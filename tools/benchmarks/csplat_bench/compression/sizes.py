@@ -1,0 +1,115 @@
+"""What the steps of a compression would take on disk if the pipeline ended there, in bytes.
+
+Before anything is quantised values are floats. A codebook takes its entries, an index per splat, and the values of
+those that escape from it. Integers take whole bytes, each column as many as its range wants; only a file has an order
+and an entropy coder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder import Frozen, Held
+from csplat_tools.training.report import ply_splat_bytes
+from csplat_trainer.finetune.rate import colour_integers_of
+
+__all__ = ["Book", "books_of", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]
+
+_FLOAT = 4
+_SHAPE = 7  # floats of rotation and scales
+_REST = 7  # floats of centre, opacity and base colour; normals, which are all 0, go when the PLY goes
+_ROOT2 = np.sqrt(2.0)
+
+
+@dataclass(frozen=True)
+class Book:
+    """A codebook: how many entries, and how many splats have values of their own."""
+
+    entries: int
+    escaped: int
+
+
+def books_of(frozen: Frozen) -> tuple[Book | None, Book | None]:
+    """The codebooks of a frozen scene, of SH and of shapes; `None` where the encoder made none."""
+    colours = Book(sum(frozen.stage_sizes), len(frozen.escaped)) if frozen.stage_sizes else None
+    shapes = frozen.shapes
+    return colours, None if shapes is None else Book(shapes.size, int(np.count_nonzero(shapes.escaped)))
+
+
+def ply_bytes(splats: int) -> int:
+    """A PLY with the 62 float columns of the INRIA trainer."""
+    return splats * ply_splat_bytes(3)
+
+
+def float_bytes(splats: int, coefficients: int, colours: Book | None, shapes: Book | None) -> int:
+    """Floats, and codebooks of floats.
+
+    Args:
+        splats: how many.
+        coefficients: floats of the SH bands above 0, per splat.
+        colours: their codebook, if there is one.
+        shapes: that of rotations and scales, whose common factor stays each splat's own.
+    """
+    size = splats * _REST * _FLOAT
+    size += _in_book(splats, coefficients, colours, 0) + _in_book(splats, _SHAPE, shapes, 1)
+    return size
+
+
+def _in_book(splats: int, floats: int, book: Book | None, own: int) -> int:
+    if book is None:
+        return splats * floats * _FLOAT
+    rows = book.entries + book.escaped
+    return splats * (_index_bytes(book.entries) + own * _FLOAT) + rows * floats * _FLOAT
+
+
+def _index_bytes(entries: int) -> int:
+    """Bytes of an index whose largest value says "escaped"."""
+    return _whole_bytes(0, entries)
+
+
+def integer_bytes(columns: Iterable[NDArray[Any]]) -> int:
+    """Integers [n, C] in whole bytes: a column takes what its range wants, nothing if it is constant."""
+    total = 0
+    for array in columns:
+        if array.size:
+            widths = map(_whole_bytes, array.min(axis=0).tolist(), array.max(axis=0).tolist())
+            total += len(array) * sum(widths)
+    return total
+
+
+def _whole_bytes(low: int, high: int) -> int:
+    return (int(high - low).bit_length() + 7) // 8
+
+
+def integer_columns(frozen: Frozen, held: Held) -> Sequence[NDArray[np.int64]]:
+    """Every integer that the file of some values holds, as arrays [n, C], in no order of meaning.
+
+    Args:
+        frozen: what was decided.
+        held: values, constrained.
+    """
+    plan, seen = frozen.plan, frozen.seen(held)
+    quats, scales, sizes = frozen.seen_shape_rows(held, seen)
+    sh = frozen.seen_rows(held.sh)
+    columns = [_lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in frozen.draft.tiles]
+    columns += [
+        _lattice(scales, plan.scale_step),
+        _lattice(sizes[:, None], plan.scale_step),
+        _lattice(quats[:, 1:], 1.0 / (_ROOT2 * plan.quat_levels)),
+        np.rint(np.sqrt(seen.opacities[:, None].astype(np.float64)) * plan.opacity_levels).astype(np.int64),
+        colour_integers_of(seen.sh0[:, None], plan.sh0_step, plan.chroma_shift).reshape(-1, 3).astype(np.int64),
+        colour_integers_of(sh, plan.sh_step, plan.chroma_shift).reshape(len(sh), -1).astype(np.int64),
+        *(index[:, None].astype(np.int64) for index in frozen.stages),
+    ]
+    if frozen.shapes is not None:
+        columns.append(frozen.shapes.index[:, None].astype(np.int64))
+    return columns
+
+
+def _lattice(values: NDArray[np.float32], step: float) -> NDArray[np.int64]:
+    return np.rint(values.astype(np.float64) / step).astype(np.int64)

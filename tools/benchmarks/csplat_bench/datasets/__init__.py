@@ -1,0 +1,1 @@
+"""The benchmark sets that papers report: trained, scored, encoded, scored again."""

@@ -1,0 +1,101 @@
+"""Measure what grades are worth: bytes at equal PSNR with and without, by who says how precise splats have to be.
+
+    python -m csplat_bench.distortion.grades                       # six scenes; ten minutes on two cores
+    python -m csplat_bench.distortion.grades --scenes fox60k_noreg --markdown
+
+Who measures: virtual views, as for a target; or every other camera that a scene was trained with. Who judges: the
+cameras of the data folder; or the other half of the training cameras. Nobody judges what the same cameras measured. SH
+is left out of scenes that have it: its coding is another matter.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.model import SplatModel
+from csplat.ply import read_ply
+from csplat_bench.common.command import MARKDOWN, SCENES, listed, run, tell
+from csplat_bench.common.curves import Point, rate_at
+from csplat_bench.common.measuring import timed
+from csplat_bench.common.report import table, tell_machine
+from csplat_bench.common.scenes import Scene, cameras_of, find_scenes
+from csplat_render import Camera
+from csplat_render.cameras import load_cameras
+from csplat_render.judge import Judge
+from csplat_render.virtual import scene_frame
+from csplat_tools.files.scenes import without_bands
+from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
+from csplat_tools.views import BLACK, find_view_set
+
+_SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
+_EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files without grades
+_GRADED = (46.0, 54.0, 62.0)
+_JUDGES = 20  # cameras at most
+_HEAD = ("scene", "kind", "measured by", "s", "judged by", *["of the bytes at dB"] * len(_GRADED))
+
+
+def main(*, scenes: SCENES = _SCENES, markdown: MARKDOWN = False) -> None:
+    """Measure scene by scene, and print a table."""
+    tell_machine()
+    rows = []
+    for scene in find_scenes(listed(scenes)):
+        rows += _rows(scene)
+        tell(f"{scene.name}: done")
+    print(table(_HEAD, rows, markdown=markdown))
+
+
+def _rows(scene: Scene) -> list[tuple[str, ...]]:
+    source = without_bands(read_ply(scene.path), 0)
+    beside = scene.path.with_suffix(".cameras.json")
+    given = load_cameras(beside) if beside.exists() else []
+    measures = {"virtual views": measuring_views(source, find_view_set(source)), "half of its cameras": given[::2]}
+    judges = {"cameras of `psnr`": cameras_of(scene.name, source), "the other half": given[1::2][:_JUDGES]}
+    kind, rows = scene_frame(source).kind, []
+    even = [_file(source, quality) for quality in _EVEN]
+    graded: dict[str, tuple[str, list[bytes]]] = {}
+    for name, cameras in measures.items():
+        if cameras:
+            importance, timing = timed(measured_importance, source, cameras, BLACK, threads=None)
+            graded[name] = f"{timing.wall:.1f}", [_file(source, quality, importance) for quality in _GRADED]
+    for judged_by, views in judges.items():
+        if views:
+            rows += [
+                (scene.name, kind, name, seconds, judged_by, *cells)
+                for name, (seconds, cells) in _shares(source, views, even, graded).items()
+            ]
+    return rows
+
+
+def _file(source: SplatModel, quality: float, importance: Importance | None = None) -> bytes:
+    """A file; graded where an importance says how."""
+    return encode_with_report(source, EncodeOptions(attribute_psnr=quality), importance=importance).data
+
+
+def _shares(
+    source: SplatModel, views: Sequence[Camera], even: Sequence[bytes], graded: dict[str, tuple[str, list[bytes]]]
+) -> dict[str, tuple[str, list[str]]]:
+    """What part of the bytes of even files the graded ones take, at their own PSNR, as these views judge."""
+    judge = Judge.of_source(source, views, BLACK)
+
+    def point(data: bytes) -> Point:
+        return Point(judge.psnr(decode(data)), len(data))
+
+    curve = {"even": [point(data) for data in even]}
+    return {
+        name: (seconds, [_share(curve, point(data)) for data in files]) for name, (seconds, files) in graded.items()
+    }
+
+
+def _share(curve: dict[str, list[Point]], one: Point) -> str:
+    rate = rate_at(curve, one.psnr)
+    if rate is None or rate.measured is not None or not math.isfinite(one.psnr):
+        return f"- at {one.psnr:.1f}"
+    return f"{one.size_bytes / rate.size_bytes:.2f} at {one.psnr:.1f}"
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,143 @@
+"""What is known of a scene, and what others were found to take elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypedDict
+
+from csplat_bench.common.curves import Point, Rate, Series, rate_at
+from csplat_bench.common.report import Machine
+
+__all__ = ["FIGURES", "GRADED", "Figure", "KeptPoint", "Measured", "Simplified", "Values", "point_of"]
+
+#: What names of series begin with whose splats are graded by what views say.
+GRADED = "graded"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What a format was found to take on other scenes: bytes per splat, and PSNR where it was taken."""
+
+    name: str
+    bytes_per_splat: tuple[float, float]
+    psnr: tuple[float, float] | None = None
+
+    @property
+    def short(self) -> str:
+        """The name, as a plot has room for it."""
+        return self.name.replace("splat-transform", "s.-t.")
+
+
+#: By whether the scenes had SH; taken with the tools named, on scenes of 9 to 300 thousand splats.
+FIGURES = {
+    True: (
+        Figure("SPZ v4", (15.7, 23.7), (36.0, 45.0)),
+        Figure("SOG by gsbox", (12.6, 21.0), (34.0, 41.0)),
+        Figure("SOG by splat-transform", (37.0, 50.0), (48.0, 56.0)),
+        Figure(".spx", (11.4, 12.4)),
+        Figure("compressed.ply", (61.0, 61.0)),
+    ),
+    False: (
+        Figure("SPZ v4", (14.7, 14.7)),
+        Figure("SOG by splat-transform", (12.0, 13.0), (46.0, 55.0)),
+        Figure(".spx", (10.5, 11.0)),
+        Figure("compressed.ply", (16.3, 16.3)),
+    ),
+}
+
+
+class KeptPoint(TypedDict, total=False):
+    """A point as JSON has it; or why there is none."""
+
+    psnr: float
+    size_bytes: int
+    quality: float
+    seconds: float
+    remark: str
+
+
+class Simplified(TypedDict, total=False):
+    """A file of a simplified scene; or why there is none. `goal` is the PSNR that was looked for, dB."""
+
+    goal: float
+    seconds: float
+    psnr: float
+    size_bytes: int
+    splats: int
+    sh_coding: str
+    encodes: int
+    remark: str
+
+
+class Values(TypedDict, total=False):
+    """What is kept of a scene.
+
+    Attributes:
+        cameras: those that judge.
+        peers: by format. plain: by preset and coding of SH. simplified: by dB beside SPZ.
+    """
+
+    machine: Machine
+    splats: int
+    sh_degree: int
+    cameras: str
+    peers: dict[str, KeptPoint]
+    plain: dict[str, list[KeptPoint]]
+    simplified: dict[str, Simplified]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What is known of a scene, as it is kept."""
+
+    values: Values
+
+    @property
+    def splats(self) -> int:
+        """Splats of the source: what bytes are divided by everywhere."""
+        return self.values["splats"]
+
+    @property
+    def has_sh(self) -> bool:
+        """Whether there is more than degree 0."""
+        return self.values["sh_degree"] > 0
+
+    def plain(self) -> Series:
+        """Files of the whole scene, by preset and coding of SH."""
+        return {how: [point_of(one) for one in points] for how, points in self.values.get("plain", {}).items()}
+
+    def unmeasured(self) -> Series:
+        """Those of them that the encoder made without having seen a picture."""
+        return {how: points for how, points in self.plain().items() if not how.startswith(GRADED)}
+
+    def simplified(self) -> Series:
+        """Files of simplified scenes, by number of splats, coding of SH, and PSNR that was looked for."""
+        return {
+            f"{one['splats']} {one['sh_coding']} for {one['goal']:.1f}": [Point(one["psnr"], one["size_bytes"])]
+            for one in self.values.get("simplified", {}).values()
+            if "psnr" in one
+        }
+
+    def simplified_rate(self, psnr: float) -> Rate | None:
+        """What files of a PSNR take where splats may go; to leave a scene whole is one way of simplifying.
+
+        `None` where none was simplified to that PSNR.
+        """
+        simplified = self.simplified()
+        if rate_at(simplified, psnr) is None:
+            return None
+        return rate_at({**simplified, **self.plain()}, psnr)
+
+    def peers(self) -> dict[str, Point]:
+        """Files of others that were judged."""
+        known = self.values.get("peers", {})
+        return {name: point_of(one) for name, one in known.items() if "psnr" in one}
+
+    def per_splat(self, size_bytes: float) -> float:
+        """Bytes per splat of the source."""
+        return size_bytes / self.splats
+
+
+def point_of(one: KeptPoint) -> Point:
+    """A file as it was judged."""
+    return Point(one["psnr"], one["size_bytes"], one.get("quality", 0.0), one.get("seconds", 0.0))

@@ -1,0 +1,1 @@
+"""What pictures, their gradients and the removal of splats cost."""

@@ -1,0 +1,1 @@
+"""A published study of simple strategies, done again."""

@@ -1,0 +1,90 @@
+"""What is kept of a scene that strategies were tried on, as JSON has it."""
+
+from __future__ import annotations
+
+from typing import Any, TypedDict
+
+from csplat_bench.common.report import Machine
+
+__all__ = ["Facts", "How", "Known", "Measured", "Results", "Scored", "Survivors"]
+
+
+class Scored(TypedDict):
+    """Scores on some views: PSNR pooled, then means and deviations over views; `None` where not measured."""
+
+    views: int
+    psnr: float
+    psnr_mean: float
+    psnr_std: float
+    ssim: float | None
+    ssim_std: float | None
+    lpips: float | None
+    lpips_std: float | None
+
+
+class How(TypedDict):
+    """All that a line depends on."""
+
+    name: str
+    reduction: dict[str, Any]
+    preset: str
+    decoded: bool
+    kmeans: dict[str, Any] | None
+
+
+class Measured(Scored):
+    """A line of a table.
+
+    Attributes:
+        splats: that are left.
+        study_bytes: by the published rule.
+        csplat_bytes, file_psnr_mean, file_psnr_std: of the file, decoded.
+        books: by attribute, entries of each codebook and the share of the variance that is lost.
+        strategy_seconds, encode_seconds, seconds: of the strategy, of encoding, in all.
+    """
+
+    how: How
+    splats: int
+    study_bytes: int
+    csplat_bytes: int
+    file_psnr_mean: float
+    file_psnr_std: float
+    books: dict[str, Any]
+    strategy_seconds: float
+    encode_seconds: float
+    seconds: float
+
+
+class Survivors(Scored):
+    """What is left at a threshold of opacity."""
+
+    tau: float
+    splats: int
+
+
+class Facts(TypedDict):
+    """What tables say of a scene; `how` and what is said of its training are `None` where it was at hand."""
+
+    splats: int
+    sh_degree: int
+    bytes: int
+    judged_by: str
+    how: str | None
+    training_seconds: float | None
+    training: dict[str, Any] | None
+
+
+class Known(TypedDict, total=False):
+    """All that is known of a scene."""
+
+    settings: dict[str, Any]
+    machine: Machine
+    facts: Facts
+    order: list[str]
+    rows: dict[str, Measured]
+    taus: dict[str, list[Survivors]]
+    attributes: dict[str, dict[str, dict[str, int]]]
+
+
+#: By name of the scene.
+Results = dict[str, Known]

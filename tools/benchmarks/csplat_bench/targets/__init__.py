@@ -1,0 +1,1 @@
+"""What targets give, beside presets, fixed shares of the splats, and another build."""

@@ -1,0 +1,1 @@
+"""What the viewer takes, in a browser, and the JavaScript decoder, in Node.js."""
