@@ -502,7 +502,7 @@ def values_text(rule: Registry, registry: Registry) -> str:
         return f"{low:g}"
     if isinstance(low, int):
         return f"{low}..{high}".replace("-", "−")
-    least = {sys.float_info.min: "2^−1022", 0.0: "0", -sys.float_info.max: ""}[low]
+    least = {sys.float_info.min: "2^−1022", 0.0: "0", -sys.float_info.max: ""}.get(low, repr(low))
     return f"finite, at least {least}" if least else "finite"
 
 
