@@ -35,7 +35,7 @@ from csplat_trainer.data import load
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import TrainResult
-from csplat_trainer.report import Progress
+from csplat_trainer.report import TrainingStep
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -194,7 +194,7 @@ def main() -> None:
     print(f"{arguments.output}: {len(result.model)} splats, {arguments.output.stat().st_size} bytes")
 
 
-def _show(now: Progress) -> None:
+def _show(now: TrainingStep) -> None:
     if now.iteration % 500 == 0:
         _say(f"step {now.iteration} of {now.iterations}: PSNR {now.psnr:.2f} dB, {now.seconds_left:.0f} s left")
 

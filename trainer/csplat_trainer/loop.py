@@ -31,9 +31,9 @@ from csplat_trainer.outputs import Outputs, TrainResult
 from csplat_trainer.parameters import Parameters, to_model
 from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.pictures import compose
-from csplat_trainer.report import Progress, peak_memory, save_picture, side_by_side
+from csplat_trainer.report import TrainingStep, peak_memory, save_picture, side_by_side
 from csplat_trainer.resume import adapt
-from csplat_trainer.starting import Scene, scene_of, starting_splats
+from csplat_trainer.starting import StartingScene, scene_of, starting_splats
 
 __all__ = ["train"]
 
@@ -48,7 +48,7 @@ _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there a
 def train(
     data: DataSet,
     options: TrainOptions | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[TrainingStep], None] | None = None,
     outputs: Outputs | None = None,
 ) -> TrainResult:
     """Train splats on pictures.
@@ -101,7 +101,7 @@ class _Run:
         self._behind = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._behind, np.float32)
 
-    def to_the_end(self, progress: Callable[[Progress], None] | None) -> TrainResult:
+    def to_the_end(self, progress: Callable[[TrainingStep], None] | None) -> TrainResult:
         options, outputs = self._options, self._outputs
         window = _Window()
         spent = float(self._log["seconds"])  # by what was resumed
@@ -135,7 +135,7 @@ class _Run:
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
-    def _start(self, scene: Scene) -> dict[str, F32]:
+    def _start(self, scene: StartingScene) -> dict[str, F32]:
         options, data = self._options, self._data
         count = options.initial_splats
         if count == 0 and options.strategy in ("fixed", "none"):
@@ -198,9 +198,9 @@ class _Run:
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
         self._engine.parameters = parameters
 
-    def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> Progress:
+    def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
         mse = sum(window.errors) / len(window.errors)
-        now = Progress(
+        now = TrainingStep(
             iteration=self._iteration,
             iterations=self._options.iterations,
             loss=sum(window.losses) / len(window.losses),

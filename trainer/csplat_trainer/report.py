@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.files import atomic_writer
 
-__all__ = ["Progress", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side", "write_log"]
+__all__ = ["TrainingStep", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side", "write_log"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -24,7 +24,7 @@ _WINDOW_SHARE = 50  # the moving average spans this part of the run
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingStep:
     """Where a run stands.
 
     Attributes:

@@ -16,7 +16,7 @@ from csplat_render.camera import Camera
 from csplat_trainer.parameters import Splats
 from csplat_trainer.pictures import Picture
 
-__all__ = ["Scene", "scene_of", "starting_splats"]
+__all__ = ["StartingScene", "scene_of", "starting_splats"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -34,7 +34,7 @@ _PHOTO_BOX = 1.5  # photographs show what lies around their subject too
 
 
 @dataclass(frozen=True)
-class Scene:
+class StartingScene:
     """What the cameras say about a scene.
 
     Attributes:
@@ -49,7 +49,7 @@ class Scene:
     half: float
 
 
-def scene_of(pictures: Sequence[Picture]) -> Scene:
+def scene_of(pictures: Sequence[Picture]) -> StartingScene:
     """Find out where the scene lies.
 
     Args:
@@ -73,12 +73,12 @@ def scene_of(pictures: Sequence[Picture]) -> Scene:
     extent = 1.1 * float(spread)
     if extent <= 0.0:  # one camera, or several in one place
         extent = max(distance, 1e-3)
-    return Scene(extent, focus, max(half, 1e-6))
+    return StartingScene(extent, focus, max(half, 1e-6))
 
 
 def starting_splats(
     pictures: Sequence[Picture],
-    scene: Scene,
+    scene: StartingScene,
     count: int,
     sh_degree: int,
     rng: Generator,
@@ -120,7 +120,7 @@ def starting_splats(
     return _splats(means, colour, sh_degree, scene, rng)
 
 
-def _at_points(points: F32, colours: F32 | None, count: int, scene: Scene, rng: Generator) -> tuple[F64, F64]:
+def _at_points(points: F32, colours: F32 | None, count: int, scene: StartingScene, rng: Generator) -> tuple[F64, F64]:
     """Some of the points, or all of them and more beside them where more are wanted."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
@@ -133,7 +133,9 @@ def _at_points(points: F32, colours: F32 | None, count: int, scene: Scene, rng: 
     return means, colour[chosen]
 
 
-def _in_box(pictures: Sequence[Picture], scene: Scene, count: int, rng: Generator, *, masked: bool) -> tuple[F64, F64]:
+def _in_box(
+    pictures: Sequence[Picture], scene: StartingScene, count: int, rng: Generator, *, masked: bool
+) -> tuple[F64, F64]:
     """Points that cameras see, inside the hull of the masks where wanted, with the mean of their pixels."""
     found: list[F64] = []
     colours: list[F64] = []
@@ -182,7 +184,7 @@ def _pixels_at(picture: Picture, points: F64) -> tuple[NDArray[np.int64], F64]:
     return inside, picture.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
 
 
-def _splats(means: F64, colour: F64, sh_degree: int, scene: Scene, rng: Generator) -> Splats:
+def _splats(means: F64, colour: F64, sh_degree: int, scene: StartingScene, rng: Generator) -> Splats:
     count = len(means)
     spacing = np.log(_neighbour_distances(means, scene)).astype(np.float32)
     quats = rng.standard_normal((count, 4))
@@ -197,7 +199,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: Scene, rng: Generato
     }
 
 
-def _neighbour_distances(points: F64, scene: Scene) -> F64:
+def _neighbour_distances(points: F64, scene: StartingScene) -> F64:
     """Root mean square distance to the nearest three others, never 0.
 
     Where most points have others in the very same place, that says nothing: then as if they filled the scene's box.

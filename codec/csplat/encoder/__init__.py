@@ -10,7 +10,7 @@ from __future__ import annotations
 from csplat.encoder.coded import Coded, EncodeReport, EncodeResult
 from csplat.encoder.curvature import Curvatures
 from csplat.encoder.draft import Draft, Origin
-from csplat.encoder.frozen import Frozen, Held, Seen
+from csplat.encoder.frozen import DecodedValues, FreeValues, Frozen
 from csplat.encoder.gauge import fix_gauge
 from csplat.encoder.grades import most_grades
 from csplat.encoder.importance import Importance, trusted
@@ -22,15 +22,15 @@ __all__ = [
     "PRESETS",
     "Coded",
     "Curvatures",
+    "DecodedValues",
     "Draft",
     "EncodeOptions",
     "EncodeReport",
     "EncodeResult",
+    "FreeValues",
     "Frozen",
-    "Held",
     "Importance",
     "Origin",
-    "Seen",
     "cluster",
     "encode",
     "encode_with_report",

@@ -14,7 +14,7 @@ import numpy as np
 from csplat import _spec
 from csplat.encoder.streams import Coding, unsigned_stream
 
-__all__ = ["CodebookTable", "FileChunk", "FileTile", "Scene", "json_payload", "write"]
+__all__ = ["CodebookTable", "FileChunk", "FileTile", "SceneFields", "json_payload", "write"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class CodebookTable:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneFields:
     """Everything that a file says about the scene as a whole."""
 
     profile: int
@@ -72,7 +72,7 @@ def json_payload(value: Any, coding: Coding) -> bytes:
     return unsigned_stream(np.frombuffer(text.encode(), np.uint8), coding)
 
 
-def write(scene: Scene, tiles: Sequence[FileTile]) -> bytes:
+def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
     """Lay out header, index and chunks in the order the spec recommends (4.3.6)."""
     index_size = _index_size(scene, tiles)
     offset = _spec.HEADER_SIZE + index_size
@@ -93,7 +93,7 @@ def write(scene: Scene, tiles: Sequence[FileTile]) -> bytes:
     return _with_header(scene.profile, index, parts, offset)
 
 
-def _in_order(scene: Scene, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
+def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
     """Yield each chunk with its (tile, layer), or None for chunks of the whole file."""
     yield from ((None, chunk) for chunk in scene.chunks if chunk.type != _spec.CHUNK_CODEBOOK)
     for layer in _spec.LAYER_NAMES:
@@ -113,7 +113,7 @@ def _frame(chunk: FileChunk, flags: int) -> bytes:
     return head + chunk.payload + crc.to_bytes(4, "little")
 
 
-def _index_size(scene: Scene, tiles: Sequence[FileTile]) -> int:
+def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
     return (
         _spec.INDEX_HEAD_SIZE
         + len(scene.attributes) * _spec.ATTRIBUTE_RECORD_SIZE
@@ -128,7 +128,7 @@ def _index_size(scene: Scene, tiles: Sequence[FileTile]) -> int:
 
 
 def _index(
-    scene: Scene,
+    scene: SceneFields,
     tiles: Sequence[FileTile],
     directory: Sequence[_spec.DirectoryRecord],
     layers: Mapping[tuple[int, int], _spec.LayerRecord],

@@ -29,7 +29,7 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Frozen", "Held", "Seen"]
+__all__ = ["DecodedValues", "FreeValues", "Frozen"]
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -37,7 +37,7 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(eq=False)
-class Held:
+class FreeValues:
     """Values of a frozen scene before they are quantised, float32; whoever tunes them changes them in place.
 
     Attributes:
@@ -60,13 +60,13 @@ class Held:
     sh: F32
     sizes: F32
 
-    def copy(self) -> Held:
+    def copy(self) -> FreeValues:
         """The same values in arrays of their own."""
-        return Held(*(getattr(self, one.name).copy() for one in fields(self)))
+        return FreeValues(*(getattr(self, one.name).copy() for one in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class DecodedValues:
     """What a decoder will see: the arrays of a `SplatModel`, unchecked, SH up to the degree that is kept."""
 
     means: F32
@@ -117,7 +117,7 @@ class Frozen:
 
     @property
     def stages(self) -> Sequence[I32]:
-        """By stage of the codebook [N], which row of its part of `Held.sh` each splat uses; empty without a codebook.
+        """By stage of the codebook [N], which row of its part of `sh` each splat uses; empty without a codebook.
 
         The size of the first stage says "escaped".
         """
@@ -140,7 +140,7 @@ class Frozen:
         """The codebook of shapes, if there is one."""
         return self.draft.shapes
 
-    def start(self) -> Held:
+    def start(self) -> FreeValues:
         """Values as the encoder found them."""
         model, plan = self.draft.model, self.plan
         kept = (plan.sh_degree + 1) ** 2 - 1
@@ -154,11 +154,11 @@ class Frozen:
             quats = np.concatenate([quat_values(shared[3:], plan.quat_levels).T, quats[own]])
             scales = np.concatenate([lattice_values(shared[:3], plan.scale_step).T, scales[own]])
             sizes = lattice_values(self.shapes.summand, plan.scale_step)
-        held = Held(model.means, quats, scales, model.opacities, model.sh0, sh, sizes).copy()
+        held = FreeValues(model.means, quats, scales, model.opacities, model.sh0, sh, sizes).copy()
         self.constrain(held)
         return held
 
-    def constrain(self, held: Held) -> None:
+    def constrain(self, held: FreeValues) -> None:
         """Bring values that moved back to where the file can hold them: into their tiles, w >= 0, zeros to zero."""
         np.clip(held.means, self.low, self.high, out=held.means)
         turned = held.quats[:, 0] < 0.0
@@ -169,7 +169,7 @@ class Frozen:
         if self.shapes is not None:
             held.sizes[self.shapes.escaped] = 0.0
 
-    def coded(self, held: Held, progress: Progress | None = None) -> Coded:
+    def coded(self, held: FreeValues, progress: Progress | None = None) -> Coded:
         """Code these values; `decode` gives `seen(held)` back, in the order of the file's source index.
 
         Args:
@@ -194,7 +194,7 @@ class Frozen:
         errors = measured_sums(self.source, decoded, self.source_index)
         return Coded.of(replace(self.draft, model=model, shapes=shapes), books, errors=errors, progress=progress)
 
-    def seen(self, held: Held) -> Seen:
+    def seen(self, held: FreeValues) -> DecodedValues:
         """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""
         tiles, plan = self.draft.tiles, self.plan
         if self.draft.options.threads == 1:
@@ -205,7 +205,7 @@ class Frozen:
                 later_sh, later_shapes = pool.submit(self.seen_sh, held.sh), pool.submit(self._seen_shapes, held)
                 means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
                 shN, (quats, scales) = later_sh.result(), later_shapes.result()
-        return Seen(means, quats, scales, seen_opacities(held.opacities, tiles, plan), sh0, shN)
+        return DecodedValues(means, quats, scales, seen_opacities(held.opacities, tiles, plan), sh0, shN)
 
     def seen_sh0(self, sh0: F32) -> F32:
         """Degree-0 colours [N, 3] as a decoder will see them."""
@@ -235,7 +235,7 @@ class Frozen:
         entries = [_as_values(stage, self.plan) for stage in self._tables(sh).entries]
         return np.concatenate([*entries, self._seen_escapes(sh)])
 
-    def seen_shape_rows(self, held: Held, seen: Seen) -> tuple[F32, F32, F32]:
+    def seen_shape_rows(self, held: FreeValues, seen: DecodedValues) -> tuple[F32, F32, F32]:
         """Rotations, scales and sizes of `held` as their streams hold them; `seen` is what a decoder makes of them."""
         shapes = self._shapes(held)[0]
         if shapes is None:
@@ -245,7 +245,7 @@ class Frozen:
         scales = np.concatenate([lattice_values(shapes.entries[:3], self.plan.scale_step).T, seen.scales[own]])
         return quats, scales, lattice_values(shapes.summand, self.plan.scale_step)
 
-    def _seen_shapes(self, held: Held) -> tuple[F32, F32]:
+    def _seen_shapes(self, held: FreeValues) -> tuple[F32, F32]:
         shapes, quats, scales = self._shapes(held)
         return seen_shapes(quats, scales, self.draft.tiles, self.plan, shapes)
 
@@ -253,7 +253,7 @@ class Frozen:
         coarse = np.full(len(self.escaped), self.plan.escape_coarse, np.int32)
         return quantise_rows(sh[sum(self.stage_sizes) :], self.plan, coarse)[2]
 
-    def _shapes(self, held: Held) -> tuple[ShapeTables | None, F32, F32]:
+    def _shapes(self, held: FreeValues) -> tuple[ShapeTables | None, F32, F32]:
         """The codebook of shapes with these values, and rotations and scales by splat, which it stands in for."""
         if self.shapes is None:
             return None, held.quats, held.scales

@@ -10,7 +10,7 @@ import numpy as np
 from csplat import _spec
 from csplat.encoder.codebook import Books
 from csplat.encoder.colour import ShTables
-from csplat.encoder.container import FileChunk, Scene, json_payload
+from csplat.encoder.container import FileChunk, SceneFields, json_payload
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan
@@ -102,13 +102,13 @@ def file_chunks(draft: Draft, errors: ErrorSums, settings: dict[str, Any]) -> li
     return chunks
 
 
-def file_scene(draft: Draft, books: Books, chunks: Sequence[FileChunk]) -> Scene:
+def file_scene(draft: Draft, books: Books, chunks: Sequence[FileChunk]) -> SceneFields:
     """Gather what header and index say of the scene."""
     model, plan = draft.model, draft.plan
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
     flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
-    return Scene(
+    return SceneFields(
         profile=plan.profile,
         sh_degree=plan.sh_degree,
         scene_flags=flags,

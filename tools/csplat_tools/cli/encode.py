@@ -19,7 +19,7 @@ from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import Progress, format_bytes, format_table, note
-from csplat_tools.files.convert import Encoded, Encoder, Made, encode_file
+from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import prepare_renderer
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def _reach(
     model: SplatModel,
     encoding: EncodeOptions,
     progress: Progress | None,
-) -> Made:
+) -> EncodedScene:
     """The file that keeps to the target."""
     from csplat_tools.files.importance import read_weights
 
@@ -213,7 +213,7 @@ def _reach(
         made = optimise(
             model, target, around, encoding, keep_all=goal.keep_all, importance=weights, progress=progress
         )  # fmt: skip
-    return Made(made.result, "target", made.report.as_json(), made.report.lines())
+    return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
 
 
 def _forecast(seconds: float, *, may_keep_all: bool) -> str:

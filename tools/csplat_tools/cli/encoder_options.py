@@ -10,7 +10,7 @@ import typer
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat_tools.cli.options import Group, chosen
 from csplat_tools.cli.settings import Settings
-from csplat_tools.files.convert import SceneFacts
+from csplat_tools.files.convert import SceneOverrides
 
 __all__ = ["ENCODER", "Encoding", "Facts", "Preset", "check_preset"]
 
@@ -52,9 +52,9 @@ class Facts(Group):
         str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, hidden=True, help="Into the metadata.")
     ] = None
 
-    def read(self) -> SceneFacts:
+    def read(self) -> SceneOverrides:
         """What the scene is told."""
-        return SceneFacts(self.axes, self.unit_metres, self.antialiased, self.licence)
+        return SceneOverrides(self.axes, self.unit_metres, self.antialiased, self.licence)
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from csplat_tools.files.streams import STANDARD_STREAM, mapped_csplat, ply_path,
 
 __all__ = [
     "Encoded",
+    "EncodedScene",
     "Encoder",
-    "Made",
-    "SceneFacts",
+    "SceneOverrides",
     "Source",
     "decode_file",
     "encode_file",
@@ -33,7 +33,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Made:
+class EncodedScene:
     """A file, and what whoever made it has to say.
 
     Attributes:
@@ -50,13 +50,13 @@ class Made:
 
 
 #: Makes a file of a scene.
-Encoder = Callable[[SplatModel, EncodeOptions, Progress | None], Made]
+Encoder = Callable[[SplatModel, EncodeOptions, Progress | None], EncodedScene]
 
 _SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
 
 
 @dataclass(frozen=True)
-class SceneFacts:
+class SceneOverrides:
     """What a PLY may not say of its scene; `None` keeps what it says.
 
     Attributes:
@@ -92,7 +92,7 @@ class Encoded:
         seconds: reading, encoding and writing.
     """
 
-    made: Made
+    made: EncodedScene
     findings: tuple[Finding, ...]
     source_bytes: int
     seconds: float
@@ -140,7 +140,7 @@ class Source:
 
 def read_source(
     path: str,
-    facts: SceneFacts | None = None,
+    facts: SceneOverrides | None = None,
     *,
     strict: bool = False,
     keep_extra: bool = False,
@@ -167,7 +167,7 @@ def read_source(
         size_bytes = local.stat().st_size
     report("reading", 1.0)
     name = "standard input" if path == STANDARD_STREAM else Path(path).name
-    return Source(name, size_bytes, (facts or SceneFacts()).applied(model), tuple(findings))
+    return Source(name, size_bytes, (facts or SceneOverrides()).applied(model), tuple(findings))
 
 
 def encode_file(
@@ -175,7 +175,7 @@ def encode_file(
     target: str,
     options: EncodeOptions,
     *,
-    facts: SceneFacts | None = None,
+    facts: SceneOverrides | None = None,
     strict: bool = False,
     importance: str | None = None,
     prune_unseen: bool = False,
@@ -209,11 +209,13 @@ def encode_file(
     elif importance is None:
         if prune_unseen:
             raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
-        made = Made(encode_with_report(model, options, progress=progress))
+        made = EncodedScene(encode_with_report(model, options, progress=progress))
     else:
         from csplat_tools.files.importance import encode_by_importance  # wants names of trainer and renderer
 
-        made = Made(encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress))
+        made = EncodedScene(
+            encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
+        )
     write_bytes(target, made.result.data)
     if source_index is not None:
         write_array(source_index, made.result.source_index)

@@ -24,7 +24,7 @@ from csplat_tools.views import evenly
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
-__all__ = ["Fitted"]
+__all__ = ["FittedSplats"]
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
@@ -41,7 +41,7 @@ _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, wi
 
 
 @dataclass(eq=False)
-class Fitted:
+class FittedSplats:
     """So many splats of a scene, fitted. Owns the colours of its last file, where the next fit begins.
 
     Attributes:

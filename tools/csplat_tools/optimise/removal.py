@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import LEAST_QUANTISED, error_at_size, error_of_psnr, log_bytes_at_error
-from csplat_tools.optimise.fitted import Fitted
+from csplat_tools.optimise.fitted import FittedSplats
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import removal_order
 from csplat_tools.optimise.simplify.simplify import Session, prepare
@@ -75,13 +75,13 @@ class Removal:
         views = self._session.views
         return len(views.used) * len(self._session.order.rounds) + len(views.check)
 
-    def fitted(self, left: int, allowed: float | None, seen: Seen) -> Fitted:
-        """So many splats, or those that no view saw if they are more; see `Fitted`."""
+    def fitted(self, left: int, allowed: float | None, seen: Seen) -> FittedSplats:
+        """So many splats, or those that no view saw if they are more; see `FittedSplats`."""
         gone = len(self.source) - left
         if gone > len(self.session.order.rows):
             self._extend(left, math.inf)
         gone = min(gone, len(self.session.order.rows))
-        return Fitted(self.session, gone, allowed, seen, self.grades, self.progress)
+        return FittedSplats(self.session, gone, allowed, seen, self.grades, self.progress)
 
     def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:
         """How many splats to begin with for the smallest file of a PSNR.

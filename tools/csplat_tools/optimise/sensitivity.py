@@ -21,7 +21,14 @@ from csplat_tools.views.agreeing import find_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
-__all__ = ["Measured", "measure_scene", "measure_views", "measured_for", "measured_importance", "measuring_views"]
+__all__ = [
+    "MeasuredSensitivity",
+    "measure_scene",
+    "measure_views",
+    "measured_for",
+    "measured_importance",
+    "measuring_views",
+]
 
 Weights = NDArray[Any] | Importance
 
@@ -33,7 +40,7 @@ _LARGE = 40_000  # splats: of fewer, half of the views would change the size of 
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredSensitivity:
     """What was found.
 
     Attributes:
@@ -77,7 +84,7 @@ def measure_scene(
     matrices: bool = True,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Measured:
+) -> MeasuredSensitivity:
     """Measure a scene from views that teach: of virtual ones as many as it takes, of others all.
 
     Args:
@@ -104,7 +111,7 @@ def measure_scene(
     if check:
         elsewhere = measure_removal(model, check, background=views.background, threads=threads).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
-    return Measured(model, measured, source, missed)
+    return MeasuredSensitivity(model, measured, source, missed)
 
 
 def measure_views(

@@ -19,7 +19,7 @@ from csplat_render.judge import renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_tools.files.console import Progress
 from csplat_tools.inspect.info import byte_shares
-from csplat_tools.tradeoff.points import Made, ModeTime, Partial, Point
+from csplat_tools.tradeoff.points import ModeTime, Partial, Point, TriedFile
 from csplat_tools.tradeoff.setting import Setting
 from csplat_tools.tradeoff.showing import WorstView
 from csplat_tools.tradeoff.sweep import Candidate
@@ -118,7 +118,7 @@ class Measurer:
             shown=worst.shown(),
         )
 
-    def _partial(self, made: Made, header: SceneHeader) -> list[Partial]:
+    def _partial(self, made: TriedFile, header: SceneHeader) -> list[Partial]:
         return [self._part(made.data, header, degree) for degree in range(header.sh_degree + 1)]
 
     def _part(self, data: bytes, header: SceneHeader, degree: int) -> Partial:

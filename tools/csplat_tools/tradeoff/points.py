@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from csplat_render.metrics import Scores
 
-__all__ = ["Failure", "Made", "ModeTime", "Partial", "Point", "Shown", "pareto_front"]
+__all__ = ["Failure", "ModeTime", "Partial", "Point", "Shown", "TriedFile", "pareto_front"]
 
 U8 = NDArray[np.uint8]
 
@@ -19,7 +19,7 @@ _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class TriedFile:
     """A file, before anything is measured.
 
     Attributes:

@@ -14,7 +14,7 @@ from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.optimise.target import Target
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoff.options import Wanted
-from csplat_tools.tradeoff.points import Made
+from csplat_tools.tradeoff.points import TriedFile
 from csplat_tools.tradeoff.setting import Setting
 from csplat_tools.training.finetune import (
     BYTE_COST,
@@ -28,7 +28,7 @@ from csplat_tools.training.finetune import (
 )
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
-from csplat_trainer.finetune import FinetuneOptions, Moment
+from csplat_trainer.finetune import FinetuneOptions, TuningStep
 
 __all__ = ["Candidate", "candidates"]
 
@@ -49,7 +49,7 @@ class Candidate:
 
     name: str
     family: str
-    make: Callable[[Progress], Made]
+    make: Callable[[Progress], TriedFile]
     is_partial: bool = False
     cost: str | None = None
 
@@ -119,11 +119,11 @@ def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
         yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(_tune, setting, wanted, keep))
 
 
-def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> Made:
+def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> TriedFile:
     return _made(encode_with_report(source, options, progress=progress))
 
 
-def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Progress) -> Made:
+def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Progress) -> TriedFile:
     return _made(
         encode_reduced(
             setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
@@ -132,17 +132,17 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Pr
     )  # fmt: skip
 
 
-def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -> Made:
+def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -> TriedFile:
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
     found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)
     return _made(found.result, target=found.report.as_json())
 
 
-def _made(result: EncodeResult, **said: Any) -> Made:
-    return Made(result.data, {"encoding": result.report.options, **said})
+def _made(result: EncodeResult, **said: Any) -> TriedFile:
+    return TriedFile(result.data, {"encoding": result.report.options, **said})
 
 
-def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> Made:
+def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> TriedFile:
     """The file that `csplat finetune` makes with its usual options, but for which virtual views decide."""
     itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
@@ -150,12 +150,12 @@ def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progre
     clock = Clock()
     plan = plan_tuning(setting.source, _tuning_views(setting), encoding, clock, keep=keep, progress=progress)
 
-    def show(now: Moment) -> None:
+    def show(now: TuningStep) -> None:
         progress("tuning", now.iteration / now.iterations)
 
     tuned = tune(plan, options.scaled(LEARNING_FACTOR[itself]), clock, threads=wanted.threads, show=show)
     said = {"steps": tuned.log["steps"], "best_step": tuned.log["best_iteration"], "keep": keep, **plan.chosen.said}
-    return Made(tuned.result.data, {"encoding": tuned.result.report.options, "finetune": said}, clock.seconds)
+    return TriedFile(tuned.result.data, {"encoding": tuned.result.report.options, "finetune": said}, clock.seconds)
 
 
 def _tuning_views(setting: Setting) -> ViewSet:

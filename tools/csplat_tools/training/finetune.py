@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Origin, Seen
+from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Frozen, Origin
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
@@ -22,7 +22,7 @@ from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.views import ViewSet
-from csplat_trainer.finetune import FinetuneOptions, Moment, Views, finetune
+from csplat_trainer.finetune import FinetuneOptions, TuningStep, Views, finetune
 from csplat_trainer.outputs import Outputs
 
 __all__ = [
@@ -202,7 +202,7 @@ def tune(
     files: Outputs | None = None,
     *,
     threads: int | None = None,
-    show: Callable[[Moment], None] | None = None,
+    show: Callable[[TuningStep], None] | None = None,
 ) -> Tuned:
     """Move the values until pictures look right, and encode them.
 
@@ -237,7 +237,7 @@ def tune(
     return Tuned(result, decoded, tuned.log)
 
 
-def _check_identity(seen: Seen, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
+def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
     """Raise a `RuntimeError` unless what was tuned is what was written, bit for bit: no file would be better."""
     places = np.empty(int(source_index.max()) + 1, np.int64)
     places[source_index] = np.arange(len(source_index))
@@ -247,7 +247,7 @@ def _check_identity(seen: Seen, source_index: I64, result: EncodeResult, decoded
             raise RuntimeError(f"the file holds other {name} than were tuned: a fault of csplat, please report it")
 
 
-def _state(now: Moment) -> str:
+def _state(now: TuningStep) -> str:
     return (
         f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, validation {now.validation_psnr:.2f} dB"
         f" (best {now.best_psnr:.2f}), {now.seconds:.0f} s, {now.seconds_left:.0f} s left"

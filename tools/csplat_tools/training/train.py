@@ -19,7 +19,7 @@ from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.report import Progress, plot_loss
+from csplat_trainer.report import TrainingStep, plot_loss
 
 __all__ = ["run_training"]
 
@@ -89,7 +89,7 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
         raise InputError(f"{files.previews} is not a folder")
 
 
-def _state(now: Progress) -> str:
+def _state(now: TrainingStep) -> str:
     return (
         f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB, {now.splat_count} splats,"
         f" SH {now.sh_degree}, {now.seconds:.0f} s, {now.seconds_left:.0f} s left"

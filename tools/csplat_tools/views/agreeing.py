@@ -22,7 +22,7 @@ from csplat_render.removal import Removal, measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.views import CHECKS, VIEW_SIZE, ViewSet, reduced
 
-__all__ = ["Measured", "find_views", "removal_keys"]
+__all__ = ["AgreedViews", "find_views", "removal_keys"]
 
 F64 = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ _SETTLED = 0.005  # share of the splats that the check views alone show, below w
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class AgreedViews:
     """Cameras that teach, others to check by, and what those that teach say.
 
     Attributes:
@@ -58,7 +58,7 @@ def find_views(
     size: tuple[int, int] = VIEW_SIZE,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Measured:
+) -> AgreedViews:
     """Take as many of the teaching views as it needs, and measure the source from them.
 
     Args:
@@ -93,7 +93,7 @@ def find_views(
             break
         removal += measured(every[count : count + _BATCH])
         count = min(count + _BATCH, len(every))
-    return Measured(every[:count], check, removal, _gap(model, removal, checked, gone))
+    return AgreedViews(every[:count], check, removal, _gap(model, removal, checked, gone))
 
 
 def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
-from csplat.encoder import Frozen, Held
+from csplat.encoder import FreeValues, Frozen
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, Parameters
@@ -52,7 +52,7 @@ class FinetuneCheckpoint:
     queue: list[int]
     options: dict[str, Any]
     log: dict[str, Any]
-    best_held: Held
+    best_held: FreeValues
     costs: dict[str, NDArray[np.float32]]
     best: tuple[float, float, int, int]
 
@@ -100,7 +100,7 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
     if len(facts["best"]) != _BEST or not all(isinstance(one, (int, float)) for one in facts["best"]):
         stored.refuse(f"its best look is {facts['best']}")
     parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
-    best = Held(*(stored[f"best_{name}"] for name in _HELD))
+    best = FreeValues(*(stored[f"best_{name}"] for name in _HELD))
     costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
     if any(table.ndim != 2 or table.dtype != np.float32 or not np.isfinite(table).all() for table in costs.values()):
         stored.refuse("its costs are no tables of float32")
@@ -129,7 +129,7 @@ def fingerprint(frozen: Frozen) -> str:
     return digest.hexdigest()
 
 
-def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: Held) -> None:
+def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: FreeValues) -> None:
     shapes = {name: getattr(start, name).shape for name in _HELD}
     found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_held, name)] for name in _HELD}
     parameters = checkpoint.parameters

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from csplat.encoder import Frozen, Held, Seen
+from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasterise import Rasteriser, Splats
@@ -25,7 +25,7 @@ from csplat_trainer.finetune.views import View, Views
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
 
-__all__ = ["FinetuneResult", "Moment", "finetune"]
+__all__ = ["FinetuneResult", "TuningStep", "finetune"]
 
 F32 = NDArray[np.float32]
 
@@ -34,7 +34,7 @@ _LEAST_GAIN = 2e-4  # of the score that counts as a gain
 
 
 @dataclass(frozen=True)
-class Moment:
+class TuningStep:
     """Where a run stands.
 
     Attributes:
@@ -63,7 +63,7 @@ class FinetuneResult:
         log: JSON-compatible: options, losses, looks, times.
     """
 
-    held: Held
+    held: FreeValues
     log: dict[str, Any]
 
 
@@ -72,7 +72,7 @@ def finetune(
     views: Views,
     options: FinetuneOptions | None = None,
     *,
-    progress: Callable[[Moment], None] | None = None,
+    progress: Callable[[TuningStep], None] | None = None,
     checkpoint: str | Path | None = None,
     checkpoint_every: int = 0,
     resume: str | Path | None = None,
@@ -105,7 +105,7 @@ def finetune(
 class _Best:
     """The best look so far, and how many that count came after it."""
 
-    held: Held
+    held: FreeValues
     score: float
     psnr: float
     iteration: int = 0
@@ -157,7 +157,7 @@ class _Run:
             self._costs = Costs(self._scene.frozen, self._options.byte_cost, checkpoint.costs)
 
     def to_the_end(
-        self, progress: Callable[[Moment], None] | None, checkpoint: str | Path | None, checkpoint_every: int
+        self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
     ) -> FinetuneResult:
         options = self._options
         begin, first, spent = time.perf_counter(), self._iteration, float(self._log["seconds"])
@@ -222,7 +222,7 @@ class _Run:
             "shN": (options.lr_entries if self._scene.frozen.stage_sizes else options.lr_shN) * share,
         }
 
-    def _render(self, seen: Seen, view: View) -> F32:
+    def _render(self, seen: DecodedValues, view: View) -> F32:
         splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
         return self._rasteriser.forward(
             splats, view.camera, background=self._views.background, antialiased=self._antialiased
@@ -257,9 +257,9 @@ class _Run:
             self._sizes[size] = _Buffers(loss, np.empty((*size, 3), np.float32))
         return self._sizes[size]
 
-    def _moment(self, window: list[float], left: float) -> Moment:
+    def _moment(self, window: list[float], left: float) -> TuningStep:
         assert self._best is not None
-        return Moment(
+        return TuningStep(
             self._iteration,
             self._options.iterations,
             sum(window) / max(1, len(window)),

@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from csplat.encoder import Frozen, Held, Seen
+from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat_render.arrays import Gradients
 from csplat_trainer.finetune.rate import Costs, Stored
 from csplat_trainer.kernels import parallel_kernel
@@ -34,7 +34,7 @@ class TunedScene:
 
     Attributes:
         frozen: as given.
-        parameters: named as in training, but `quats`, `scales` and `shN` hold the rows of `Held`, and `sizes` is there.
+        parameters: named as in training, but `quats`, `scales`, `shN` hold the rows of `FreeValues`; and `sizes`.
     """
 
     def __init__(self, frozen: Frozen, parameters: Parameters | None = None) -> None:
@@ -48,20 +48,20 @@ class TunedScene:
         self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
 
     @property
-    def held(self) -> Held:
+    def held(self) -> FreeValues:
         """The values as the encoder takes them; all but the opacities are the parameters' own arrays."""
         return self._held(sigmoid(self.parameters.values["logits"]))
 
-    def _held(self, alphas: F32) -> Held:
+    def _held(self, alphas: F32) -> FreeValues:
         v = self.parameters.values
-        return Held(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
+        return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
-    def seen(self) -> tuple[Seen, F32]:
+    def seen(self) -> tuple[DecodedValues, F32]:
         """What a decoder will see, and the opacities before they were quantised."""
         held = self.held
         return self.frozen.seen(held), held.opacities
 
-    def stored(self, seen: Seen) -> Stored:
+    def stored(self, seen: DecodedValues) -> Stored:
         """What the streams of the file hold, as a decoder will see it."""
         sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self._users else seen.shN
         if self.frozen.shapes is None:
@@ -69,11 +69,13 @@ class TunedScene:
         quats, scales, sizes = self.frozen.seen_shape_rows(self._held(seen.opacities), seen)
         return Stored(quats, scales, sizes, seen.opacities, seen.sh0, sh)
 
-    def count(self, seen: Seen, weight: float) -> Costs:
+    def count(self, seen: DecodedValues, weight: float) -> Costs:
         """Count what the integers of the file cost, at a weight in loss per bit and splat."""
         return Costs.counted(self.frozen, self.stored(seen), weight)
 
-    def step(self, gradients: Gradients, seen: Seen, alphas: F32, rates: dict[str, float], costs: Costs | None) -> None:
+    def step(
+        self, gradients: Gradients, seen: DecodedValues, alphas: F32, rates: dict[str, float], costs: Costs | None
+    ) -> None:
         """Move the values against the gradients by what was seen.
 
         Args:
@@ -121,7 +123,7 @@ class TunedScene:
         return quats, scales, gradients.scales.sum(axis=1)
 
 
-def _values(held: Held) -> Splats:
+def _values(held: FreeValues) -> Splats:
     alpha = np.clip(held.opacities.astype(np.float64), *_ALPHAS)
     return {
         "means": held.means,

@@ -17,7 +17,7 @@ from csplat_bench.common.scenes import DATA
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
-from csplat_trainer.report import Progress
+from csplat_trainer.report import TrainingStep
 
 __all__ = ["CAPTURES", "Capture", "Training", "choose_captures", "read_training", "train_to", "trained"]
 
@@ -134,7 +134,7 @@ def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
     """Train a scene and write its PLY, and beside that how it was trained."""
     every = max(1, options.iterations // _TOLD // options.log_every) * options.log_every
 
-    def show(now: Progress) -> None:
+    def show(now: TrainingStep) -> None:
         if now.iteration % every == 0:
             tell(f"{ply.stem}: {now.iteration}/{now.iterations}, {now.splat_count} splats, {now.seconds:.0f} s")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeResult, Frozen, Held
+from csplat.encoder import EncodeResult, FreeValues, Frozen
 from csplat.model import SplatModel
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.compression.rows import Step
@@ -83,7 +83,7 @@ def _served_shapes(
     return replace(model, quats=np.where(own, model.quats, quats), scales=np.where(own, model.scales, scales))
 
 
-def _as_model(frozen: Frozen, held: Held) -> SplatModel:
+def _as_model(frozen: Frozen, held: FreeValues) -> SplatModel:
     """What a decoder will see, from memory."""
     seen, model = frozen.seen(held), frozen.draft.model
     shN = np.zeros_like(model.shN)
@@ -92,7 +92,7 @@ def _as_model(frozen: Frozen, held: Held) -> SplatModel:
     return replace(model, **arrays, shN=shN)
 
 
-def _unordered(frozen: Frozen, held: Held) -> EncodeResult:
+def _unordered(frozen: Frozen, held: FreeValues) -> EncodeResult:
     """The same file with the splats of each tile in the order of the source, their centres coded axis by axis."""
     draft = frozen.draft
     tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in draft.tiles]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Frozen, Held, Importance, Seen
+from csplat.encoder import DecodedValues, EncodeOptions, FreeValues, Frozen, Importance
 from csplat.model import SplatModel
 from csplat_bench.common.measuring import timed
 from csplat_bench.compression.rows import Control
@@ -29,13 +29,13 @@ class Unquantised(Frozen):
         assert frozen.shapes is None
         return cls(**{**vars(frozen), "zero": None})
 
-    def constrain(self, held: Held) -> None:
+    def constrain(self, held: FreeValues) -> None:
         """Leave values where they are: no file bounds them."""
 
-    def seen(self, held: Held) -> Seen:
+    def seen(self, held: FreeValues) -> DecodedValues:
         """The values themselves, in arrays of their own."""
         here = held.copy()
-        return Seen(here.means, here.quats, here.scales, here.opacities, here.sh0, here.sh)
+        return DecodedValues(here.means, here.quats, here.scales, here.opacities, here.sh0, here.sh)
 
 
 def control(bench: Bench) -> Control:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode, read_header
-from csplat.encoder import Draft, EncodeOptions, EncodeResult, Frozen, Held, Importance, Origin
+from csplat.encoder import Draft, EncodeOptions, EncodeResult, FreeValues, Frozen, Importance, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -53,7 +53,7 @@ class Tuned:
 
     chosen: Chosen
     frozen: Frozen
-    held: Held
+    held: FreeValues
     plain: EncodeResult
     result: EncodeResult
     log: Mapping[str, Any]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import Frozen, Held
+from csplat.encoder import FreeValues, Frozen
 from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.finetune.rate import colour_integers_of
 
@@ -86,7 +86,7 @@ def _whole_bytes(low: int, high: int) -> int:
     return (int(high - low).bit_length() + 7) // 8
 
 
-def integer_columns(frozen: Frozen, held: Held) -> Sequence[NDArray[np.int64]]:
+def integer_columns(frozen: Frozen, held: FreeValues) -> Sequence[NDArray[np.int64]]:
     """Every integer that the file of some values holds, as arrays [n, C], in no order of meaning.
 
     Args:

@@ -17,7 +17,7 @@ from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 
-__all__ = ["Fitted", "fit", "refitted"]
+__all__ = ["ColourFit", "fit", "refitted"]
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -25,7 +25,7 @@ _SECOND_STEPS = 4  # of a fit after something has changed a little
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class ColourFit:
     """A scene with new colours, and opacities and scales adjusted.
 
     Attributes:
@@ -46,7 +46,7 @@ def fit(
     options: SimplifyOptions,
     *,
     progress: Progress | None = None,
-) -> Fitted:
+) -> ColourFit:
     """Fit colours; adjust opacities and scales; set bands to zero; after each of the two fit colours once more.
 
     Args:
@@ -75,7 +75,7 @@ def fit(
         moved = fitted(moved, _SECOND_STEPS, None)
         model = moved if errors[-1][-1] < errors[-2][-1] else model
     if not options.bands or not model.sh_degree:
-        return Fitted(model, None, tuple(errors))
+        return ColourFit(model, None, tuple(errors))
     removal = measure_removal(model, cameras, background=options.background, threads=options.threads, progress=progress)
     left = min(one[-1] for one in errors) if errors else 0.0
     stays = band_mask(removal, left / max(1, len(model)))
@@ -83,7 +83,7 @@ def fit(
         model = without(model, stays)
         if options.refit:
             model = fitted(model, _SECOND_STEPS, free_coefficients(stays))
-    return Fitted(model, stays, tuple(errors))
+    return ColourFit(model, stays, tuple(errors))
 
 
 def refitted(

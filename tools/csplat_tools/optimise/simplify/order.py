@@ -12,7 +12,7 @@ from csplat.model import SplatModel
 from csplat_render.removal import measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
-from csplat_tools.views.agreeing import Measured, removal_keys
+from csplat_tools.views.agreeing import AgreedViews, removal_keys
 
 __all__ = ["Order", "Round", "removal_order"]
 
@@ -61,7 +61,7 @@ class Order:
 
 def removal_order(
     model: SplatModel,
-    views: Measured,
+    views: AgreedViews,
     options: SimplifyOptions,
     left: int | None,
     progress: Progress | None = None,

@@ -16,12 +16,12 @@ from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
 from csplat_tools.files.console import Progress
-from csplat_tools.optimise.simplify.colours import Fitted, fit
+from csplat_tools.optimise.simplify.colours import ColourFit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import Order, removal_order
 from csplat_tools.optimise.target import Target
 from csplat_tools.views import ViewSet, find_view_set
-from csplat_tools.views.agreeing import Measured, find_views
+from csplat_tools.views.agreeing import AgreedViews, find_views
 
 __all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "simplify"]
 
@@ -69,7 +69,7 @@ class Session:
     source: SplatModel
     options: SimplifyOptions
     around: ViewSet
-    views: Measured
+    views: AgreedViews
     wanted: list[F32]
     order: Order
     checked: Judge
@@ -83,7 +83,7 @@ class Session:
         """The largest error among the first `gone`."""
         return float(self.order.errors[:gone].max(initial=0.0))
 
-    def fitted(self, rows: I64, progress: Progress | None = None) -> Fitted:
+    def fitted(self, rows: I64, progress: Progress | None = None) -> ColourFit:
         """Fit what is left."""
         return fit(self.source.select(rows), self.views.used, self.wanted, self.options, progress=progress)
 
