@@ -30,7 +30,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say how many tests went without the shared scenes: those are no part of a clone."""
-    skipped = [one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in one.keywords]
+    skipped = [
+        one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
+    ]
     if skipped:
         terminalreporter.section(f"{len(skipped)} tests skipped that want shared scenes", sep="=")
         terminalreporter.line(

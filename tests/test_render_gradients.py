@@ -12,6 +12,7 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 from csplat.ply import read_ply
 from csplat_render import Camera
 from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.virtual import virtual_cameras
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools" / "benchmarks"))
 
@@ -53,6 +54,15 @@ def test_gradients_are_those_of_autograd(degree, antialiased):
     np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
     for group in GROUPS:
         assert relative_error(getattr(gradients, group), wanted[group]) <= 1e-6, group
+
+
+def test_float32_gradients_are_those_of_float64_on_the_sample(sample_path):
+    model = read_ply(sample_path)
+    (view,) = virtual_cameras(model, 1, 160, 120)
+    flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
+    assert flipped <= 10
+    for group, error in errors.items():
+        assert error <= 1e-4, group
 
 
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
