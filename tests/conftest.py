@@ -18,13 +18,35 @@ hypothesis.settings.load_profile("csplat")
 pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
 
 
+SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what takes `data_dir`, so that `-m shared_data` and `-m "not shared_data"` choose."""
+    for item in items:
+        if "data_dir" in getattr(item, "fixturenames", ()):
+            item.add_marker("shared_data")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many tests went without the shared scenes: those are no part of a clone."""
+    skipped = [
+        one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
+    ]
+    if skipped:
+        terminalreporter.section(f"{len(skipped)} tests skipped that want shared scenes", sep="=")
+        terminalreporter.line(
+            f"They are absent ({SHARED}); CSPLAT_DATA names their folder. What they say of scenes that"
+        )
+        terminalreporter.line("were trained by others, other tests say of the sample and of scenes that are made.")
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of shared scenes, which are never part of the project."""
-    path = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
-    if not path.is_dir():
-        pytest.skip(f"shared scenes are absent ({path}); CSPLAT_DATA names their folder")
-    return path
+    if not SHARED.is_dir():
+        pytest.skip(f"shared scenes are absent ({SHARED}); CSPLAT_DATA names their folder")
+    return SHARED
 
 
 @pytest.fixture(scope="session")

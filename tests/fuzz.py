@@ -16,7 +16,7 @@ joins the corpus.
     python tests/fuzz.py --target decoder --count 100000 --jobs 2 scene.csplat
     python tests/fuzz.py --target ply --replay tests/corpus/ply/*
 
-Process k of a seed and a number of jobs sees the same cases each time, until its time is up.
+Process k of a seed and a number of jobs sees the same cases each time, until its time is up; each target has its own.
 """
 
 from __future__ import annotations
@@ -250,12 +250,12 @@ def work(k, name, args, clock, results, stop, scratch):
     clock.value = 0.0
     results.put(("tally", tally))
     target.close()
-    results.put(("done", k if args.plain else edges.lines()))
+    results.put(("done", set() if args.plain else edges.lines()))
 
 
 def case(target, seed, number, seeds, grown, *, plain=False):
     """Return case `number` of a seed, and whether its coverage is to be looked at."""
-    rng = random.Random(f"{seed} {number}")  # noqa: S311 - repeatable, no secret
+    rng = random.Random(f"{target.name} {seed} {number}")  # noqa: S311 - repeatable, no secret
     traced = not plain and rng.random() < TRACED_SHARE
     corpus = grown if grown and rng.random() < GROWN_SHARE else seeds
     return target.mutant(rng, corpus), traced

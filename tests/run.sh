@@ -25,13 +25,13 @@ main() {
         if have chromium "the decoder in a browser"; then
             step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
         fi
-        step "JavaScript by the protocol" "$DEV/csplat" conformance decoder --profile base --exact \
-            --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
     fi
     step "wheel" build_and_install_wheel
     step "conformance of the decoder" "$WHEEL/csplat" conformance decoder --level 4
-    step "conformance of the encoder" "$WHEEL/csplat" conformance encoder --level 3
-    step "fuzzing" "$WHEEL/python" tests/fuzz.py --target all --seconds 60
+    # Of each kind a few, by processes: tests/test_conformance_encoder.py takes all at every preset, in its own.
+    step "conformance of the encoder" "$WHEEL/csplat" conformance encoder --level 3 --filter '*/[nodt]*[tsy]'
+    # Unguided: so few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
+    step "fuzzing" "$WHEEL/python" tests/fuzz.py --target all --count 2000 --jobs 1 --plain
     step "Python tests" "$WHEEL/pytest" "$@"
 }
 

@@ -8,6 +8,7 @@ A mistake is made where a third party would make it: in the scene as it was read
 bytes that are written, or in how the program ends. Checksums are made right again unless they are the mistake.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import os
@@ -17,9 +18,11 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -29,6 +32,7 @@ from csplat.encoder import apart, blocks, coded, container, streams, tile
 from csplat.model import normalise_quats
 from csplat_conformance.encoders import LEVELS, EncoderChoice, run_encoder
 from csplat_conformance.mutate import mapped
+from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Report
 
 DEGREE_3, PLAIN = "ordinary/degree_3", "ordinary/degree_1"
@@ -43,7 +47,7 @@ class Mistake:
         caught: level and clause that find it; the clause is empty where it is no clause that is broken.
         inputs: pattern of the reference inputs that show it.
         scene: changes what was read.
-        stage: changes the encoder.
+        stage: changes the encoder until it is left.
         options: of the encoder.
         data: changes the file.
         end: takes input and output, the encoder's bytes and how to encode, and ends the process as it pleases.
@@ -53,7 +57,7 @@ class Mistake:
     caught: tuple[str, str]
     inputs: str = PLAIN
     scene: Callable[[csplat.SplatModel], csplat.SplatModel] | None = None
-    stage: Callable[[], None] | None = None
+    stage: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
     options: Mapping[str, Any] = field(default_factory=dict)
     data: Callable[[bytes], bytes] | None = None
     end: Callable[[Path, Path, bytes], None] | None = None
@@ -101,7 +105,7 @@ def merged(model):
 
 def replaced(module, name, make):
     """Return a stage change: `make` is given the original function."""
-    return lambda: setattr(module, name, make(getattr(module, name)))
+    return lambda: mock.patch.object(module, name, make(getattr(module, name)))
 
 
 def swapped_blocks(encode_tile):
@@ -370,12 +374,11 @@ MISTAKES = {
 
 def encode(mistake: Mistake, ply: Path, out: Path) -> None:
     """What the sloppy program does."""
-    if mistake.stage is not None:
-        mistake.stage()
     model = csplat.read_ply(ply)
     if mistake.scene is not None:
         model = mistake.scene(model)
-    data = csplat.encode(model, csplat.EncodeOptions(**mistake.options))
+    with mistake.stage():
+        data = csplat.encode(model, csplat.EncodeOptions(**mistake.options))
     if mistake.data is not None:
         data = mistake.data(data)
     if mistake.end is not None:
@@ -385,12 +388,19 @@ def encode(mistake: Mistake, ply: Path, out: Path) -> None:
 
 
 def find(name: str) -> Report:
-    """Run the conformance suite over a mistake; return its report."""
+    """Run the conformance suite over a mistake; return its report. Only odd ends need a process that ends."""
     mistake = MISTAKES[name]
     command = f"{shlex.quote(sys.executable)} {shlex.quote(__file__)} {name} {{ply}} {{out}}"
     levels = LEVELS if mistake.caught[0] == LEVELS[-1] else LEVELS[:-1]
-    choice = EncoderChoice(mistake.inputs, levels, 5.0 if name == "hangs" else 60.0)
-    return run_encoder(command, choice, pictures=psnr if LEVELS[-1] in levels else None)
+    choice = EncoderChoice(mistake.inputs, levels, 5.0 if name == "hangs" else 60.0, jobs=1)
+    pictures = psnr if LEVELS[-1] in levels else None
+    return run_encoder(command, choice, pictures=pictures, run=run_here if mistake.end is None else run_program)
+
+
+def run_here(command: str, places: Mapping[str, str], _seconds: float) -> Ended:
+    """Encode as `main` does with this command line, in this process."""
+    encode(MISTAKES[shlex.split(command)[2]], Path(places["ply"]), Path(places["out"]))
+    return Ended(None, 0, b"", b"", 0.0)
 
 
 def psnr(source: csplat.SplatModel, decoded: csplat.SplatModel) -> float:

@@ -9,6 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat.errors import InputError
+from csplat_conformance import node
+from csplat_conformance.answers import PARTS, judge
 from csplat_conformance.manifest import load
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice, parse_levels, run_builtin, run_command
@@ -16,6 +18,8 @@ from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
+JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
+needs_node = pytest.mark.skipif(bool(node.missing_javascript()), reason=f"skipped: {node.missing_javascript()}")
 
 # Our decoder by the protocol, with a fault to order.
 FAULTY = """
@@ -82,6 +86,40 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets():
     assert [] == report.failures
     assert {"L1", "L2", "L3"} == set(report.levels())
     assert {"valid", "invalid"} <= {outcome.name.split("/")[0] for outcome in report.outcomes}
+
+
+@needs_node
+@pytest.mark.parametrize(
+    "name",
+    [
+        "valid/sh_degree_3",
+        "valid/empty",
+        "valid/scene_facts",
+        "valid/rich",
+        "valid/coder_zstd_raw",
+        "extreme/extra_names",
+        "invalid/json_open",
+        "invalid/quat_radicand",
+    ],
+)
+def test_the_javascript_decoder_passes_by_the_protocol(name):
+    # One for each kind of thing that its adapter says; the next test has all of them, in one process.
+    report = run_command(JS_ADAPTER, Choice(pattern=name, profile="base", exact=True))
+
+    assert report.outcomes
+    assert [] == report.failures
+
+
+@needs_node
+def test_the_javascript_decoder_answers_every_vector_as_the_manifest_says():
+    with node.JsDecoder() as decoder:
+        judged = {
+            vector.name: judge(vector, decoder.ask(vector.data), tuple(PARTS), exact=True, profile="base")
+            for vector in load()
+        }
+
+    assert [] == [one for outcomes in judged.values() for one in outcomes if one.status is not Status.PASSED]
+    assert all(judged.values())
 
 
 VALID_FAULTS = {

@@ -154,8 +154,18 @@ def test_refuses_a_part_without_its_source(make_model):
         Draft.of(make_model(5, 0), origin=Origin(9, np.arange(5))).frozen()
 
 
-def test_the_sample_is_decoded_as_it_was_seen(sample_path):
-    frozen = Draft.of(read_ply(sample_path), EncodeOptions(preset="small")).frozen()
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"preset": "small"},
+        {"sh_coding": "scalar", "attribute_psnr": 40.0},
+        {"shape_codebook_size": 512},
+        {},
+        {"tile_splats": 2_000},
+    ],
+)
+def test_the_sample_is_decoded_as_it_was_seen(sample_path, options):
+    frozen = Draft.of(read_ply(sample_path), EncodeOptions(**options)).frozen()
     held = moved(frozen, share=0.02)
     assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 

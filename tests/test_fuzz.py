@@ -79,7 +79,7 @@ def test_most_mutants_have_sound_checksums():
 
 
 def test_mutants_reach_the_streams():
-    names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 1500, BASES)}
+    names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 800, BASES)}
 
     assert {"decoded", "E_STREAM", "E_CODER", "E_CODEBOOK", "E_BOX", "E_RANGE"} <= names
     assert "finding" not in names
@@ -197,7 +197,7 @@ def test_a_decoder_of_base_may_refuse_archive():
 @needs_node
 def test_both_decoders_agree_on_mutants():
     target = JsTarget()
-    names = {fuzz.attempt(target, data)[0] for data in cases(target, 2, 300, BASES)}
+    names = {fuzz.attempt(target, data)[0] for data in cases(target, 2, 100, BASES)}
     target.close()
 
     assert {"decoded", "E_INDEX", "E_STREAM"} <= names
@@ -229,7 +229,7 @@ def test_a_javascript_process_that_hangs_is_a_finding(tmp_path):
 
 
 def test_validator_and_decoder_agree_on_mutants():
-    names = {fuzz.attempt(ValidatorTarget(), data) for data in cases(ValidatorTarget(), 2, 400, BASES)}
+    names = {fuzz.attempt(ValidatorTarget(), data) for data in cases(ValidatorTarget(), 2, 100, BASES)}
 
     assert {("decoded", ""), ("E_INDEX", ""), ("E_STREAM", "")} <= names
     assert "finding" not in {name for name, _ in names}
@@ -311,14 +311,16 @@ def test_edges_are_new_once():
     assert edges.lines() <= edges.all_lines() | {line for line in edges.lines() if "<" in line[0]}
 
 
-@pytest.mark.parametrize("target", ["decoder", "validator", "ply", pytest.param("js", marks=needs_node)])
-def test_the_program_says_what_it_did(tmp_path, target):
-    words = [sys.executable, str(PROGRAM), "--target", target, "--count", "40", "--jobs", "1", "--out", str(tmp_path)]
+@needs_node
+def test_the_program_says_what_it_did(tmp_path):
+    # Of the target that has most to say; `tests/run.sh` runs all, unguided.
+    words = [sys.executable, str(PROGRAM), "--target", "js", "--count", "12", "--jobs", "1", "--out", str(tmp_path)]
     run = subprocess.run(words, capture_output=True, text=True, check=False)
 
     assert (0, "") == (run.returncode, run.stderr)
-    assert f"{target}: 40 executions" in run.stdout
-    assert "coverage:" in run.stdout
+    assert "js: 12 executions" in run.stdout
+    assert "lines of functions" in run.stdout
+    assert "of 26 modules ran" in run.stdout
     assert "0 kinds of findings" in run.stdout
 
 

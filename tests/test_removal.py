@@ -18,6 +18,7 @@ from csplat_render.cameras import intrinsics, load_cameras, look_at
 from csplat_render.contributions import Contributions
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.removal import measure_removal, removal_exact
+from csplat_render.virtual import virtual_cameras
 
 
 def views(count=3, width=40, height=30, distance=4.0):
@@ -64,10 +65,17 @@ def test_the_pass_agrees_on_real_scenes(data_dir, name):
     path = data_dir / "ply" / f"{name}.ply"
     if not path.exists():
         pytest.skip(f"{name} is absent")
-    source = read_ply(path)
-    model = source.select(slice(0, None, max(1, len(source) // 1500)))
     camera = load_cameras(data_dir / "psnr_cameras" / f"{name}.json")[1]
-    camera = replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48)
+    assert_the_pass_agrees(read_ply(path), replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48))
+
+
+def test_the_pass_agrees_on_the_sample(sample_path):
+    source = read_ply(sample_path)
+    assert_the_pass_agrees(source, virtual_cameras(source, 1, 64, 48)[0])
+
+
+def assert_the_pass_agrees(source, camera):
+    model = source.select(slice(0, None, max(1, len(source) // 1500)))
     found = measure_removal(model, [camera], transmittance_min=0.0)
     rows = np.argsort(-found.error)[:400:80]
     expected = removal_exact(model, [camera], rows, transmittance_min=0.0)

@@ -25,6 +25,7 @@ from oracle import (
 from csplat.ply import read_ply
 from csplat_render import Camera
 from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.virtual import virtual_cameras
 
 
 def most(errors):
@@ -58,6 +59,14 @@ def test_gradients_are_those_of_autograd(degree, antialiased):
     np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
     errors = {group: relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS}
     assert most(errors) <= 1e-6, errors
+
+
+def test_float32_gradients_are_those_of_float64_on_the_sample(sample_path):
+    model = read_ply(sample_path)
+    (view,) = virtual_cameras(model, 1, 160, 120)
+    flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
+    assert flipped <= 10
+    assert most(errors) <= 1e-4, errors
 
 
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])

@@ -5,6 +5,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="the torch wrapper wants torch (the train extra)")
 
 from csplat.errors import InputError
+from csplat_render import lpips
 from csplat_render.camera import Camera
 from csplat_trainer import autograd, cuda
 from csplat_trainer.engine import CpuEngine
@@ -115,11 +116,15 @@ def test_a_missing_gpu_is_refused_in_one_line():
         cuda.gsplat_rasterization()
 
 
-def test_the_perceptual_loss_is_lpips_with_its_gradient(data_dir):
-    from csplat_render.lpips import load_lpips
-
-    weights = load_lpips(data_dir / "lpips" / "lpips_alex.npz")
+def test_the_perceptual_loss_is_lpips_with_its_gradient():
     rng = np.random.default_rng(0)
+    shapes = [shape for shape, *_ in lpips._LAYERS]
+    weights = lpips.Lpips(
+        kernels=tuple(rng.standard_normal(s).astype(np.float32) / np.float32(np.sqrt(np.prod(s[:3]))) for s in shapes),
+        biases=tuple(rng.standard_normal(s[3]).astype(np.float32) for s in shapes),
+        heads=tuple(rng.random(s[3]).astype(np.float32) for s in shapes),
+        source="random",
+    )
     x, y = (rng.random((64, 64, 3), dtype=np.float32) for _ in range(2))
     perceptual = PerceptualLoss(weights)
     assert weights(y, x) == pytest.approx(perceptual.distance(x, y), abs=1e-5)

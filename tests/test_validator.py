@@ -325,6 +325,7 @@ def test_flipped_bits_of_a_real_file_are_found(sample_path):
     assert [] == sealed.missed
     assert (24, 24) == (plain.found, sealed.found)
     assert repaired.found < repaired.count  # the checksums are what finds the rest
+    assert [] == prefixes(data, 20).missed
 
 
 def test_flipped_bits_of_a_trained_scene_are_found(data_dir):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +29,9 @@ __all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "run_encode
 LEVELS = ("L1", "L2", "L3", "L4")
 TIMEOUT_SECONDS = 60.0
 PSNR_MIN = 30.0  #: dB
+
+#: Runs a command line with some places put in, within some seconds.
+Runner = Callable[[str, Mapping[str, str], float], Ended]
 
 _NAMES = ("ply", "out")
 _TRACEBACK = b"Traceback (most recent call last)"
@@ -64,6 +67,7 @@ def run_encoder(
     pictures: PictureJudge | None = None,
     no_pictures: str = _NO_PICTURES,
     progress: Callable[[int, int], None] | None = None,
+    run: Runner = run_program,
 ) -> Report:
     """Run an encoder over the inputs.
 
@@ -76,6 +80,8 @@ def run_encoder(
         pictures: judges L4; without it the level is skipped.
         no_pictures: why it is.
         progress: is told how many inputs of how many are done.
+        run: runs the command line with `ply` and `out` put in, within some seconds; `run_program` starts a process.
+            On threads, as many as `choice.jobs` says.
 
     Raises:
         InputError: the command line is not one, there is no such program, or no such level.
@@ -88,7 +94,7 @@ def run_encoder(
     inputs = [one for one in all_inputs() if choice.pattern is None or fnmatch.fnmatchcase(one.name, choice.pattern)]
     outcomes: list[Outcome] = []
     with _folder(choice.keep) as folder, ThreadPoolExecutor(choice.jobs or os.cpu_count() or 1) as pool:
-        started = [pool.submit(_run, command, one, folder, choice.timeout_seconds) for one in inputs]
+        started = [pool.submit(_run, run, command, one, folder, choice.timeout_seconds) for one in inputs]
         try:
             for done, (one, future) in enumerate(zip(inputs, started, strict=True)):
                 # Judged here, one after the other: rendering uses all cores by itself.
@@ -118,11 +124,11 @@ def _places(one: Input, folder: Path) -> tuple[Path, Path]:
     return folder / f"{stem}.ply", folder / f"{stem}.csplat"
 
 
-def _run(command: str, one: Input, folder: Path, timeout_seconds: float) -> Ended:
+def _run(run: Runner, command: str, one: Input, folder: Path, timeout_seconds: float) -> Ended:
     ply, out = _places(one, folder)
     ply.write_bytes(one.make())
     out.unlink(missing_ok=True)  # of an earlier run that was kept
-    return run_program(command, {"ply": str(ply), "out": str(out)}, timeout_seconds)
+    return run(command, {"ply": str(ply), "out": str(out)}, timeout_seconds)
 
 
 # Judging -------------------------------------------------------------------------------------------
