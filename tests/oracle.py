@@ -1,4 +1,4 @@
-"""What the rasteriser is checked against, for tests and benchmarks: random and adversarial splats, the exact twin."""
+"""What the rasteriser is checked against: random and adversarial splats, the exact twin, finite differences."""
 
 from __future__ import annotations
 

@@ -292,7 +292,10 @@ def _spelling(one: inspect.Parameter) -> str:
     info = next(iter(getattr(one.annotation, "__metadata__", ())), None)
     if not isinstance(info, OptionInfo):
         return ""
-    given = (info.default, *(info.param_decls or ()))  # inside of Annotated a name may stand in the default's place
+    given: list[object] = [
+        info.default,
+        *(info.param_decls or ()),
+    ]  # inside of Annotated a name may stand in the default's place
     declared = [word for word in given if isinstance(word, str) and word.startswith("--")]
     return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
 

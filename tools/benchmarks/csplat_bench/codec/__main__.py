@@ -12,6 +12,7 @@ of the scene's arrays.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +23,7 @@ from csplat_bench.codec.process import Run, decoded, encoded
 from csplat_bench.common.command import CACHE, JSON, PEERS, PRESETS, SCENES, THREADS, listed, run
 from csplat_bench.common.measuring import Timing, alone, run_timed
 from csplat_bench.common.peers import CAP_SECONDS, Peer, find_splat_transform, transform
-from csplat_bench.common.report import optional, table, tell_machine, write_json
+from csplat_bench.common.report import Table, laid_out, optional, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
 
 _SCENES = "sample,lego60k,fox120k,fox60k_noreg,plane3,donut,horse,jacket,fox-1M,donut-1M,fox-4M,donut-4M"
@@ -31,20 +32,12 @@ _LARGE = 2_000_000  # splats: one run, fewer programs
 
 @dataclass(frozen=True)
 class Measured:
-    """A preset, or another program.
-
-    Attributes:
-        size_bytes: of the file; 0 where there is none.
-        whole: seconds of a whole process; `None` where it did not come through.
-        encode, decode: of presets.
-        remark: why there is no file.
-    """
+    """A preset: its file, from arrays and back, and a whole process; that is `None` where it reached the cap."""
 
     size_bytes: int
+    encode: Run
+    decode: Run
     whole: Timing | None
-    encode: Run | None = None
-    decode: Run | None = None
-    remark: str = ""
 
 
 def main(
@@ -62,16 +55,17 @@ def main(
     """Measure the scenes that the command line names, and print tables."""
     command, remark = (None, "left out") if no_peers else find_splat_transform(peers)
     machine = tell_machine(peers=remark)
-    results = {}
+    figures = {}
     for scene in find_scenes(["sample"] if quick else listed(scenes), cache):
-        large = scene.splat_count > _LARGE
-        times = 1 if quick or large else runs
+        times = 1 if quick or scene.splat_count > _LARGE else runs
         ours = {preset: _measured(scene, preset, times, threads, cache) for preset in listed(presets)}
         others = [] if command is None else transform(command, scene, cache, times)
-        results[scene.name] = {**ours, **{peer.name: _measured_peer(peer) for peer in others}}
-        print(_tables(scene, times, ours, results[scene.name]), flush=True)
+        print(_tables(scene, times, ours, others), flush=True)
+        figures[scene.name] = {
+            "presets": {preset: asdict(one) for preset, one in ours.items()},
+            "peers": {one.name: {"size_bytes": one.size_bytes, "remark": one.remark} for one in others},
+        }
     if json is not None:
-        figures = {scene: {name: asdict(one) for name, one in measured.items()} for scene, measured in results.items()}
         write_json(json, {"machine": machine, "cap_seconds": CAP_SECONDS, "scenes": figures})
 
 
@@ -84,48 +78,34 @@ def _measured(scene: Scene, preset: str, runs: int, threads: int | None, cache: 
     command = [sys.executable, "-m", "csplat_tools", "encode", str(scene.path), str(output)]
     command += ["--preset", preset, "--force", "--quiet", *(["--threads", str(threads)] if threads else [])]
     whole = run_timed(command, encode_runs, CAP_SECONDS)
-    return Measured(output.stat().st_size, whole, encode, decode)
+    return Measured(output.stat().st_size, encode, decode, whole)
 
 
-def _measured_peer(peer: Peer) -> Measured:
-    return Measured(peer.size_bytes, peer.timing, remark=peer.remark)
-
-
-def _tables(scene: Scene, runs: int, ours: dict[str, Measured], every: dict[str, Measured]) -> str:
+def _tables(scene: Scene, runs: int, ours: Mapping[str, Measured], others: Sequence[Peer]) -> str:
     count, ply = scene.splat_count, scene.size_bytes
-    title = f"{scene.name}: {count} splats, SH {scene.sh_degree}, PLY {ply / 1e6:.1f} MB, {runs} runs"
-    way = ("s", "Msplats/s", "MB/s", "peak/arrays")
-    sizes = [(*_size_cells(name, one, count, ply), one.remark) for name, one in every.items()]
-    return "\n\n".join(
-        (
-            f"\n=== {title}",
-            table(
-                ("from arrays", "enc s", *way[1:], "dec s", *way[1:]), [_way_cells(*one, count) for one in ours.items()]
-            ),
-            table(("PLY -> file", "bytes", "B/splat", "times smaller", "wall s", "CPU s", ""), sizes),
-        )
+    sizes = [(*_size_cells(f"csplat {name}", one.size_bytes, one.whole, scene), "") for name, one in ours.items()]
+    sizes += [(*_size_cells(one.name, one.size_bytes, one.timing, scene), one.remark) for one in others]
+    ways = [(name, *_way_cells(one.encode, count), *_way_cells(one.decode, count)) for name, one in ours.items()]
+    way = ("Msplats/s", "MB/s", "peak/arrays")
+    return laid_out(
+        [
+            f"\n=== {scene.name}: {count} splats, SH {scene.sh_degree}, PLY {ply / 1e6:.1f} MB, {runs} runs",
+            Table(("from arrays", "enc s", *way, "dec s", *way), ways),
+            Table(("PLY -> file", "bytes", "B/splat", "times smaller", "wall s", "CPU s", ""), sizes),
+        ],
+        markdown=False,
     )
 
 
-def _way_cells(name: str, one: Measured, count: int) -> list[str]:
-    cells = [name]
-    for way in (one.encode, one.decode):
-        assert way is not None
-        cells += [
-            f"{way.seconds:.3f}",
-            f"{count / way.seconds / 1e6:.2f}",
-            f"{way.array_bytes / way.seconds / 1e6:.0f}",
-        ]
-        cells.append(f"{way.growth_bytes / way.array_bytes:.2f}")
-    return cells
+def _way_cells(way: Run, count: int) -> tuple[str, ...]:
+    splats, size = count / way.seconds / 1e6, way.array_bytes / way.seconds / 1e6
+    return f"{way.seconds:.3f}", f"{splats:.2f}", f"{size:.0f}", f"{way.growth_bytes / way.array_bytes:.2f}"
 
 
-def _size_cells(name: str, one: Measured, count: int, ply: int) -> list[str]:
-    label = name if one.encode is None else f"csplat {name}"
-    size = one.size_bytes
-    sizes = [str(size), f"{size / count:.2f}", f"{ply / size:.1f}"] if size else ["-"] * 3
-    wall, cpu = (None, None) if one.whole is None else (one.whole.wall, one.whole.cpu)
-    return [label, *sizes, optional(wall, ".2f"), optional(cpu, ".2f")]
+def _size_cells(label: str, size: int, timing: Timing | None, scene: Scene) -> tuple[str, ...]:
+    sizes = (str(size), f"{size / scene.splat_count:.2f}", f"{scene.size_bytes / size:.1f}") if size else ("-",) * 3
+    wall, cpu = (None, None) if timing is None else (timing.wall, timing.cpu)
+    return label, *sizes, optional(wall, ".2f"), optional(cpu, ".2f")
 
 
 if __name__ == "__main__":

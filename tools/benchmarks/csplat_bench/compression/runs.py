@@ -24,13 +24,11 @@ from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
 from csplat_render.removal import measure_removal
 from csplat_tools.inspect.info import byte_shares
-from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.finetune import Clock
 from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.finetune import FinetuneOptions, Views, finetune
-from csplat_trainer.sensitivity import Sensitivity
 
 __all__ = ["Bench", "Tuned"]
 
@@ -96,13 +94,6 @@ class Bench:
     def views(self) -> Views:
         """What teaches, and what judges on the way."""
         return training_views(self.source, self.looks, self.threads)
-
-    @cached_property
-    def sensitivity(self) -> Sensitivity:
-        """Of the whole source, measured from the training views."""
-        return measure_views(
-            self.source, self.looks.teaches, self.looks.background, matrices=True, threads=self.threads
-        )
 
     def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
         """The splats that stay, and the seconds that it took to find them.
