@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.binning import TILE
@@ -145,12 +144,13 @@ def gather(
 
 @parallel_kernel(relaxed=True)
 def blend(
+    lane: int,
+    lanes: int,
     starts: Any,
     ids: Any,
     shape: Any,
     box: Any,
     tiles_x: int,
-    lanes: int,
     limits: Any,
     background: Any,
     rgb: Any,
@@ -161,12 +161,13 @@ def blend(
     """Blend the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
+        lane: which of the threads this is.
+        lanes: how many share the tiles; the result does not depend on it.
         starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
         ids: [intersections] int32, splats, tile by tile, nearest first.
         shape: [N, 10] float64, see `project`.
         box: [N, 4] int32, see `project`.
         tiles_x: tiles side by side.
-        lanes: how many threads share the tiles; the result does not depend on it.
         limits: [3], smallest alpha, largest alpha, smallest transmittance; its dtype, float32 or
             float64, is that of the pixels.
         background: [3].
@@ -176,57 +177,56 @@ def blend(
         used: [tiles] int64, written: the end of what was looked at of each tile.
     """
     height, width = transmittance.shape
-    for lane in numba.prange(lanes):
-        # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
-        # 16 transmittances, then 16 each of red, green, blue, depth; and the positions in a row.
-        planes = aligned(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
-        ys = middles()
-        for y in range(TILE):
-            planes[y, 5 * TILE :] = ys
-        batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
-        alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
-        zero, one = alpha_min - alpha_min, alpha_min / alpha_min
-        for tile in range(lane, len(used), lanes):
-            X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-            columns, low, high = min(TILE, width - X0), 0, min(TILE, height - Y0)
-            planes[:, : 5 * TILE] = zero
-            planes[:, :columns] = one
-            planes[:, columns:TILE] = -one  # finished from the start: they are not on the picture
-            end = starts[tile + 1]
-            for begin in range(starts[tile], end, CHECK):
-                low, high = alive_rows(planes, low, high)
-                if low >= high:
-                    end = begin
-                    break
-                count = min(CHECK, end - begin)
-                gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
-                for j in range(count):
-                    first, last = rows[j, 0], rows[j, 1]
-                    body, row0, row1 = planes[first:last], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
-                    a, o = batch[j, THEN], batch[j, THEN + 1]
-                    r, g, b, d = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4], batch[j, THEN + 5]
-                    for y in range(len(body)):
-                        row, c0, c1 = body[y], row0[y], row1[y]
-                        for x in range(TILE):
-                            at = row[5 * TILE + x]
-                            power = (a * at + c1) * at + c0
-                            alpha = min(o * fast_exp2(min(power, zero)), alpha_cap)
-                            alpha = alpha if alpha >= alpha_min else zero
-                            before = row[x]
-                            after = before * (one - alpha)
-                            going = after >= stop
-                            weight = alpha * before if going else zero
-                            row[x] = after if going else -abs(before)  # finished: negative from here on
-                            row[TILE + x] += weight * r
-                            row[2 * TILE + x] += weight * g
-                            row[3 * TILE + x] += weight * b
-                            row[4 * TILE + x] += weight * d
-            used[tile] = end
-            for y in range(min(TILE, height - Y0)):
-                for x in range(columns):
-                    left = abs(planes[y, x])
-                    rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + left * background[0]
-                    rgb[Y0 + y, X0 + x, 1] = planes[y, 2 * TILE + x] + left * background[1]
-                    rgb[Y0 + y, X0 + x, 2] = planes[y, 3 * TILE + x] + left * background[2]
-                    transmittance[Y0 + y, X0 + x] = left
-                    depth[Y0 + y, X0 + x] = planes[y, 4 * TILE + x]
+    # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
+    # 16 transmittances, then 16 each of red, green, blue, depth; and the positions in a row.
+    planes = aligned(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
+    ys = middles()
+    for y in range(TILE):
+        planes[y, 5 * TILE :] = ys
+    batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    for tile in range(lane, len(used), lanes):
+        X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+        columns, low, high = min(TILE, width - X0), 0, min(TILE, height - Y0)
+        planes[:, : 5 * TILE] = zero
+        planes[:, :columns] = one
+        planes[:, columns:TILE] = -one  # finished from the start: they are not on the picture
+        end = starts[tile + 1]
+        for begin in range(starts[tile], end, CHECK):
+            low, high = alive_rows(planes, low, high)
+            if low >= high:
+                end = begin
+                break
+            count = min(CHECK, end - begin)
+            gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
+            for j in range(count):
+                first, last = rows[j, 0], rows[j, 1]
+                body, row0, row1 = planes[first:last], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
+                a, o = batch[j, THEN], batch[j, THEN + 1]
+                r, g, b, d = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4], batch[j, THEN + 5]
+                for y in range(len(body)):
+                    row, c0, c1 = body[y], row0[y], row1[y]
+                    for x in range(TILE):
+                        at = row[5 * TILE + x]
+                        power = (a * at + c1) * at + c0
+                        alpha = min(o * fast_exp2(min(power, zero)), alpha_cap)
+                        alpha = alpha if alpha >= alpha_min else zero
+                        before = row[x]
+                        after = before * (one - alpha)
+                        going = after >= stop
+                        weight = alpha * before if going else zero
+                        row[x] = after if going else -abs(before)  # finished: negative from here on
+                        row[TILE + x] += weight * r
+                        row[2 * TILE + x] += weight * g
+                        row[3 * TILE + x] += weight * b
+                        row[4 * TILE + x] += weight * d
+        used[tile] = end
+        for y in range(min(TILE, height - Y0)):
+            for x in range(columns):
+                left = abs(planes[y, x])
+                rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + left * background[0]
+                rgb[Y0 + y, X0 + x, 1] = planes[y, 2 * TILE + x] + left * background[1]
+                rgb[Y0 + y, X0 + x, 2] = planes[y, 3 * TILE + x] + left * background[2]
+                transmittance[Y0 + y, X0 + x] = left
+                depth[Y0 + y, X0 + x] = planes[y, 4 * TILE + x]
