@@ -10,8 +10,20 @@ from typing import Any
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending import CHECK, NUMBERS, ROW0, ROW1, THEN, aligned, gather, middles
-from csplat_render.jit import fast_exp2, parallel_kernel
+from csplat_render.blending_steps import (
+    CHECK,
+    NUMBERS,
+    aligned,
+    alpha_at,
+    begin_tile,
+    gather,
+    middles,
+    numbers_of,
+    passed,
+    place,
+    read_planes,
+)
+from csplat_render.jit import parallel_kernel
 
 __all__ = ["COLOUR_SUMS", "sum_colours"]
 
@@ -52,7 +64,7 @@ def sum_colours(
         used: [tiles] int64, as `blend` wrote it.
         ids: see `blend`.
         slots: [intersections] int32, the record of each of `ids`.
-        shape: see `blend`, as the next four; colours are not read.
+        shape: see `blend`, as the next three; colours are not read.
         box: [N, 4] int32.
         tiles_x: tiles side by side.
         limits: [3].
@@ -70,17 +82,10 @@ def sum_colours(
     zero, one = alpha_min - alpha_min, alpha_min / alpha_min
     trace = planes.dtype.type(_TRACE)
     for tile in range(lane, len(used), lanes):
-        X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-        columns, high = min(TILE, width - X0), min(TILE, height - Y0)
-        T[:, :columns] = one
-        T[:, columns:] = -one
+        X0, Y0, columns, high = place(tile, tiles_x, width, height)
+        begin_tile(T, columns, one)
         planes[_RED:_WEIGHT] = zero
-        for y in range(high):
-            row = planes[y * TILE :]
-            for x in range(columns):
-                row[_RED + x] = error[Y0 + y, X0 + x, 0]
-                row[_GREEN + x] = error[Y0 + y, X0 + x, 1]
-                row[_BLUE + x] = error[Y0 + y, X0 + x, 2]
+        read_planes(error, X0, Y0, columns, high, planes, _RED)
         # Rows that are finished are gone through: so a sum is added up in one order, whatever lies in front.
         for begin in range(starts[tile], used[tile], CHECK):
             count = min(CHECK, used[tile] - begin)
@@ -91,20 +96,15 @@ def sum_colours(
                 if first >= last:
                     record[:] = zero
                     continue
-                body, row0, row1 = planes[first * TILE :], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
-                a, o = batch[j, THEN], batch[j, THEN + 1]
+                body = planes[first * TILE :]
+                row0, row1, a, o, _, _, _, _ = numbers_of(batch, j, first)
                 for y in range(last - first):
                     row, c0, c1 = body[y * TILE :], row0[y], row1[y]
                     for x in range(TILE):
-                        at = row[_X + x]
-                        power = (a * at + c1) * at + c0
-                        alpha = min(o * fast_exp2(min(power, zero)), alpha_cap)
-                        alpha = alpha if alpha >= alpha_min else zero
+                        _, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
                         before = row[x]
-                        after = before * (one - alpha)
-                        going = after >= stop
-                        row[x] = after if going else -abs(before)
-                        row[_WEIGHT + x] = alpha * before if going else max(before, zero) * trace
+                        going, weight, row[x] = passed(before, alpha, stop, zero, one)
+                        row[_WEIGHT + x] = weight if going else max(before, zero) * trace
                 m0, m1, m2, m3 = zero, zero, zero, zero
                 for e in range((last - first) * TILE):
                     weight = body[_WEIGHT + e]

@@ -14,9 +14,9 @@ import numpy as np
 from csplat.model import sh_degree_of
 from csplat_render.arrays import Array, HasSplats, Splats
 from csplat_render.binning import TILE
-from csplat_render.blending import blend
+from csplat_render.blending import blend, blend_counted
 from csplat_render.blending_colours import COLOUR_SUMS, sum_colours
-from csplat_render.blending_sums import SUMS, blend_counted, sum_removal
+from csplat_render.blending_sums import SUMS, sum_removal
 from csplat_render.camera import Camera
 from csplat_render.conventions import TRANSMITTANCE_MIN, view_vector
 from csplat_render.drawn_view import DrawnView, add_gradient, add_removal, basis_of_view, set_colours
@@ -186,7 +186,7 @@ class Contributions(Rasteriser):
         with thread_count(self.threads):
             blend_counted(
                 drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
-                rgb, transmittance, last,
+                rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
             )  # fmt: skip
             error = np.zeros_like(rgb) if reference is None else rgb - reference
             sum_removal(

@@ -28,6 +28,7 @@ __all__ = [
     "parallel_kernel",
     "python",
     "relaxed_kernel",
+    "spliced",
     "thread_count",
 ]
 
@@ -59,6 +60,12 @@ def inline(function: Callable[P, R]) -> Callable[P, R]:
     return compiled
 
 
+def spliced(function: Callable[P, R]) -> Callable[P, R]:
+    """Copy a few lines into the kernels that call them, before anything is compiled: loops vectorise all the same."""
+    copied: Callable[P, R] = numba.njit(function, inline="always", nogil=True, error_model="numpy")
+    return copied
+
+
 def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of one thread that may reassociate and contract: the inside of a loop over pixels."""
     compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
@@ -70,7 +77,7 @@ class ParallelKernel(Generic[P]):
     """A function that every thread calls once; its first two arguments, which callers leave out, say which it is.
 
     Threads of Python run it, not numba's `prange`: that compiles a kernel four times over, as the function that was
-    written, as two wrappers, and as part of their caller. A call costs 10 µs more, and compiling a third.
+    written, as two wrappers, and as part of their caller. A call costs 10 µs more, and compiling half as much.
 
     Attributes:
         compiled: the kernel; lane, number of lanes, arguments.

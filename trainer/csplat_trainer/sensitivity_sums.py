@@ -13,9 +13,23 @@ from typing import Any
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending import CHECK, NUMBERS, ROW0, ROW1, THEN, aligned, alive_rows, gather, middles
+from csplat_render.blending_steps import (
+    CHECK,
+    HALF,
+    NUMBERS,
+    aligned,
+    alive_rows,
+    alpha_at,
+    begin_tile,
+    gather,
+    middles,
+    numbers_of,
+    passed,
+    place,
+    read_planes,
+)
 from csplat_render.harmonics import sh_basis
-from csplat_render.jit import fast_exp2, parallel_kernel, relaxed_kernel
+from csplat_render.jit import parallel_kernel, relaxed_kernel
 from csplat_render.projecting import BLOCK, deviation, direction
 from csplat_trainer.sensitivity_forms import FORM
 
@@ -27,7 +41,6 @@ __all__ = ["SUMS", "add_view", "sum_derivatives"]
 #: (the upper triangle of 6 by 6).
 SUMS = 39
 
-_HALF = 0.5 * TILE
 _AREA = TILE * TILE
 
 # Where the planes of a tile begin: transmittance, what lies behind by channel, the current splat's share of the pixel,
@@ -68,17 +81,11 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
     alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
     zero, one = alpha_min - alpha_min, alpha_min / alpha_min
     for tile in range(lane, len(used), lanes):
-        X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-        columns, low, high = min(TILE, width - X0), 0, min(TILE, height - Y0)
+        X0, Y0, columns, high = place(tile, tiles_x, width, height)
+        low = 0
         planes[:_X] = zero
-        T[:, :columns] = one
-        T[:, columns:] = -one
-        for y in range(high):
-            for x in range(columns):
-                at = y * TILE + x
-                planes[_RED + at] = rgb[Y0 + y, X0 + x, 0]
-                planes[_GREEN + at] = rgb[Y0 + y, X0 + x, 1]
-                planes[_BLUE + at] = rgb[Y0 + y, X0 + x, 2]
+        begin_tile(T, columns, one)
+        read_planes(rgb, X0, Y0, columns, high, planes, _RED)
         for begin in range(starts[tile], used[tile], CHECK):
             low, high = alive_rows(T, low, high)
             count = min(CHECK, used[tile] - begin)
@@ -89,28 +96,18 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
                 if first >= last:
                     record[:] = zero
                     continue
-                body, row0, row1 = planes[first * TILE :], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
-                a, o = batch[j, THEN], batch[j, THEN + 1]
-                r, g, b = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4]
+                body = planes[first * TILE :]
+                row0, row1, a, o, r, g, b, _ = numbers_of(batch, j, first)
                 for y in range(last - first):
                     row, c0, c1 = body[y * TILE :], row0[y], row1[y]
                     for x in range(TILE):
-                        at = row[_X + x]
-                        power = (a * at + c1) * at + c0
-                        full = o * fast_exp2(min(power, zero))
-                        alpha = min(full, alpha_cap)
-                        alpha = alpha if alpha >= alpha_min else zero
-                        before = row[x]
-                        rest = one - alpha
-                        after = before * rest
-                        going = after >= stop
-                        weight = alpha * before if going else zero
-                        row[x] = after if going else -abs(before)
+                        full, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        going, weight, row[x] = passed(row[x], alpha, stop, zero, one)
                         red, green, blue = weight * r, weight * g, weight * b
                         row[_RED + x] -= red
                         row[_GREEN + x] -= green
                         row[_BLUE + x] -= blue
-                        share = alpha / rest
+                        share = alpha / (one - alpha)
                         red -= row[_RED + x] * share
                         green -= row[_GREEN + x] * share
                         blue -= row[_BLUE + x] * share
@@ -120,7 +117,7 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
                         row[_SIZE + x] = free * (abs(red) + abs(green) + abs(blue))
                         row[_SQUARE + x] = free * (red * red + green * green + blue * blue)
                 i = ids[begin + j]
-                dx, dy = X0 + _HALF - shape[i, 0], Y0 + _HALF - shape[i, 1]
+                dx, dy = X0 + HALF - shape[i, 0], Y0 + HALF - shape[i, 1]
                 for e in range(FORM):
                     form[e] = forms[i, e]
                 for k in range(3):
