@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
-from csplat_render.jit import inline, kernel, parallel_kernel
+from csplat_render.jit import inline, kernel, lane_run, parallel_kernel
 
 __all__ = [
     "CHUNKS",
@@ -124,7 +123,7 @@ def _span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> 
 
 
 @parallel_kernel()
-def arrange(order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any) -> None:
+def arrange(lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any) -> None:
     """Copy what the sort into tiles reads to the order in which it reads: no waiting for memory there.
 
     Args:
@@ -134,7 +133,7 @@ def arrange(order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: A
         sorted_extent: [V, 6], written.
         sorted_box: [V, 4], written.
     """
-    for j in numba.prange(len(order)):
+    for j in range(*lane_run(lane, lanes, len(order))):
         i = order[j]
         for k in range(6):
             sorted_extent[j, k] = extent[i, k]
@@ -143,7 +142,9 @@ def arrange(order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: A
 
 
 @parallel_kernel()
-def count_tiles(order: Any, extent: Any, box: Any, tiles_x: int, counts: Any, touched: Any) -> None:
+def count_tiles(
+    lane: int, lanes: int, order: Any, extent: Any, box: Any, tiles_x: int, counts: Any, touched: Any
+) -> None:
     """Count the splats of each tile; parallel over chunks of the depth order.
 
     Args:
@@ -156,7 +157,7 @@ def count_tiles(order: Any, extent: Any, box: Any, tiles_x: int, counts: Any, to
     """
     chunks = counts.shape[0]
     n = len(order)
-    for chunk in numba.prange(chunks):
+    for chunk in range(lane, chunks, lanes):
         row = counts[chunk]
         row[:] = 0
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
@@ -202,6 +203,8 @@ def tile_starts(counts: Any, starts: Any) -> int:
 
 @parallel_kernel()
 def fill_tiles(
+    lane: int,
+    lanes: int,
     order: Any,
     extent: Any,
     box: Any,
@@ -230,7 +233,7 @@ def fill_tiles(
     chunks = counts.shape[0]
     n = len(order)
     with_slots = len(offsets) > 0
-    for chunk in numba.prange(chunks):
+    for chunk in range(lane, chunks, lanes):
         row = counts[chunk]
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
             i = order[j]

@@ -7,12 +7,23 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending import CHECK, NUMBERS, ROW0, ROW1, THEN, aligned, gather, middles
-from csplat_render.jit import fast_exp2, parallel_kernel
+from csplat_render.blending_steps import (
+    CHECK,
+    NUMBERS,
+    aligned,
+    alpha_at,
+    begin_tile,
+    gather,
+    middles,
+    numbers_of,
+    passed,
+    place,
+    read_planes,
+)
+from csplat_render.jit import parallel_kernel
 
 __all__ = ["COLOUR_SUMS", "sum_colours"]
 
@@ -31,6 +42,8 @@ _TRACE = 1e-12
 
 @parallel_kernel(relaxed=True)
 def sum_colours(
+    lane: int,
+    lanes: int,
     starts: Any,
     used: Any,
     ids: Any,
@@ -38,7 +51,6 @@ def sum_colours(
     shape: Any,
     box: Any,
     tiles_x: int,
-    lanes: int,
     limits: Any,
     error: Any,
     records: Any,
@@ -46,72 +58,60 @@ def sum_colours(
     """Take a picture back to the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
+        lane: which of the threads this is.
+        lanes: how many share the tiles; the result does not depend on it.
         starts: see `blend`.
         used: [tiles] int64, as `blend` wrote it.
         ids: see `blend`.
         slots: [intersections] int32, the record of each of `ids`.
-        shape: see `blend`, as the next four; colours are not read.
+        shape: see `blend`, as the next three; colours are not read.
         box: [N, 4] int32.
         tiles_x: tiles side by side.
-        lanes: how many threads share the tiles; the result does not depend on it.
         limits: [3].
         error: [H, W, 3], what is taken back.
         records: [intersections, COLOUR_SUMS], written: sums of w · error for red, green, blue, and of w²; the last is
             0 for what could as well be absent: it neither shows nor finishes a pixel.
     """
     height, width = error.shape[:2]
-    for lane in numba.prange(lanes):
-        planes = aligned(_PLANES * _AREA, limits)
-        T, ys = planes[:_AREA].reshape((TILE, TILE)), middles()
-        for e in range(_AREA):
-            planes[_X + e] = ys[e % TILE]
-        batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
-        alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
-        zero, one = alpha_min - alpha_min, alpha_min / alpha_min
-        trace = planes.dtype.type(_TRACE)
-        for tile in range(lane, len(used), lanes):
-            X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-            columns, high = min(TILE, width - X0), min(TILE, height - Y0)
-            T[:, :columns] = one
-            T[:, columns:] = -one
-            planes[_RED:_WEIGHT] = zero
-            for y in range(high):
-                row = planes[y * TILE :]
-                for x in range(columns):
-                    row[_RED + x] = error[Y0 + y, X0 + x, 0]
-                    row[_GREEN + x] = error[Y0 + y, X0 + x, 1]
-                    row[_BLUE + x] = error[Y0 + y, X0 + x, 2]
-            # Rows that are finished are gone through: so a sum is added up in one order, whatever lies in front.
-            for begin in range(starts[tile], used[tile], CHECK):
-                count = min(CHECK, used[tile] - begin)
-                gather(ids, begin, begin + count, shape, box, X0, Y0, 0, high, ys, batch, rows)
-                for j in range(count):
-                    record = records[slots[begin + j]]
-                    first, last = rows[j, 0], rows[j, 1]
-                    if first >= last:
-                        record[:] = zero
-                        continue
-                    body, row0, row1 = planes[first * TILE :], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
-                    a, o = batch[j, THEN], batch[j, THEN + 1]
-                    for y in range(last - first):
-                        row, c0, c1 = body[y * TILE :], row0[y], row1[y]
-                        for x in range(TILE):
-                            at = row[_X + x]
-                            power = (a * at + c1) * at + c0
-                            alpha = min(o * fast_exp2(min(power, zero)), alpha_cap)
-                            alpha = alpha if alpha >= alpha_min else zero
-                            before = row[x]
-                            after = before * (one - alpha)
-                            going = after >= stop
-                            row[x] = after if going else -abs(before)
-                            row[_WEIGHT + x] = alpha * before if going else max(before, zero) * trace
-                    m0, m1, m2, m3 = zero, zero, zero, zero
-                    for e in range((last - first) * TILE):
-                        weight = body[_WEIGHT + e]
-                        m0 += weight * body[_RED + e]
-                        m1 += weight * body[_GREEN + e]
-                        m2 += weight * body[_BLUE + e]
-                        m3 += weight * weight
-                    record[0], record[1], record[2], record[3] = m0, m1, m2, m3
-            for k in range(used[tile], starts[tile + 1]):
-                records[slots[k]] = zero
+    planes = aligned(_PLANES * _AREA, limits)
+    T, ys = planes[:_AREA].reshape((TILE, TILE)), middles()
+    for e in range(_AREA):
+        planes[_X + e] = ys[e % TILE]
+    batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    trace = planes.dtype.type(_TRACE)
+    for tile in range(lane, len(used), lanes):
+        X0, Y0, columns, high = place(tile, tiles_x, width, height)
+        begin_tile(T, columns, one)
+        planes[_RED:_WEIGHT] = zero
+        read_planes(error, X0, Y0, columns, high, planes, _RED)
+        # Rows that are finished are gone through: so a sum is added up in one order, whatever lies in front.
+        for begin in range(starts[tile], used[tile], CHECK):
+            count = min(CHECK, used[tile] - begin)
+            gather(ids, begin, begin + count, shape, box, X0, Y0, 0, high, ys, batch, rows)
+            for j in range(count):
+                record = records[slots[begin + j]]
+                first, last = rows[j, 0], rows[j, 1]
+                if first >= last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, _, _, _, _ = numbers_of(batch, j, first)
+                for y in range(last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        _, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        before = row[x]
+                        going, weight, row[x] = passed(before, alpha, stop, zero, one)
+                        row[_WEIGHT + x] = weight if going else max(before, zero) * trace
+                m0, m1, m2, m3 = zero, zero, zero, zero
+                for e in range((last - first) * TILE):
+                    weight = body[_WEIGHT + e]
+                    m0 += weight * body[_RED + e]
+                    m1 += weight * body[_GREEN + e]
+                    m2 += weight * body[_BLUE + e]
+                    m3 += weight * weight
+                record[0], record[1], record[2], record[3] = m0, m1, m2, m3
+        for k in range(used[tile], starts[tile + 1]):
+            records[slots[k]] = zero

@@ -14,9 +14,9 @@ import numpy as np
 from csplat.model import sh_degree_of
 from csplat_render.arrays import Array, HasSplats, Splats
 from csplat_render.binning import TILE
-from csplat_render.blending import blend
+from csplat_render.blending import blend, blend_counted
 from csplat_render.blending_colours import COLOUR_SUMS, sum_colours
-from csplat_render.blending_sums import SUMS, blend_counted, sum_removal
+from csplat_render.blending_sums import SUMS, sum_removal
 from csplat_render.camera import Camera
 from csplat_render.conventions import TRANSMITTANCE_MIN, view_vector
 from csplat_render.drawn_view import DrawnView, add_gradient, add_removal, basis_of_view, set_colours
@@ -183,14 +183,14 @@ class Contributions(Rasteriser):
         transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
         rgb = np.empty((*size, 3), self.dtype)
         behind = np.ascontiguousarray(background, self.dtype)
-        with thread_count(self.threads) as lanes:
+        with thread_count(self.threads):
             blend_counted(
-                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, lanes, self._limits, behind,
-                rgb, transmittance, last,
+                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
+                rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
             )  # fmt: skip
             error = np.zeros_like(rgb) if reference is None else rgb - reference
             sum_removal(
-                drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, lanes, self._limits, behind,
+                drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
                 error.astype(self.dtype, copy=False), transmittance, last, records,
             )  # fmt: skip
         return rgb, records
@@ -201,15 +201,15 @@ class Contributions(Rasteriser):
         records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
         used = self._buffer("used", (len(drawn.starts) - 1,), np.int64)
         rgb = np.empty((*size, 3), self.dtype)
-        with thread_count(self.threads) as lanes:
+        with thread_count(self.threads):
             blend(
-                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, lanes, self._limits,
+                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits,
                 np.ascontiguousarray(background, self.dtype), rgb, self._buffer("through", size, self.dtype),
                 self._buffer("depth", size, self.dtype), used,
             )  # fmt: skip
             error = rgb if reference is None else rgb - reference
             sum_colours(
-                drawn.starts, used, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, lanes, self._limits,
+                drawn.starts, used, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits,
                 error.astype(self.dtype, copy=False), records,
             )  # fmt: skip
         return rgb, records

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,7 +51,7 @@ def convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
 
 
 @parallel_kernel(relaxed=True)
-def _convolve(x: Any, weights: Any, bias: Any, down: int, across: int, result: Any) -> None:
+def _convolve(lane: int, lanes: int, x: Any, weights: Any, bias: Any, down: int, across: int, result: Any) -> None:
     """Sums of four pixels at a time; parallel over rows, vectorised over the outputs.
 
     Args:
@@ -64,8 +63,8 @@ def _convolve(x: Any, weights: Any, bias: Any, down: int, across: int, result: A
         result: [rows, columns, out] float32, written; columns are a multiple of four.
     """
     outputs = len(bias)
-    for r in numba.prange(result.shape[0]):
-        sums = np.empty(_PIXELS * outputs, np.float32)
+    sums = np.empty(_PIXELS * outputs, np.float32)
+    for r in range(lane, result.shape[0], lanes):
         for column in range(0, result.shape[1], _PIXELS):
             for p in range(_PIXELS):
                 sums[p * outputs : (p + 1) * outputs] = bias

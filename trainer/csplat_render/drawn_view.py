@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.arrays import Array
@@ -84,10 +83,10 @@ class DrawnView:
 
 
 @parallel_kernel()
-def basis_of_view(means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
+def basis_of_view(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
     """Spherical harmonics in the direction of each splat that is drawn; parallel over blocks of them."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
-        values = np.empty(16, np.float64)
+    values = np.empty(16, np.float64)
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             x, y, z, _ = direction(view, means[rows[j]])
             sh_basis(degree, x, y, z, values)
@@ -96,9 +95,11 @@ def basis_of_view(means: Any, rows: Any, view: Any, degree: int, basis: Any) -> 
 
 
 @parallel_kernel()
-def set_colours(rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any) -> None:
+def set_colours(
+    lane: int, lanes: int, rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any
+) -> None:
     """Write offset + Y · coefficients into the shapes, 0 where not active; parallel over blocks of splats."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
             r, g, b = _shown(basis[j], coefficients[i], 0, basis.shape[1])
@@ -120,9 +121,11 @@ def _shown(basis: Any, coefficients: Any, first: int, end: int) -> tuple[float, 
 
 
 @parallel_kernel()
-def add_removal(rows: Any, first: Any, records: Any, basis: Any, coefficients: Any, totals: Any, bands: Any) -> None:
+def add_removal(
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, coefficients: Any, totals: Any, bands: Any
+) -> None:
     """Add the records of one view up, splat by splat, see `Contributions.removal`; parallel over blocks of splats."""
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
             error, product, weight, squares = 0.0, 0.0, 0.0, 0.0
@@ -144,10 +147,12 @@ def add_removal(rows: Any, first: Any, records: Any, basis: Any, coefficients: A
 
 
 @parallel_kernel()
-def add_gradient(rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any) -> None:
+def add_gradient(
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
+) -> None:
     """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
     with_diagonal = diagonal.shape[0] > 0
-    for block in numba.prange((len(rows) + BLOCK - 1) // BLOCK):
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             r, g, b, squares = 0.0, 0.0, 0.0, 0.0
             for n in range(first[j], first[j + 1]):

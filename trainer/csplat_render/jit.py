@@ -7,40 +7,41 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, ParamSpec, TypeVar
+from dataclasses import dataclass
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numba as typed_numba
 import numpy as np
 from numba import extending as typed_extending
+from numba.core import compiler as typed_compiler
 
 from csplat.errors import InputError
 
 __all__ = [
     "LOCK",
+    "ParallelKernel",
     "available_threads",
     "fast_exp2",
     "inline",
     "kernel",
+    "lane_run",
     "parallel_kernel",
     "python",
     "relaxed_kernel",
+    "spliced",
     "thread_count",
 ]
 
 # The types that numba states for itself differ from version to version.
 numba: Any = typed_numba
 extending: Any = typed_extending
+compiler: Any = typed_compiler
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Held while kernels run: not every threading layer of numba may be entered by two threads at once.
+#: Held while threads run a kernel, by the one caller that they have.
 LOCK = threading.RLock()
-
-# Work at import, because OpenMP reads it once, when numba starts its threads. A thread that spins at
-# the end of a loop keeps the one that it waits for from the processor: on a machine with something
-# else to do a picture of 1,000 splats took 32 ms, and takes 0.5 ms when threads sleep.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
 _LN2 = math.log(2.0)
@@ -59,25 +60,69 @@ def inline(function: Callable[P, R]) -> Callable[P, R]:
     return compiled
 
 
+def spliced(function: Callable[P, R]) -> Callable[P, R]:
+    """Copy a few lines into the kernels that call them, before anything is compiled: loops vectorise all the same."""
+    copied: Callable[P, R] = numba.njit(function, inline="always", nogil=True, error_model="numpy")
+    return copied
+
+
 def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of one thread that may reassociate and contract: the inside of a loop over pixels."""
     compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
     return compiled
 
 
-def parallel_kernel(*, relaxed: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Compile a function whose `prange` loops run on all threads.
+@dataclass(frozen=True, eq=False)
+class ParallelKernel(Generic[P]):
+    """A function that every thread calls once; its first two arguments, which callers leave out, say which it is.
+
+    Threads of Python run it, not numba's `prange`: that compiles a kernel four times over, as the function that was
+    written, as two wrappers, and as part of their caller. A call costs 10 µs more, and compiling half as much.
+
+    Attributes:
+        compiled: the kernel; lane, number of lanes, arguments.
+    """
+
+    compiled: Any
+
+    @property
+    def signatures(self) -> list[Any]:
+        """What it was compiled for."""
+        signatures: list[Any] = self.compiled.signatures
+        return signatures
+
+    def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
+        """Run it on as many threads as `thread_count` says; returns when all of them have."""
+        assert not named
+        with LOCK:
+            _threads.run(self.compiled, arguments)
+
+
+class _Disjoint(compiler.Compiler):  # type: ignore[misc]  # numba's types are those of each version
+    """Compiles kernels whose arrays do not overlap: without that many a loop is not vectorised."""
+
+    def define_pipelines(self) -> Any:
+        """What numba asks for; the flags are this one compilation's."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
+
+
+def parallel_kernel(
+    *, relaxed: bool = False
+) -> Callable[[Callable[Concatenate[int, int, P], None]], ParallelKernel[P]]:
+    """Compile a function that does one lane of some work, (lane, lanes, ...), and is run for all lanes at once.
+
+    No two of the arrays that it is given may overlap.
 
     Args:
         relaxed: reassociate and contract, for the loops over pixels.
     """
+    options: dict[str, Any] = {"fastmath": _RELAXED} if relaxed else {}
 
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        options: dict[str, Any] = {"fastmath": _RELAXED} if relaxed else {}
-        compiled: Callable[P, R] = numba.njit(
-            function, parallel=True, cache=True, nogil=True, error_model="numpy", **options
+    def decorate(function: Callable[Concatenate[int, int, P], None]) -> ParallelKernel[P]:
+        return ParallelKernel(
+            numba.njit(function, cache=True, nogil=True, error_model="numpy", pipeline_class=_Disjoint, **options)
         )
-        return compiled
 
     return decorate
 
@@ -113,6 +158,12 @@ def _fast_exp2(x: Any) -> Callable[[Any], Any]:
 extending.overload(fast_exp2, jit_options={"fastmath": _RELAXED}, inline="always")(_fast_exp2)
 
 
+@inline
+def lane_run(lane: int, lanes: int, count: int) -> tuple[int, int]:
+    """First and last + 1 of a thread's run of `count` things."""
+    return count * lane // lanes, count * (lane + 1) // lanes
+
+
 def python(compiled: Callable[P, R]) -> Callable[P, R]:
     """The Python function that was compiled; it takes arrays where a kernel takes numbers."""
     function: Callable[P, R] = getattr(compiled, "py_func", compiled)
@@ -120,7 +171,7 @@ def python(compiled: Callable[P, R]) -> Callable[P, R]:
 
 
 def available_threads() -> int:
-    """How many threads numba was started with, at most the processors of this process."""
+    """How many threads there are for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
     return int(numba.config.NUMBA_NUM_THREADS)
 
 
@@ -129,7 +180,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
     """Run kernels on so many threads, one caller at a time.
 
     Args:
-        threads: 1 or more, no more than there are; None for as many as numba is set to.
+        threads: 1 or more, no more than there are; None for as many as were in use before, at first all.
 
     Raises:
         InputError: `threads` is below 1.
@@ -137,13 +188,81 @@ def thread_count(threads: int | None) -> Iterator[int]:
     if threads is not None and threads < 1:
         raise InputError(f"threads is {threads}, wanted 1 or more")
     with LOCK:
-        before = int(numba.get_num_threads())
-        count = before if threads is None else min(threads, available_threads())
-        if count == before:
-            yield count
-            return
-        numba.set_num_threads(count)
+        before = _threads.count
+        _threads.count = before if threads is None else min(threads, available_threads())
         try:
-            yield count
+            yield _threads.count
         finally:
-            numba.set_num_threads(before)
+            _threads.count = before
+
+
+class _Helper:
+    """A thread that sleeps until it is given something to call. Owns two locks that take turns.
+
+    Locks wake a thread in half the time that a queue or a future takes.
+    """
+
+    def __init__(self) -> None:
+        self._begun, self._ended = threading.Lock(), threading.Lock()
+        self._begun.acquire()
+        self._ended.acquire()
+        self._job: tuple[Any, tuple[Any, ...]] = (None, ())
+        self._error: BaseException | None = None
+        threading.Thread(target=self._serve, name="csplat kernel", daemon=True).start()
+
+    def start(self, function: Any, arguments: tuple[Any, ...]) -> None:
+        """Begin a call."""
+        self._job = function, arguments
+        self._begun.release()
+
+    def wait(self) -> None:
+        """Wait for the end of the call, and raise what it raised."""
+        self._ended.acquire()
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _serve(self) -> None:
+        while True:
+            self._begun.acquire()
+            function, arguments = self._job
+            self._job = (None, ())
+            try:
+                function(*arguments)
+            except BaseException as error:  # noqa: BLE001  # whatever it is, the caller is to have it
+                self._error = error
+            del function, arguments  # buffers are not to live until the next call
+            self._ended.release()
+
+
+class _Threads:
+    """The threads that run kernels, beside the one that calls them. Owns them, and how many are in use."""
+
+    def __init__(self) -> None:
+        self.count = available_threads()
+        self._helpers: list[_Helper] = []
+
+    def run(self, function: Any, arguments: tuple[Any, ...]) -> None:
+        """Call `function(lane, lanes, *arguments)` for every lane."""
+        lanes = self.count
+        while len(self._helpers) < lanes - 1:
+            self._helpers.append(_Helper())
+        helpers = self._helpers[: lanes - 1]
+        try:
+            for lane, helper in enumerate(helpers):
+                helper.start(function, (lane + 1, lanes, *arguments))
+            function(0, lanes, *arguments)
+            for helper in helpers:
+                helper.wait()
+        except BaseException:
+            self.forget()  # they may be in the middle of something: new ones the next time
+            raise
+
+    def forget(self) -> None:
+        """Leave the threads to themselves: after a fork, too, where there are none."""
+        self._helpers = []
+
+
+_threads = _Threads()
+if hasattr(os, "register_at_fork"):  # work at import, because nobody else would tell a child that it has no threads
+    os.register_at_fork(after_in_child=_threads.forget)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.conventions import COMPENSATION_MIN, DILATION, LOG_SCALE_LIMIT
@@ -140,6 +139,8 @@ def beyond(at: float, size: int, squared_reach: float) -> bool:
 
 @parallel_kernel()
 def project(
+    lane: int,
+    lanes: int,
     means: Any,
     quats: Any,
     scales: Any,
@@ -186,8 +187,8 @@ def project(
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
-    for block in numba.prange((n + BLOCK - 1) // BLOCK):
-        basis = np.empty(16, np.float64)
+    basis = np.empty(16, np.float64)
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         bad = 0
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             depth[i], radii[i] = 0.0, 0.0

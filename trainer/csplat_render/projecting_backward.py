@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.binning import TILE
@@ -74,6 +73,8 @@ def gather(begin: int, end: int, records: Any, tiles: Any, tiles_x: int, shape: 
 
 @parallel_kernel()
 def project_backward(
+    lane: int,
+    lanes: int,
     means: Any,
     quats: Any,
     scales: Any,
@@ -123,8 +124,8 @@ def project_backward(
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
-    for block in numba.prange((n + BLOCK - 1) // BLOCK):
-        basis, weights = np.empty(16, np.float64), np.empty(16, np.float64)
+    basis, weights = np.empty(16, np.float64), np.empty(16, np.float64)
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             g_means[i], g_quats[i], g_scales[i], g_opacities[i], g_sh0[i], g_means2d[i] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             g_shN[i] = 0.0

@@ -128,7 +128,7 @@ class Rasteriser:
         radii = np.empty(n, np.float32)
         rgb = np.empty((height, width, 3), self.dtype)
         transmittance, depth = np.empty((height, width), self.dtype), np.empty((height, width), self.dtype)
-        with thread_count(self.threads) as lanes:
+        with thread_count(self.threads):
             project(
                 arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh0, arrays.shN, degree, view,
                 width, height, antialiased, self.settings.alpha_min, shape, extent, box, near, radii, ignored,
@@ -136,7 +136,7 @@ class Rasteriser:
             order = self._depth_order(near)
             starts, intersections = self._sort_into_tiles(order, near, extent, box, tiles_x, tile_count)
             blend(
-                starts, self._buffers["ids"], shape, box, tiles_x, lanes, self._limits, colour,
+                starts, self._buffers["ids"], shape, box, tiles_x, self._limits, colour,
                 rgb, transmittance, depth, self._buffer("used", (tile_count,), np.int64),
             )  # fmt: skip
         result = RenderResult(rgb, 1 - transmittance, depth, radii, len(order), intersections, int(ignored.sum()))
@@ -181,11 +181,11 @@ class Rasteriser:
             last.radii,
         )
         shape, box = self._buffer("shape", (n, 10), np.float64), self._buffer("box", (n, 4), np.int32)
-        with thread_count(self.threads) as lanes:
+        with thread_count(self.threads):
             blend_backward(
                 self._buffer("starts", (last.tile_count + 1,), np.int64),
                 self._buffer("used", (last.tile_count,), np.int64), buffers["ids"], buffers["slots"], shape, box,
-                last.tiles_x, lanes, self._limits, last.rgb, last.transmittance, last.depth,
+                last.tiles_x, self._limits, last.rgb, last.transmittance, last.depth,
                 g_rgb, g_alpha, g_depth, records,
             )  # fmt: skip
             project_backward(

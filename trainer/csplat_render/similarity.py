@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -112,7 +111,7 @@ def blur_down(field: Any, r: int, taps: Any, out: Any) -> None:
 
 
 @parallel_kernel(relaxed=True)
-def blur_products(x: Any, y: Any, taps: Any, across: Any) -> None:
+def blur_products(lane: int, lanes: int, x: Any, y: Any, taps: Any, across: Any) -> None:
     """Blur x, y, x², y², xy along each row; parallel over rows, vectorised over the values of a row.
 
     Args:
@@ -122,7 +121,7 @@ def blur_products(x: Any, y: Any, taps: Any, across: Any) -> None:
         across: [5, H + 10, 3·W], rows 5 .. H + 4 written.
     """
     height, width = x.shape
-    for r in numba.prange(height):
+    for r in range(lane, height, lanes):
         rows = np.zeros((5, width + 2 * _PAD), x.dtype)
         a, b, aa, bb, ab = rows[0], rows[1], rows[2], rows[3], rows[4]
         for i in range(width):
@@ -137,7 +136,7 @@ def blur_products(x: Any, y: Any, taps: Any, across: Any) -> None:
 
 
 @parallel_kernel(relaxed=True)
-def _similarities(across: Any, taps: Any, sums: Any) -> None:
+def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> None:
     """Sum of SSIM over each row; parallel over rows, vectorised over the values of a row.
 
     Args:
@@ -146,8 +145,8 @@ def _similarities(across: Any, taps: Any, sums: Any) -> None:
         sums: [H], written.
     """
     width = across.shape[2]
-    for r in numba.prange(len(sums)):
-        moments = np.empty((5, width), across.dtype)
+    moments = np.empty((5, width), across.dtype)
+    for r in range(lane, len(sums), lanes):
         for f in range(5):
             blur_down(across[f], r, taps, moments[f])
         m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numba import prange
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from csplat_render.camera import Camera
+from csplat_render.jit import lane_run, parallel_kernel
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_trainer.densify import ScreenGradients
-from csplat_trainer.kernels import parallel_kernel
 from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
 from csplat_trainer.mcmc import add_noise
 from csplat_trainer.options import TrainOptions
@@ -158,15 +157,19 @@ def _half_pictures(norms: F32, camera: Camera) -> F32:
 
 
 @parallel_kernel(relaxed=True)
-def _activate(logits: F32, alphas: F32) -> None:
+def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
     """Opacities of logits; vectorises over splats."""
     one = np.float32(1.0)
-    for i in prange(len(logits)):
-        alphas[i] = one / (one + np.exp(-logits[i]))
+    first, end = lane_run(lane, lanes, len(logits))
+    x, y = logits[first:end], alphas[first:end]
+    for i in range(len(x)):
+        y[i] = one / (one + np.exp(-x[i]))
 
 
 @parallel_kernel(relaxed=True)
 def _chain(
+    lane: int,
+    lanes: int,
     alphas: F32,
     by_alpha: F32,
     scales: F32,
@@ -186,7 +189,10 @@ def _chain(
         scale_weight: of the sum of standard deviations.
         by_logit: [N], written.
     """
-    for i in prange(len(alphas)):
+    first, end = lane_run(lane, lanes, len(alphas))
+    alphas, by_alpha, by_logit = alphas[first:end], by_alpha[first:end], by_logit[first:end]
+    scales, by_scale = scales[first:end], by_scale[first:end]
+    for i in range(end - first):
         alpha = alphas[i]
         by_logit[i] = (by_alpha[i] + opacity_weight) * alpha * (np.float32(1.0) - alpha)
         if scale_weight > np.float32(0.0):

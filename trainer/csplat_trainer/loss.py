@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
+from csplat_render.jit import parallel_kernel
 from csplat_render.similarity import C1, C2, CHANNELS, RADIUS, WINDOW, blur_across, blur_down, blur_products, blur_twin
-from csplat_trainer.kernels import parallel_kernel
 
 __all__ = ["LOSS_WEIGHTS", "LossValue", "PhotometricLoss", "photometric_loss_twin"]
 
@@ -97,12 +96,12 @@ class PhotometricLoss:
 
 
 @parallel_kernel(relaxed=True)
-def _ssim_partials(x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
+def _ssim_partials(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
     """SSIM of each value, its derivatives by mean, square and product; vectorises over a row."""
     height, width = x.shape
     c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
-    for r in prange(height):
-        moments = np.empty((5, width), np.float32)
+    moments = np.empty((5, width), np.float32)
+    for r in range(lane, height, lanes):
         for f in range(5):
             blur_down(across[f], r, _TAPS, moments[f])
         m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
@@ -131,19 +130,21 @@ def _ssim_partials(x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None
 
 
 @parallel_kernel(relaxed=True)
-def _blur_partials(partial: F32, across: F32) -> None:
+def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
     """Blur the three derivatives along each row; vectorises over the values of a row."""
-    for r in prange(partial.shape[1]):
+    for r in range(lane, partial.shape[1], lanes):
         for f in range(3):
             blur_across(partial[f, r], _TAPS, across[f, r + RADIUS])
 
 
 @parallel_kernel(relaxed=True)
-def _combine(x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32) -> None:
+def _combine(
+    lane: int, lanes: int, x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32
+) -> None:
     """Blur the derivatives across the rows and add the gradient of L1; vectorises over a row."""
     height, width = x.shape
-    for r in prange(height):
-        blurred = np.empty((3, width), np.float32)
+    blurred = np.empty((3, width), np.float32)
+    for r in range(lane, height, lanes):
         for f in range(3):
             blur_down(across[f], r, _TAPS, blurred[f])
         p0, p1, p2 = blurred[0], blurred[1], blurred[2]
@@ -154,10 +155,10 @@ def _combine(x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.flo
 
 
 @parallel_kernel(relaxed=True)
-def _l1_alone(x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
+def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
     """L1 and squared error of each row; vectorises over the values of a row."""
     height, width = x.shape
-    for r in prange(height):
+    for r in range(lane, height, lanes):
         l1_sum, square_sum = np.float32(0.0), np.float32(0.0)
         for i in range(width):
             difference = x[r, i] - y[r, i]

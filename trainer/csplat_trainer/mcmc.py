@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from csplat_trainer.kernels import parallel_kernel
+from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import GROUPS, Parameters
 
 __all__ = ["add_noise", "grow", "relocate", "share"]
@@ -129,10 +128,12 @@ def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
 
 
 @parallel_kernel()
-def _noise(means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32) -> None:
+def _noise(
+    lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
+) -> None:
     """Add the noise to each mean; a thread takes a run of splats."""
     highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
-    for i in prange(means.shape[0]):
+    for i in range(*lane_run(lane, lanes, means.shape[0])):
         if logits[i] > highest:
             continue
         alpha = 1.0 / (1.0 + math.exp(-logits[i]))

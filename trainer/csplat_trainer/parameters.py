@@ -9,11 +9,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel, normalise_quats
-from csplat_trainer.kernels import parallel_kernel, relaxed_kernel
+from csplat_render.jit import parallel_kernel, relaxed_kernel
 
 __all__ = ["GROUPS", "Parameters", "Splats", "adam_step", "from_model", "to_model"]
 
@@ -140,13 +139,15 @@ def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]
 
 
 @parallel_kernel(relaxed=True)
-def _adam(value: F32, gradient: F32, first: F32, second: F32, rate: np.float32, over: np.float32) -> None:
+def _adam(
+    lane: int, lanes: int, value: F32, gradient: F32, first: F32, second: F32, rate: np.float32, over: np.float32
+) -> None:
     """Adam on a flat array; vectorises over its values."""
     b1, b2 = np.float32(_BETA1), np.float32(_BETA2)
     a1, a2 = np.float32(1.0 - _BETA1), np.float32(1.0 - _BETA2)
     epsilon, tiny = np.float32(_EPSILON), np.float32(1e-30)
     blocks = (value.shape[0] + _BLOCK - 1) // _BLOCK
-    for block in prange(blocks):
+    for block in range(lane, blocks, lanes):
         begin = block * _BLOCK
         count = min(_BLOCK, value.shape[0] - begin)
         p, g = value[begin : begin + count], gradient[begin : begin + count]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera
-from csplat_trainer.kernels import parallel_kernel
+from csplat_render.jit import parallel_kernel
 
 __all__ = ["Picture", "UnreadPixels", "compose"]
 
@@ -105,10 +104,10 @@ def compose(picture: Picture, background: F32, out: F32) -> F32:
 
 
 @parallel_kernel()
-def _compose(pixels: U8, background: F32, out: F32) -> None:
+def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> None:
     """Blend each row with the background; a thread takes a run of rows."""
     over = np.float32(1.0 / 255.0)
-    for r in prange(pixels.shape[0]):
+    for r in range(lane, pixels.shape[0], lanes):
         for c in range(pixels.shape[1]):
             if pixels.shape[2] == 4:
                 alpha = np.float32(pixels[r, c, 3]) * over

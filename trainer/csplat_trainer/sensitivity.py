@@ -152,12 +152,12 @@ class _Derivatives(Rasteriser):
         forms = self._buffer("forms", (n, FORM), np.float64)
         records = self._buffer("derivatives", (last.intersections, SUMS), self.dtype)
         view = view_vector(camera)
-        with thread_count(self.threads) as lanes:
+        with thread_count(self.threads):
             covariance_forms(a.means, a.quats, a.scales, view, last.antialiased, shape, near, forms)
             sum_derivatives(
                 self._buffer("starts", (last.tile_count + 1,), np.int64),
                 self._buffer("used", (last.tile_count,), np.int64), self._buffers["ids"], self._buffers["slots"],
-                shape, box, forms, last.tiles_x, lanes, self._limits, last.rgb, records,
+                shape, box, forms, last.tiles_x, self._limits, last.rgb, records,
             )  # fmt: skip
             add_view(
                 a.means, a.opacities, a.scales, view, last.degree, shape, near, offsets, records,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.conventions import COMPENSATION_MIN
@@ -19,8 +18,8 @@ FORM = 12
 
 
 @parallel_kernel()
-def covariance_forms(means: Any, quats: Any, scales: Any, view: Any, antialiased: bool, shape: Any, near: Any,
-                     forms: Any) -> None:  # fmt: skip
+def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any, view: Any, antialiased: bool,
+                     shape: Any, near: Any, forms: Any) -> None:  # fmt: skip
     """What turns a place on the picture into the exponent's derivative towards a splat's covariance.
 
     With Σ2 the covariance on the picture, M the linearised perspective and γ² the trace of the covariance Σ, the
@@ -39,7 +38,7 @@ def covariance_forms(means: Any, quats: Any, scales: Any, view: Any, antialiased
             yz.
     """
     n = means.shape[0]
-    for block in numba.prange((n + BLOCK - 1) // BLOCK):
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             if not near[i] > 0.0:
                 continue

@@ -10,13 +10,26 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending import CHECK, NUMBERS, ROW0, ROW1, THEN, aligned, alive_rows, gather, middles
+from csplat_render.blending_steps import (
+    CHECK,
+    HALF,
+    NUMBERS,
+    aligned,
+    alive_rows,
+    alpha_at,
+    begin_tile,
+    gather,
+    middles,
+    numbers_of,
+    passed,
+    place,
+    read_planes,
+)
 from csplat_render.harmonics import sh_basis
-from csplat_render.jit import fast_exp2, parallel_kernel, relaxed_kernel
+from csplat_render.jit import parallel_kernel, relaxed_kernel
 from csplat_render.projecting import BLOCK, deviation, direction
 from csplat_trainer.sensitivity_forms import FORM
 
@@ -28,7 +41,6 @@ __all__ = ["SUMS", "add_view", "sum_derivatives"]
 #: (the upper triangle of 6 by 6).
 SUMS = 39
 
-_HALF = 0.5 * TILE
 _AREA = TILE * TILE
 
 # Where the planes of a tile begin: transmittance, what lies behind by channel, the current splat's share of the pixel,
@@ -38,11 +50,13 @@ _PLANES = 10
 
 
 @parallel_kernel(relaxed=True)
-def sum_derivatives(starts: Any, used: Any, ids: Any, slots: Any, shape: Any, box: Any, forms: Any, tiles_x: int,
-                    lanes: int, limits: Any, rgb: Any, records: Any) -> None:  # fmt: skip
+def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slots: Any, shape: Any, box: Any,
+                    forms: Any, tiles_x: int, limits: Any, rgb: Any, records: Any) -> None:  # fmt: skip
     """One record for every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
+        lane: see `blend_backward`.
+        lanes: see `blend_backward`.
         starts: see `blend_backward`, as the next five.
         used: see `blend_backward`.
         ids: see `blend_backward`.
@@ -50,87 +64,69 @@ def sum_derivatives(starts: Any, used: Any, ids: Any, slots: Any, shape: Any, bo
         shape: see `blend_backward`.
         box: see `blend_backward`.
         forms: see `covariance_forms`.
-        tiles_x: see `blend_backward`, as the next two.
-        lanes: see `blend_backward`.
+        tiles_x: see `blend_backward`, as the next.
         limits: see `blend_backward`.
         rgb: [H, W, 3], the picture.
         records: [intersections, SUMS], written.
     """
     height, width = rgb.shape[:2]
-    for lane in numba.prange(lanes):
-        planes = aligned(_PLANES * _AREA, limits)
-        T = planes[:_AREA].reshape((TILE, TILE))
-        ys = middles()
-        for e in range(_AREA):
-            planes[_X + e] = ys[e % TILE]
-            planes[_Y + e] = ys[e // TILE]
-        batch, rows_ = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
-        form, sums = np.empty(FORM + 3, limits.dtype), np.empty(SUMS, limits.dtype)
-        alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
-        zero, one = alpha_min - alpha_min, alpha_min / alpha_min
-        for tile in range(lane, len(used), lanes):
-            X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-            columns, low, high = min(TILE, width - X0), 0, min(TILE, height - Y0)
-            planes[:_X] = zero
-            T[:, :columns] = one
-            T[:, columns:] = -one
-            for y in range(high):
-                for x in range(columns):
-                    at = y * TILE + x
-                    planes[_RED + at] = rgb[Y0 + y, X0 + x, 0]
-                    planes[_GREEN + at] = rgb[Y0 + y, X0 + x, 1]
-                    planes[_BLUE + at] = rgb[Y0 + y, X0 + x, 2]
-            for begin in range(starts[tile], used[tile], CHECK):
-                low, high = alive_rows(T, low, high)
-                count = min(CHECK, used[tile] - begin)
-                gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows_)
-                for j in range(count):
-                    record = records[slots[begin + j]]
-                    first, last = rows_[j, 0], rows_[j, 1]
-                    if first >= last:
-                        record[:] = zero
-                        continue
-                    body, row0, row1 = planes[first * TILE :], batch[j, ROW0 + first :], batch[j, ROW1 + first :]
-                    a, o = batch[j, THEN], batch[j, THEN + 1]
-                    r, g, b = batch[j, THEN + 2], batch[j, THEN + 3], batch[j, THEN + 4]
-                    for y in range(last - first):
-                        row, c0, c1 = body[y * TILE :], row0[y], row1[y]
-                        for x in range(TILE):
-                            at = row[_X + x]
-                            power = (a * at + c1) * at + c0
-                            full = o * fast_exp2(min(power, zero))
-                            alpha = min(full, alpha_cap)
-                            alpha = alpha if alpha >= alpha_min else zero
-                            before = row[x]
-                            rest = one - alpha
-                            after = before * rest
-                            going = after >= stop
-                            weight = alpha * before if going else zero
-                            row[x] = after if going else -abs(before)
-                            red, green, blue = weight * r, weight * g, weight * b
-                            row[_RED + x] -= red
-                            row[_GREEN + x] -= green
-                            row[_BLUE + x] -= blue
-                            share = alpha / rest
-                            red -= row[_RED + x] * share
-                            green -= row[_GREEN + x] * share
-                            blue -= row[_BLUE + x] * share
-                            free = one if going and full < alpha_cap else zero
-                            row[_WEIGHT + x] = weight
-                            row[_SLOPE + x] = free * (red + green + blue)
-                            row[_SIZE + x] = free * (abs(red) + abs(green) + abs(blue))
-                            row[_SQUARE + x] = free * (red * red + green * green + blue * blue)
-                    i = ids[begin + j]
-                    dx, dy = X0 + _HALF - shape[i, 0], Y0 + _HALF - shape[i, 1]
-                    for e in range(FORM):
-                        form[e] = forms[i, e]
-                    for k in range(3):
-                        form[FORM + k] = forms[i, 2 * k] * dx + forms[i, 2 * k + 1] * dy
-                    _moments(body, (last - first) * TILE, form, sums)
-                    for e in range(SUMS):
-                        record[e] = sums[e]
-            for k in range(used[tile], starts[tile + 1]):
-                records[slots[k]] = zero
+    planes = aligned(_PLANES * _AREA, limits)
+    T = planes[:_AREA].reshape((TILE, TILE))
+    ys = middles()
+    for e in range(_AREA):
+        planes[_X + e] = ys[e % TILE]
+        planes[_Y + e] = ys[e // TILE]
+    batch, rows_ = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
+    form, sums = np.empty(FORM + 3, limits.dtype), np.empty(SUMS, limits.dtype)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    for tile in range(lane, len(used), lanes):
+        X0, Y0, columns, high = place(tile, tiles_x, width, height)
+        low = 0
+        planes[:_X] = zero
+        begin_tile(T, columns, one)
+        read_planes(rgb, X0, Y0, columns, high, planes, _RED)
+        for begin in range(starts[tile], used[tile], CHECK):
+            low, high = alive_rows(T, low, high)
+            count = min(CHECK, used[tile] - begin)
+            gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows_)
+            for j in range(count):
+                record = records[slots[begin + j]]
+                first, last = rows_[j, 0], rows_[j, 1]
+                if first >= last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, r, g, b, _ = numbers_of(batch, j, first)
+                for y in range(last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        full, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        going, weight, row[x] = passed(row[x], alpha, stop, zero, one)
+                        red, green, blue = weight * r, weight * g, weight * b
+                        row[_RED + x] -= red
+                        row[_GREEN + x] -= green
+                        row[_BLUE + x] -= blue
+                        share = alpha / (one - alpha)
+                        red -= row[_RED + x] * share
+                        green -= row[_GREEN + x] * share
+                        blue -= row[_BLUE + x] * share
+                        free = one if going and full < alpha_cap else zero
+                        row[_WEIGHT + x] = weight
+                        row[_SLOPE + x] = free * (red + green + blue)
+                        row[_SIZE + x] = free * (abs(red) + abs(green) + abs(blue))
+                        row[_SQUARE + x] = free * (red * red + green * green + blue * blue)
+                i = ids[begin + j]
+                dx, dy = X0 + HALF - shape[i, 0], Y0 + HALF - shape[i, 1]
+                for e in range(FORM):
+                    form[e] = forms[i, e]
+                for k in range(3):
+                    form[FORM + k] = forms[i, 2 * k] * dx + forms[i, 2 * k + 1] * dy
+                _moments(body, (last - first) * TILE, form, sums)
+                for e in range(SUMS):
+                    record[e] = sums[e]
+        for k in range(used[tile], starts[tile + 1]):
+            records[slots[k]] = zero
 
 
 @relaxed_kernel
@@ -209,9 +205,9 @@ def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
 
 
 @parallel_kernel()
-def add_view(means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any, near: Any, offsets: Any,
-             records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any, bends: Any,
-             views: Any) -> None:  # fmt: skip
+def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any,
+             near: Any, offsets: Any, records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any,
+             bends: Any, views: Any) -> None:  # fmt: skip
     """Add what one view says of every splat; parallel over blocks of splats, records in one order.
 
     Args:
@@ -237,8 +233,8 @@ def add_view(means: Any, opacities: Any, scales: Any, view: Any, degree: int, sh
     """
     n = means.shape[0]
     count = (degree + 1) * (degree + 1)
-    for block in numba.prange((n + BLOCK - 1) // BLOCK):
-        basis, sums = np.empty(16, np.float64), np.empty(SUMS, np.float64)
+    basis, sums = np.empty(16, np.float64), np.empty(SUMS, np.float64)
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             if not (near[i] > 0.0 and offsets[i + 1] > offsets[i]):
                 continue

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen
-from csplat_trainer.kernels import parallel_kernel
+from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import Splats
 
 __all__ = ["Costs", "Stored", "colour_integers_of", "cost_slopes"]
@@ -149,23 +148,31 @@ def _integers(seen: F32, step: float) -> I32:
 
 
 @parallel_kernel()
-def _add_plain(seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32) -> None:
+def _add_plain(
+    lane: int, lanes: int, seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32
+) -> None:
     """Add the slopes of plain columns, [n, C] from column `first` on; a thread takes a run of rows."""
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
-    for i in prange(seen.shape[0]):
+    begin, end = lane_run(lane, lanes, seen.shape[0])
+    seen, out = seen[begin:end], out[begin:end]
+    for i in range(end - begin):
         for c in range(first, seen.shape[1]):
             n = min(max(int(np.rint(seen[i, c] * over)), -reach), reach)
             out[i, c] += per_bit * over * tables[c - first, reach + n]
 
 
 @parallel_kernel()
-def _add_colour(seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32) -> None:
+def _add_colour(
+    lane: int, lanes: int, seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32
+) -> None:
     """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; a thread takes a run of rows."""
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     chroma = np.float32(0.5**shift)
-    for i in prange(seen.shape[0]):
+    begin, end = lane_run(lane, lanes, seen.shape[0])
+    seen, out = seen[begin:end], out[begin:end]
+    for i in range(end - begin):
         for k in range(seen.shape[1]):
             red = int(np.rint(seen[i, k, 0] * over))
             green = int(np.rint(seen[i, k, 1] * over))

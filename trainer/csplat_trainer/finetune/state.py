@@ -8,13 +8,12 @@ entry gets the sum of the gradients of all who use it.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat_render.arrays import Gradients
+from csplat_render.jit import parallel_kernel
 from csplat_trainer.finetune.rate import Costs, Stored
-from csplat_trainer.kernels import parallel_kernel
 from csplat_trainer.parameters import Parameters, Splats, adam_step, sigmoid
 
 __all__ = ["TunedScene", "sum_by_entry", "sum_by_entry_twin"]
@@ -150,7 +149,7 @@ def _summed(values: F32, order: I64, starts: I64, size: int) -> F32:
 
 
 @parallel_kernel()
-def sum_by_entry(values: F32, order: I64, starts: I64, out: F32) -> None:
+def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, out: F32) -> None:
     """Sum the rows of the users of each entry, in float32 and in their order; vectorises over a row.
 
     Args:
@@ -159,7 +158,7 @@ def sum_by_entry(values: F32, order: I64, starts: I64, out: F32) -> None:
         starts: [size + 1], where the users of an entry begin in `order`.
         out: [size, C], overwritten.
     """
-    for entry in prange(out.shape[0]):
+    for entry in range(lane, out.shape[0], lanes):
         total = out[entry]
         total[:] = np.float32(0.0)
         for at in range(starts[entry], starts[entry + 1]):

@@ -1,0 +1,84 @@
+"""The threads that run kernels: every lane once, errors to the caller, a child of a fork with threads of its own."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+from csplat_render.jit import available_threads, kernel, lane_run, parallel_kernel, thread_count
+
+
+@parallel_kernel()
+def note(lane, lanes, seen):
+    first, end = lane_run(lane, lanes, len(seen))
+    for i in range(first, end):
+        seen[i] += lane + 1
+
+
+@parallel_kernel()
+def fail_at(lane, lanes, which):
+    if lane == min(which, lanes):
+        raise ValueError("this lane")
+
+
+@kernel
+def run_of(lane, lanes, count):
+    return lane_run(lane, lanes, count)
+
+
+def test_the_runs_of_all_lanes_make_up_the_whole():
+    for count in (0, 1, 5, 100):
+        runs = [run_of(lane, 3, count) for lane in range(3)]
+        assert list(range(count)) == [i for first, end in runs for i in range(first, end)]
+
+
+def test_every_lane_runs_once():
+    for threads in (1, 2, None, 1):
+        seen = np.zeros(1000, np.int64)
+        with thread_count(threads) as lanes:
+            note(seen)
+        counts = np.bincount(seen, minlength=lanes + 1)
+        assert counts[0] == 0
+        assert counts.sum() == counts[1 : lanes + 1].sum() == 1000
+
+
+def test_the_error_of_any_lane_reaches_the_caller():
+    with thread_count(None) as lanes:
+        for lane in range(lanes):
+            with pytest.raises(ValueError, match="this lane"):
+                fail_at(lane)
+        fail_at(-1)
+
+
+def test_the_number_of_threads_is_given_back():
+    with thread_count(1):
+        with pytest.raises(InputError), thread_count(0):
+            pass
+        with thread_count(available_threads() + 1) as lanes:
+            assert lanes == available_threads()
+        with thread_count(None) as lanes:
+            assert lanes == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+def test_a_forked_child_has_threads_of_its_own():
+    script = """
+import os
+import numpy as np
+from test_jit import note
+note(np.zeros(9, np.int64))
+if child := os.fork():
+    raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+seen = np.zeros(9, np.int64)
+note(seen)
+os._exit(0 if seen.all() else 3)
+"""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    run = subprocess.run([sys.executable, "-c", script], env=environment, timeout=120, check=False)
+    assert run.returncode == 0
