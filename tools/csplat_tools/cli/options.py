@@ -295,7 +295,7 @@ def _spelling(one: inspect.Parameter) -> str:
     given: list[object] = [
         info.default,
         *(info.param_decls or ()),
-    ]  # inside of Annotated a name may stand in the default's place
+    ]  # in Annotated one stands first
     declared = [word for word in given if isinstance(word, str) and word.startswith("--")]
     return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
 
