@@ -23,7 +23,7 @@ class EncodeOptions:
         attribute_psnr: PSNR in dB that each attribute alone is to keep, not the file's, which is 5 to 12 dB lower;
             overrides the preset's. All steps follow from it.
         profile: "base" (every decoder reads it) or "archive" (Zstandard too).
-        position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from splat sizes.
+        position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from the quality.
         position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
         position_error: largest distance of a centre from where it was, scene units, > 0; overrides both. The step
             follows from it, and tiles are cut until none needs a coarser one.
