@@ -549,7 +549,7 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
     [
         ((), "one of --data and --self"),
         (("--self", "--data", "x"), "--data and --self: give one of them"),
-        (("--data", "x", "--cameras", "y"), "--data and --cameras: give one of them"),
+        (("--data", "x", "--cameras", "y"), "--cameras and --data: give one of them"),
         (("--self", "--attribute-psnr", "5"), "attribute_psnr is 5"),
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
         (("--self", "--lr-factor", "1e9"), "lr_"),

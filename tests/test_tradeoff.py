@@ -163,7 +163,7 @@ def test_fewer_layers_take_fewer_bytes_and_look_worse(measured):
         assert (len(point.partial) == 3) == (point.family == "presets")
         for fewer, more in zip(point.partial, point.partial[1:], strict=False):
             assert fewer.size_bytes < more.size_bytes <= point.size_bytes
-            assert fewer.psnr < more.psnr
+            assert fewer.quality.psnr < more.quality.psnr
         if point.partial:
             assert point.first_picture_bytes == point.partial[0].size_bytes
             assert point.psnr == point.partial[-1].psnr

@@ -292,10 +292,8 @@ def _spelling(one: inspect.Parameter) -> str:
     info = next(iter(getattr(one.annotation, "__metadata__", ())), None)
     if not isinstance(info, OptionInfo):
         return ""
-    given: list[object] = [
-        info.default,
-        *(info.param_decls or ()),
-    ]  # in Annotated one stands first
+    given: list[object] = [info.default]  # inside of Annotated a name may stand in the default's place
+    given.extend(info.param_decls or ())
     declared = [word for word in given if isinstance(word, str) and word.startswith("--")]
     return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
 
