@@ -166,7 +166,7 @@ def test_fewer_layers_take_fewer_bytes_and_look_worse(measured):
             assert fewer.quality.psnr < more.quality.psnr
         if point.partial:
             assert point.first_picture_bytes == point.partial[0].size_bytes
-            assert point.psnr == point.partial[-1].psnr
+            assert point.psnr == point.partial[-1].quality.psnr
 
 
 def test_what_is_fetched_suffices():
