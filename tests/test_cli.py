@@ -135,6 +135,24 @@ def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):
     assert expected in " ".join(result.stderr.replace("│", "").split())
 
 
+@pytest.mark.parametrize("words", [("encode",), ("simplify",), ("finetune",), ("decode",)])
+def test_all_help_is_there_without_the_extra_packages(words):
+    code = "import sys; sys.modules['numba'] = None; from csplat_tools.__main__ import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words, "--help-all"], capture_output=True, text=True, check=True
+    )
+    assert "--report" in done.stdout
+    if words[0] in ("simplify", "finetune"):
+        assert "Settings of --set: this needs numba: pip install 'csplat[render]'" in done.stdout
+
+
+def test_settings_that_want_an_extra_say_so_in_one_line(ply, tmp_path):
+    code = "import sys; sys.modules['numba'] = None; from csplat_tools.__main__ import main; main()"
+    words = ("simplify", ply, tmp_path / "o.ply", "--keep", "0.5", "--set", "rounds=1")
+    done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, check=False)
+    assert (1, "error: this needs numba: pip install 'csplat[render]'\n") == (done.returncode, done.stderr)
+
+
 def test_the_output_is_an_argument_or_an_option(tmp_path, ply):
     call("encode", ply, tmp_path / "a.csplat", "-q")
     call("encode", ply, "-o", tmp_path / "b.csplat", "-q")

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from csplat.errors import InputError
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-from csplat_render.jit import available_threads, kernel, lane_run, parallel_kernel, thread_count
+from csplat_render.jit import ParallelKernel, available_threads, kernel, lane_run, parallel_kernel, thread_count
 
 
 @parallel_kernel()
@@ -54,6 +56,44 @@ def test_the_error_of_any_lane_reaches_the_caller():
             with pytest.raises(ValueError, match="this lane"):
                 fail_at(lane)
         fail_at(-1)
+
+
+def test_an_error_waits_for_the_lanes_that_still_write():
+    """Afterwards nothing is written any more, and the threads are those of before."""
+
+    def slow(lane, _lanes, written):
+        if lane == 0:
+            raise MemoryError("the first lane")
+        time.sleep(0.2)
+        written[0] += 1
+
+    written = [0]
+    run = ParallelKernel(slow)
+    with thread_count(None) as lanes:
+        before = threading.active_count()
+        for _ in range(3):
+            with pytest.raises(MemoryError, match="the first lane"):
+                run(written)
+        assert [3 * (lanes - 1)] == written
+        assert threading.active_count() <= before + lanes - 1
+
+
+def test_a_child_of_a_fork_does_not_wait_for_a_lock_that_nobody_frees():
+    code = (
+        "import os, threading, time; import numpy as np; from csplat_render.jit import parallel_kernel, thread_count\n"
+        "held = threading.Event()\n"
+        "def hold():\n"
+        "    with thread_count(1): held.set(); time.sleep(30)\n"
+        "threading.Thread(target=hold, daemon=True).start(); held.wait()\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    with thread_count(None): os._exit(7)\n"
+        "os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+    )
+    if not hasattr(os, "fork"):
+        pytest.skip("this system does not fork")
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=False, timeout=25)
+    assert 7 == done.returncode
 
 
 def test_the_number_of_threads_is_given_back():

@@ -181,6 +181,14 @@ def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, 
     assert f"error: this needs {package}: pip install 'csplat[render]'\n" == done.stderr
 
 
+def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
+    film = tmp_path / "turn.webp"
+    result = CliRunner().invoke(app, ["render", str(ply), str(film), "--orbit", "2", "--report", str(film)])
+    assert 1 == result.exit_code
+    assert "is wanted for two outputs" in result.stderr
+    assert not film.exists()
+
+
 def test_the_program_starts_without_the_extra_packages():
     code = (
         "import sys; from csplat_tools.cli.app import app\n"

@@ -217,6 +217,7 @@ def test_a_long_search_says_beforehand_how_long_it_takes(tmp_path, ply, monkeypa
         (["--keep", "0.5", "--max-error", "means=1"], 2, "no bounds"),
         (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr and --target-size: give one of them"),
         (["--views", "9"], 2, "--views says nothing without --target-psnr or"),
+        (["--view-size", "9x9"], 2, "--view-size says nothing without --target-psnr or"),
         (["--grades", "3"], 2, "--grades says nothing"),
         (["--grades", "9", "--target-size", "5kB"], 2, "grades is 9"),
         (["--keep-all"], 2, "--keep-all says nothing without --target-psnr or"),

@@ -401,6 +401,7 @@ def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
         ["--what", "precision=forty"],
         ["--what", "precision=500"],
         ["--what", "presets=3"],
+        ["--what", "precision=36,precision=44"],
         ["--what", "targets=100"],
         ["--what", "targets=5 parsecs"],
         ["--what", "simplify=0"],

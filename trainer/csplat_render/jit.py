@@ -6,7 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
@@ -177,7 +177,8 @@ def available_threads() -> int:
 
 @contextmanager
 def thread_count(threads: int | None) -> Iterator[int]:
-    """Run kernels on so many threads, one caller at a time.
+    """Run kernels on so many threads, one caller at a time: a thread that waits inside for another one that calls a
+    kernel waits for ever.
 
     Args:
         threads: 1 or more, no more than there are; None for as many as were in use before, at first all.
@@ -247,22 +248,45 @@ class _Threads:
         lanes = self.count
         while len(self._helpers) < lanes - 1:
             self._helpers.append(_Helper())
-        helpers = self._helpers[: lanes - 1]
+        waiting: list[_Helper] = []
         try:
-            for lane, helper in enumerate(helpers):
+            for lane, helper in enumerate(self._helpers[: lanes - 1]):
                 helper.start(function, (lane + 1, lanes, *arguments))
+                waiting.append(helper)
             function(0, lanes, *arguments)
-            for helper in helpers:
-                helper.wait()
+            while waiting:
+                waiting.pop().wait()
+        except Exception:
+            self._quit(waiting)
+            raise
         except BaseException:
-            self.forget()  # they may be in the middle of something: new ones the next time
+            self._quit(waiting)
+            self.forget()  # an interrupt may have come between a start and its note: new threads the next time
+            raise
+
+    def _quit(self, waiting: list[_Helper]) -> None:
+        """Wait for lanes that still write into the buffers; what they raise is not the first mistake."""
+        try:
+            while waiting:
+                with suppress(Exception):
+                    waiting.pop().wait()
+        except BaseException:
+            self.forget()  # somebody is in a hurry: new threads the next time
             raise
 
     def forget(self) -> None:
-        """Leave the threads to themselves: after a fork, too, where there are none."""
+        """Leave the threads to themselves."""
         self._helpers = []
+
+
+def _after_fork() -> None:
+    """A child has no other threads: nobody holds the lock, and there are no helpers."""
+    global LOCK  # noqa: PLW0603  # it may be held for ever by a thread that is not there
+    LOCK = threading.RLock()
+    _threads.count = available_threads()
+    _threads.forget()
 
 
 _threads = _Threads()
 if hasattr(os, "register_at_fork"):  # work at import, because nobody else would tell a child that it has no threads
-    os.register_at_fork(after_in_child=_threads.forget)
+    os.register_at_fork(after_in_child=_after_fork)

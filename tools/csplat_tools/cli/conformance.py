@@ -48,6 +48,13 @@ class Run(Group):
     ] = None
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for each check.")] = False
 
+    def check(self, out: Output) -> None:
+        """Refuse the places of reports before anything is run; XML may go to a terminal."""
+        to_stdout = self.junit == STANDARD_STREAM
+        if to_stdout and out.as_json:
+            raise typer.BadParameter("--json and --junit - both want standard output")
+        out.check(None if to_stdout else self.junit)
+
     def publish(self, report: Report, out: Output, nothing: str) -> None:
         """Give the report, in every form that is wanted, and end with its status.
 
@@ -123,7 +130,7 @@ def decoder(
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
-    out.check(run.junit)
+    run.check(out)
     with out.bar() as bar:
         # A renderer alone is tested at L4 alone.
         levels = parse_levels(level or ("3" if render_program is None else "4"))
@@ -164,10 +171,10 @@ def encoder(
       csplat conformance encoder --cmd 'my-encoder --small {ply} {out}' --min-psnr 28 --junit report.xml
       csplat conformance encoder --cmd 'my-encoder {ply} {out}' --filter 'nasty/*' --level 1 --keep tried
     """
-    out.check(run.junit)
+    run.check(out)
     levels = tuple(f"L{number}" for number in parse_levels(level))
     folder = _checked_folder(keep, force=out.force)
-    pictures, reason = _picture_judge() if f"L{_PICTURES_LEVEL}" in levels else (None, "")
+    pictures, reason = _picture_judge(quiet=out.quiet) if f"L{_PICTURES_LEVEL}" in levels else (None, "")
     choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, folder)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
@@ -190,10 +197,10 @@ def _checked_folder(name: str | None, *, force: bool) -> Path | None:
     return folder
 
 
-def _picture_judge() -> tuple[PictureJudge | None, str]:
+def _picture_judge(*, quiet: bool) -> tuple[PictureJudge | None, str]:
     """Return what judges pictures, or why nothing does."""
     try:
-        prepare_renderer(quiet=False)
+        prepare_renderer(quiet=quiet)
     except InputError as error:
         return None, str(error)
     from csplat_render.judge import Judge

@@ -106,6 +106,7 @@ class Goal(Group):
         "cameras": _RENDERED,
         "data": _RENDERED,
         "views": _RENDERED,
+        "view_size": _RENDERED,
         "background": ("cameras", "data"),
     },
     settings=(ENCODER,),

@@ -10,7 +10,7 @@ from csplat.lint import Finding
 from csplat.ply import lint_ply, read_ply
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.options import Output, command
-from csplat_tools.files.console import format_table, note
+from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.streams import STANDARD_STREAM, ply_path, write_model
 
@@ -51,7 +51,7 @@ def lint(
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:
-        note(table)
+        out.remark(table)
     result = {"clean": clean, "fixed": fix is not None and not errors, "findings": findings_as_json(findings)}
     out.publish(result, "" if fix == STANDARD_STREAM else table)
     if errors or (fix is None and not clean):

@@ -92,6 +92,13 @@ class Group:
     one_of: ClassVar[Sequence[tuple[str, ...]]] = ()
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
+    def parse(self) -> None:
+        """Refuse words that say nothing, before any work is done.
+
+        Raises:
+            typer.BadParameter: there are such.
+        """
+
 
 @dataclass(frozen=True)
 class Output(Group):
@@ -198,11 +205,11 @@ def command(
             values = {
                 name: kind(**{one.name: given.pop(one.name) for one in fields(kind)}) for name, kind in groups.items()
             }
+            for group in values.values():
+                group.parse()
             function(**given, **values)
 
-        if any(_is_hidden(one) for one in flat if one.name != _ALIAS):
-            more = functools.partial(_more_help, function, settings, options)
-            flat.append(_help_all(more))
+        flat.append(_help_all(functools.partial(_more_help, function, settings, options)))
         shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}
         told = [_saying_what_excludes_it(one, shown, exclusive) for one in flat]
         run.__signature__ = inspect.Signature(told)  # type: ignore[attr-defined]  # functions take attributes
@@ -236,8 +243,7 @@ def _help_all(more: Callable[[], str]) -> inspect.Parameter:
         if wanted and not context.resilient_parsing:
             for option in context.command.params:
                 option.hidden = option.name in (_HELP_ALL, _ALIAS)  # type: ignore[attr-defined]  # arguments have it, too
-            say(context.get_help())
-            say(more())
+            say(f"{context.get_help()}{more()}")
             raise typer.Exit
 
     option = typer.Option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, ClassVar
 
@@ -21,11 +22,25 @@ from csplat_tools.views import BLACK
 __all__ = ["render"]
 
 
+@dataclass(frozen=True)
 class _Views(Views):
-    """Views that pictures are made from; a size is that of the pictures."""
+    """From where pictures are made, all of them, and how large."""
 
     one_of = (("cameras", "orbit", "data"),)
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("images", "test_every", "split"), ("data",))
+
+    cameras: Annotated[
+        str | None, typer.Option(metavar="FILE.json", help="Cameras: a list of {K, viewmat, W, H, near, image}.")
+    ] = None
+    data: Annotated[str | None, typer.Option(metavar="DATA", help="Where the pictures of a data set were taken.")] = (
+        None
+    )
+    background: Annotated[
+        str | None, typer.Option(metavar="R,G,B", help="Colour behind the scene, 0 to 1, or black, or white.")
+    ] = None
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Of the pictures: the cameras' own, or 640x480.")] = (
+        None
+    )
 
 
 @command()
@@ -71,7 +86,7 @@ def render(
     pixels = None if views.size is None else parse_size(views.size)
     colour, chosen = views.colour or BLACK, parse_mode(mode)
     shots = views.photographs()
-    out.check(inputs=(source, views.cameras))
+    out.check(output if film else None, inputs=(source, views.cameras))
     need_renderer()
     model = load_model(source).model
     if sh_degree is not None:

@@ -12,6 +12,9 @@ from typing import Any, get_args, get_type_hints
 
 import typer
 
+from csplat.errors import InputError
+from csplat_tools.files.extras import missing
+
 __all__ = ["Settings", "describe_settings", "read_settings"]
 
 _READERS: dict[type, tuple[Callable[[str], Any], str]] = {
@@ -47,6 +50,7 @@ def read_settings(texts: Sequence[str], kinds: Sequence[str], taken: Collection[
 
     Raises:
         typer.BadParameter: there is no such setting, one is given twice, or its value is of another type.
+        InputError: an extra is not installed.
     """
     known = {name: (kind, type_) for kind in _imported(kinds if texts else ()) for name, type_ in _names(kind, taken)}
     found = dict[type, dict[str, Any]]()
@@ -72,7 +76,11 @@ def read_settings(texts: Sequence[str], kinds: Sequence[str], taken: Collection[
 def describe_settings(kinds: Sequence[str], taken: Collection[str]) -> str:
     """The names, and what the dataclasses say of each; for `--help-all`."""
     lines = []
-    for kind in _imported(kinds):
+    try:
+        found = _imported(kinds)
+    except InputError as error:
+        return f"Settings of --set: {error}"
+    for kind in found:
         told = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", inspect.getdoc(kind) or "", re.MULTILINE))
         for name, _ in _names(kind, taken):
             lines.append(f"  {name.replace('_', '-')}: {' '.join(told.get(name, '').split())}")
@@ -80,7 +88,10 @@ def describe_settings(kinds: Sequence[str], taken: Collection[str]) -> str:
 
 
 def _imported(kinds: Sequence[str]) -> list[type]:
-    return [getattr(import_module(module), name) for module, _, name in (kind.partition(":") for kind in kinds)]
+    try:
+        return [getattr(import_module(module), name) for module, _, name in (kind.partition(":") for kind in kinds)]
+    except ModuleNotFoundError as error:
+        raise missing(error) from None
 
 
 def _names(kind: type, taken: Collection[str]) -> list[tuple[str, type]]:

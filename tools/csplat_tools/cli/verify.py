@@ -49,8 +49,7 @@ def verify(
         with out.bar() as progress:
             verified = verify_file(path, source, source_index, max_splats=max_splats, progress=progress)
     except CsplatError as error:
-        if out.as_json:
-            out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
+        out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise
     out.publish(verified.as_json(), "" if out.quiet else _report(verified))
     if not verified.holds:

@@ -72,6 +72,10 @@ class Views(Group):
         ),
     ] = None
 
+    def parse(self) -> None:
+        """Refuse a colour or a size that is none."""
+        _ = self.colour, None if self.size is None else parse_size(self.size)
+
     @property
     def colour(self) -> tuple[float, float, float] | None:
         """What is behind the scene; `None`: as usual."""
@@ -116,6 +120,10 @@ class Virtual(Group):
             metavar="WxH", hidden=True, rich_help_panel=_VIEWS, help="About how large pictures that teach are."
         ),
     ] = None
+
+    def parse(self) -> None:
+        """Refuse a size that is none."""
+        self.given()
 
     def given(self) -> dict[str, Any]:
         """What is asked for, as `find_view_set` takes it."""

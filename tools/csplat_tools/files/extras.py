@@ -9,7 +9,15 @@ from importlib import import_module
 from csplat.errors import InputError
 from csplat_tools.files.console import note
 
-__all__ = ["need_photographs", "need_pictures", "need_plots", "need_renderer", "need_trainer", "prepare_renderer"]
+__all__ = [
+    "missing",
+    "need_photographs",
+    "need_pictures",
+    "need_plots",
+    "need_renderer",
+    "need_trainer",
+    "prepare_renderer",
+]
 
 _FRUGAL_SPINS = "1000"  # see _wait_frugally
 _PHOTOGRAPHS = (
@@ -104,7 +112,12 @@ def _need(module: str, package: str | None = None) -> None:
     try:
         import_module(module)
     except ModuleNotFoundError as error:
-        raise InputError(f"this needs {package or error.name or module}: pip install 'csplat[render]'") from None
+        raise missing(error, package) from None
+
+
+def missing(error: ModuleNotFoundError, package: str | None = None) -> InputError:
+    """One line for a package that is not installed."""
+    return InputError(f"this needs {package or error.name}: pip install 'csplat[render]'")
 
 
 def _wait_frugally() -> None:

@@ -157,7 +157,7 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
         if encoding.adaptive:
             raise InputError("adaptive steps bound no error of a splat: leave them out")
         if encoding.sh_coding == "codebook":
-            raise InputError("an SH codebook bounds no error of a splat: leave --sh-coding to the bound")
+            raise InputError("an SH codebook bounds no error of a splat: leave sh_coding to the bound")
         bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")
         if encoding.sh_degree is not None and encoding.sh_degree < min(bounded, source.sh_degree):
             raise InputError(f"SH degree {encoding.sh_degree} leaves out sh{bounded}, whose error is bounded")

@@ -85,7 +85,10 @@ def parse_what(text: str, **how: Any) -> Wanted:
     Raises:
         InputError: there is no such group, or a value is none.
     """
-    words = {name: values for name, *values in (word.strip().split("=", 1) for word in text.split(",")) if name}
+    parts = [word.strip().split("=", 1) for word in text.split(",") if word.strip()]
+    words = {name: values for name, *values in parts}
+    if len([name for name, *values in parts if values]) > len([name for name, values in words.items() if values]):
+        raise InputError("values of a group are given twice: put colons between them")
     what = [one for name in words for one in (USUAL if name == "usual" else (name,))]
     values: dict[str, Any] = {}
     for name, listed in words.items():
