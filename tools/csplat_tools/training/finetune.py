@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from csplat.decoder import decode
 from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Frozen, Origin
 from csplat.model import SplatModel
+from csplat_render import warmup
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
-from csplat_render.warmup import warm_up
 from csplat_tools.files.console import Progress, note, progress_bar, step_progress
 from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
@@ -104,7 +104,7 @@ def run_finetuning(
     """
     clock, threads = Clock(), encoding.threads
     with thread_count(threads):
-        warm_up(None if quiet else note)
+        warmup.warm_up(None if quiet else note)
         with progress_bar(quiet=quiet) as progress:
             plan = plan_tuning(
                 source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=importance,

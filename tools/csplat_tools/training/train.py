@@ -7,9 +7,9 @@ from typing import Any
 
 from csplat.errors import InputError
 from csplat.training import TrainedOn
+from csplat_render import warmup
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
-from csplat_render.warmup import warm_up
 from csplat_tools.files.console import note, step_progress
 from csplat_tools.files.streams import write_model
 from csplat_tools.views import DataOptions
@@ -61,7 +61,7 @@ def run_training(
     shown = step_progress("training", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
     with thread_count(threads):
         if options.device == "cpu":
-            warm_up(None if quiet else note)
+            warmup.warm_up(None if quiet else note)
         with shown as show:
             result = train(pictures, options, show, files)
     write_model(output, result.model, absolute=False)
