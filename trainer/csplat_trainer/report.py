@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import io
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.files import atomic_writer
 
-__all__ = ["TrainingStep", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side", "write_log"]
+__all__ = ["TrainingStep", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -56,12 +54,6 @@ def peak_memory() -> int | None:
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(most) if sys.platform == "darwin" else int(most) * 1024
-
-
-def write_log(path: str | Path, log: dict[str, Any]) -> None:
-    """Write the log of a run as JSON."""
-    with atomic_writer(str(path)) as stream:
-        stream.write(json.dumps(log, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def moving_average(values: Sequence[float], window: int) -> F64:

@@ -243,7 +243,8 @@ def _help_all(more: Callable[[], str]) -> inspect.Parameter:
         if wanted and not context.resilient_parsing:
             for option in context.command.params:
                 option.hidden = option.name in (_HELP_ALL, _ALIAS)  # type: ignore[attr-defined]  # arguments have it, too
-            say(f"{context.get_help()}{more()}")
+            # Where rich draws the help it is printed already, and nothing comes back.
+            say("\n\n".join(part for part in (context.get_help(), more()) if part))
             raise typer.Exit
 
     option = typer.Option(

@@ -1,4 +1,8 @@
-"""Simple strategies, each a step on a scene: prune by opacity, take fewer SH bands, cluster attribute by attribute."""
+"""Simple strategies, each a step on a scene: prune by opacity, take fewer SH bands, cluster attribute by attribute.
+
+They serve comparisons with published studies. Of the encoder they take what `csplat.encoder` names: `cluster` and
+`fix_gauge`, so that k-means and the one form of shapes are those of the codec, and `Draft`, whose colours they choose.
+"""
 
 from __future__ import annotations
 
