@@ -2,8 +2,6 @@
 
 import dataclasses
 import hashlib
-import subprocess
-import sys
 
 import pytest
 
@@ -91,13 +89,6 @@ def test_every_error_code_of_files_has_a_vector():
     codes = {vector.error["code"] for vector in INVALID}
 
     assert set(_spec.ERROR_NAMES) - {_spec.ERROR_INPUT} == codes
-
-
-def test_vectors_and_annexes_are_what_the_recipes_make():
-    command = [sys.executable, "-m", "csplat_conformance.recipes", "--check"]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-
-    assert (0, "") == (run.returncode, run.stderr)
 
 
 def test_vectors_stay_well_below_five_megabytes():

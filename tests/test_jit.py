@@ -41,17 +41,27 @@ def test_the_runs_of_all_lanes_make_up_the_whole():
 
 
 def test_every_lane_runs_once():
-    for threads in (1, 2, None, 1):
-        seen = np.zeros(1000, np.int64)
+    for threads, count in ((1, 1000), (2, 1000), (None, 1000), (None, 100_000), (1, 1000)):
+        seen = np.zeros(count, np.int64)
         with thread_count(threads) as lanes:
             note(seen)
         counts = np.bincount(seen, minlength=lanes + 1)
         assert counts[0] == 0
-        assert counts.sum() == counts[1 : lanes + 1].sum() == 1000
+        assert counts.sum() == counts[1 : lanes + 1].sum() == count
+
+
+def test_little_work_wakes_no_thread_unless_a_number_is_asked_for():
+    """Every lane notes its number, and one more: the largest is how many there were."""
+    several = available_threads()
+    for threads, count, lanes in ((None, 1000, 1), (None, 100_000, several), (several, 1000, several)):
+        seen = np.zeros(count, np.int64)
+        with thread_count(threads):
+            note(seen)
+        assert lanes == seen.max()
 
 
 def test_the_error_of_any_lane_reaches_the_caller():
-    with thread_count(None) as lanes:
+    with thread_count(available_threads()) as lanes:
         for lane in range(lanes):
             with pytest.raises(ValueError, match="this lane"):
                 fail_at(lane)
@@ -69,7 +79,7 @@ def test_an_error_waits_for_the_lanes_that_still_write():
 
     written = [0]
     run = ParallelKernel(slow)
-    with thread_count(None) as lanes:
+    with thread_count(available_threads()) as lanes:
         before = threading.active_count()
         for _ in range(3):
             with pytest.raises(MemoryError, match="the first lane"):
@@ -111,12 +121,17 @@ def test_a_forked_child_has_threads_of_its_own():
     script = """
 import os
 import numpy as np
+from csplat_render.jit import thread_count
 from test_jit import note
-note(np.zeros(9, np.int64))
+def noted():
+    seen = np.zeros(9, np.int64)
+    with thread_count(2):
+        note(seen)
+    return seen
+noted()
 if child := os.fork():
     raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-seen = np.zeros(9, np.int64)
-note(seen)
+seen = noted()
 os._exit(0 if seen.all() else 3)
 """
     environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

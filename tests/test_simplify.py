@@ -314,7 +314,7 @@ def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
     words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--set", "refit=no", "--cameras", cameras)
-    result = invoke(*words, "--json")
+    result = invoke(*words, "--view-size", "48x36", "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     assert report["decided_psnr"] >= 30.0

@@ -257,9 +257,9 @@ def coded_opacities(coder, coded, packed, profile=_spec.PROFILE_ARCHIVE):
 
 
 @pytest.mark.parametrize("checksum", [False, True])
-@pytest.mark.parametrize("size", [3, 200, 70_000])
+@pytest.mark.parametrize("size", [3, 200, 5_000])
 def test_frames_of_the_library_are_walked_to_their_end(checksum, size):
-    packed = bytes(i * i % 251 for i in range(min(size, 60_000)))
+    packed = bytes(i * i % 251 for i in range(size))
     squeezed = zstandard.ZstdCompressor(write_checksum=checksum).compress(packed)
 
     assert set() == clauses_of(coded_opacities("zstd", squeezed, packed))

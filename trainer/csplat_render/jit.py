@@ -43,6 +43,9 @@ R = TypeVar("R")
 #: Held while threads run a kernel, by the one caller that they have.
 LOCK = threading.RLock()
 
+# Bytes of arrays below which waking threads (80 µs) takes longer than what one of them does alone.
+_LITTLE = 1 << 17
+
 # Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
 _LN2 = math.log(2.0)
 _RELAXED = {"reassoc", "nsz", "arcp", "contract", "afn"}
@@ -92,7 +95,7 @@ class ParallelKernel(Generic[P]):
         return signatures
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
-        """Run it on as many threads as `thread_count` says; returns when all of them have."""
+        """Run it on as many threads as `thread_count` says, on one where arrays are small; returns when all have."""
         assert not named
         with LOCK:
             _threads.run(self.compiled, arguments)
@@ -181,7 +184,11 @@ def thread_count(threads: int | None) -> Iterator[int]:
     kernel waits for ever.
 
     Args:
-        threads: 1 or more, no more than there are; None for as many as were in use before, at first all.
+        threads: 1 or more, no more than there are, whatever there is to do; None for what was said before, at first
+            nothing: all, but one where arrays are small.
+
+    Yields:
+        The number, at most.
 
     Raises:
         InputError: `threads` is below 1.
@@ -189,12 +196,13 @@ def thread_count(threads: int | None) -> Iterator[int]:
     if threads is not None and threads < 1:
         raise InputError(f"threads is {threads}, wanted 1 or more")
     with LOCK:
-        before = _threads.count
-        _threads.count = before if threads is None else min(threads, available_threads())
+        before = _threads.wanted
+        if threads is not None:
+            _threads.wanted = min(threads, available_threads())
         try:
-            yield _threads.count
+            yield _threads.wanted or available_threads()
         finally:
-            _threads.count = before
+            _threads.wanted = before
 
 
 class _Helper:
@@ -237,15 +245,15 @@ class _Helper:
 
 
 class _Threads:
-    """The threads that run kernels, beside the one that calls them. Owns them, and how many are in use."""
+    """The threads that run kernels, beside the one that calls them. Owns them, and how many are wanted."""
 
     def __init__(self) -> None:
-        self.count = available_threads()
+        self.wanted: int | None = None
         self._helpers: list[_Helper] = []
 
     def run(self, function: Any, arguments: tuple[Any, ...]) -> None:
         """Call `function(lane, lanes, *arguments)` for every lane."""
-        lanes = self.count
+        lanes = self.wanted or (1 if _bytes_of(arguments) < _LITTLE else available_threads())
         while len(self._helpers) < lanes - 1:
             self._helpers.append(_Helper())
         waiting: list[_Helper] = []
@@ -279,11 +287,16 @@ class _Threads:
         self._helpers = []
 
 
+def _bytes_of(arguments: tuple[Any, ...]) -> int:
+    """Of all arrays."""
+    return sum(one.nbytes for one in arguments if isinstance(one, np.ndarray))
+
+
 def _after_fork() -> None:
     """A child has no other threads: nobody holds the lock, and there are no helpers."""
     global LOCK  # noqa: PLW0603  # it may be held for ever by a thread that is not there
     LOCK = threading.RLock()
-    _threads.count = available_threads()
+    _threads.wanted = None
     _threads.forget()
 
 
