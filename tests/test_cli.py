@@ -615,7 +615,7 @@ def test_help_gives_an_example(command):
 
 
 def test_version_names_program_and_format():
-    assert call("--version").startswith("csplat 0.1.0, format 0.1")
+    assert call("--version").startswith("csplat 0.1.0, format 0.2")
 
 
 # As a process -------------------------------------------------------------------------------------

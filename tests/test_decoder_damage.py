@@ -62,7 +62,7 @@ def test_the_version_error_names_both_versions():
     error = refusal(data)
     assert "E_VERSION" == error.code
     assert "3.7" in str(error)
-    assert "0.1" in str(error)
+    assert "0.2" in str(error)
 
 
 def test_a_crc_error_says_what_was_found_and_computed():

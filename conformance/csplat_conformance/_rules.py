@@ -48,7 +48,7 @@ class Mask(NamedTuple):
 
 RANGES: Final[tuple[Range, ...]] = (
     Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
-    Range("header", "version_minor", "", 1, 1, "HDR-2", "E_VERSION"),
+    Range("header", "version_minor", "", 2, 2, "HDR-2", "E_VERSION"),
     Range("index_head", "sh_degree", "", 0, 3, "IDX-3", "E_UNSUPPORTED"),
     Range("index_head", "unit_metres", "", 0.0, 1.7976931348623157e+308, "IDX-5", "E_VALUE"),
     Range("index_head", "origin", "", -1.7976931348623157e+308, 1.7976931348623157e+308, "IDX-6", "E_VALUE"),

@@ -69,7 +69,7 @@ _SECTIONS: Final = {
 }
 
 _NOTES: Final = {
-    "header.version_minor": "version 0.1",
+    "header.version_minor": "version 0.2",
     "header.profile": "BASE",
     "header.index_size": "so the chunks begin at 64 + 264 = 328",
     "header.header_crc": "of the bytes 0 to 27",
