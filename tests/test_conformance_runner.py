@@ -96,7 +96,6 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets():
         "valid/empty",
         "valid/scene_facts",
         "valid/rich",
-        "valid/coder_zstd_raw",
         "extreme/extra_names",
         "invalid/json_open",
         "invalid/quat_radicand",
@@ -104,7 +103,7 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets():
 )
 def test_the_javascript_decoder_passes_by_the_protocol(name):
     # One for each kind of thing that its adapter says; the next test has all of them, in one process.
-    report = run_command(JS_ADAPTER, Choice(pattern=name, profile="base", exact=True))
+    report = run_command(JS_ADAPTER, Choice(pattern=name, exact=True))
 
     assert report.outcomes
     assert [] == report.failures
@@ -113,10 +112,7 @@ def test_the_javascript_decoder_passes_by_the_protocol(name):
 @needs_node
 def test_the_javascript_decoder_answers_every_vector_as_the_manifest_says():
     with node.JsDecoder() as decoder:
-        judged = {
-            vector.name: judge(vector, decoder.ask(vector.data), tuple(PARTS), exact=True, profile="base")
-            for vector in load()
-        }
+        judged = {vector.name: judge(vector, decoder.ask(vector.data), tuple(PARTS), exact=True) for vector in load()}
 
     assert [] == [one for outcomes in judged.values() for one in outcomes if one.status is not Status.PASSED]
     assert all(judged.values())
@@ -188,15 +184,6 @@ def test_a_broken_text_may_be_accepted_by_decoders_that_do_not_read_it(faulty):
     assert not run_command(faulty("silent"), Choice(pattern="invalid/json_open", exact=True)).passed
 
 
-def test_a_decoder_of_the_profile_base_has_to_refuse_archive_as_unsupported(faulty):
-    choice = Choice(pattern="valid/coder_zstd_raw", profile="base")
-
-    assert "accepted" == run_command(ADAPTER, choice).failures[0].message
-    (wrong_code,) = run_command(faulty("refusal"), choice).failures
-    assert "planted E_UNSUPPORTED at byte 12 by HDR-4, reported E_MAGIC" == wrong_code.message
-    assert run_command(ADAPTER, Choice(pattern="valid/coder_zstd_raw")).passed
-
-
 def test_names_of_extra_columns_are_percent_encoded():
     report = run_command(ADAPTER, Choice(pattern="extreme/extra_names", levels=(3,)))
 
@@ -224,7 +211,7 @@ def test_a_command_that_cannot_be_run_is_refused_at_once(command):
         run_command(command, Choice(pattern="valid/quats"))
 
 
-@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"profile": "main"}, {"timeout": 0}, {"jobs": 0}])
+@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}])
 def test_a_choice_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(InputError):
         Choice(**wrong)

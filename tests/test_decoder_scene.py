@@ -8,7 +8,7 @@ import pytest
 
 from csplat import SplatModel, _spec
 from csplat.decoder import Limits, decode, decode_integers, decode_scene, iter_tiles, read_header, read_metadata
-from csplat.errors import FormatError, InputError, LimitError, UnsupportedError
+from csplat.errors import FormatError, InputError, LimitError
 from csplat_conformance.builder import build
 from csplat_conformance.reference import expected
 from csplat_conformance.samples import (
@@ -127,13 +127,6 @@ def test_corners_and_axes_at_their_largest():
     rows = [[0, 0, 0], [2**24 - 1, 5, 2**24 - 1]]
     corner = (2**53 - 2**24 + 1, -(2**53), 0)
     assert_decodes(scene(0, (tile(1, 2, 0, {_spec.ATTRIBUTE_MEANS: axis(rows, Stream(3))}, corner=corner),)))
-
-
-def test_zstd_is_read_in_the_archive_profile_only():
-    described = coded(scene(0), lambda stream: replace(stream, coder="zstd_raw"))
-    assert_decodes(replace(described, profile=_spec.PROFILE_ARCHIVE))
-    with pytest.raises(UnsupportedError, match="STR-7"):
-        decode(build(described).data)
 
 
 def test_the_model_passes_its_own_constructor():

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import zstandard
 
 import csplat
 from csplat import _spec
@@ -17,8 +16,8 @@ from csplat_conformance.manifest import load
 from csplat_conformance.mutate import mutant
 from csplat_conformance.recipes import all_recipes
 from csplat_conformance.repair import repair
-from csplat_conformance.samples import OPACITIES, attributes, levels, rich_scene, scene, tile
-from csplat_conformance.scene import Attribute, Chunk, StatedErrors, Stream
+from csplat_conformance.samples import attributes, rich_scene, scene, tile
+from csplat_conformance.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.validator import validate
 from csplat_conformance.validator.findings import VIOLATIONS_MAX
 from csplat_conformance.validator.jsontext import JsonError, parse
@@ -244,28 +243,6 @@ def test_what_exceeds_the_budget_of_splats_is_not_read():
 
 def test_a_text_beyond_the_budget_is_not_read():
     assert "STR-8" in clauses_of(RICH.data, json_bytes_max=3)
-
-
-# Coders --------------------------------------------------------------------------------------------
-
-
-def coded_opacities(coder, coded, packed, profile=_spec.PROFILE_ARCHIVE):
-    how = Stream(1, (), coder, packed=packed, coded=coded)
-    return build(
-        scene(profile=profile, tiles=[tile(n=len(packed), changes={OPACITIES: levels(list(packed), how)})])
-    ).data
-
-
-@pytest.mark.parametrize("checksum", [False, True])
-@pytest.mark.parametrize("size", [3, 200, 5_000])
-def test_frames_of_the_library_are_walked_to_their_end(checksum, size):
-    packed = bytes(i * i % 251 for i in range(size))
-    squeezed = zstandard.ZstdCompressor(write_checksum=checksum).compress(packed)
-
-    assert set() == clauses_of(coded_opacities("zstd", squeezed, packed))
-    if checksum:
-        assert {"COD-3"} == clauses_of(coded_opacities("zstd", squeezed[:-1] + bytes([squeezed[-1] ^ 1]), packed))
-    assert {"COD-3"} == clauses_of(coded_opacities("zstd", squeezed + b"\0", packed))
 
 
 # JSON ----------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from interrupts import heed_interrupts
 
-from csplat import EncodeOptions, decode, encode, read_ply, write_ply
+from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
 from csplat_tools.present.server import byte_range, open_server
 from csplat_tools.present.viewing import open_scene, view_wishes
@@ -249,12 +249,6 @@ def test_a_ply_is_one_whatever_its_name(tmp_path, make_model):
     write_ply(path, make_model(20, 1))
     with open_scene(str(path), preset="fast") as scene:
         assert 20 == scene.header.splat_count
-
-
-def test_a_profile_that_browsers_do_not_read_is_refused(tmp_path, make_model):
-    path = tmp_path / "scene.csplat"
-    path.write_bytes(encode(make_model(2000), EncodeOptions(profile="archive")))
-    assert "do not read the profile archive" in refused(path)
 
 
 def test_something_else_is_refused(tmp_path):

@@ -28,7 +28,6 @@ CODEBOOK_ENTRIES_MAX: Final = 65536  # entries of one stage
 TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
-ZSTD_WINDOW_MAX: Final = 8388608  # bytes of a Zstandard window
 EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
 BUDGET_SPLATS: Final = 33554432  # default budget: splats of one whole-scene decode, 2^25
 BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables, 8 GiB
@@ -37,9 +36,8 @@ BUDGET_JSON_BYTES: Final = 67108864  # default budget: bytes of one JSON chunk a
 
 # Profiles
 PROFILE_BASE: Final = 0
-PROFILE_ARCHIVE: Final = 1
-PROFILE_MAIN: Final = 2  # reserved
-PROFILE_NAMES: Final[dict[int, str]] = {0: "base", 1: "archive"}
+PROFILE_ARCHIVE: Final = 1  # reserved
+PROFILE_NAMES: Final[dict[int, str]] = {0: "base"}
 
 # Chunk flags (bit masks)
 CHUNK_FLAG_CRITICAL: Final = 1
@@ -105,7 +103,6 @@ CODING_OFFSET: Final = 4
 CODING_SIGNED: Final = 5
 CODING_CODEBOOK: Final = 6
 CODING_RAW: Final = 7
-CODING_ADAPTIVE: Final = 16  # reserved
 CODING_NAMES: Final[dict[int, str]] = {1: "levels", 2: "morton", 3: "axis", 4: "offset", 5: "signed", 6: "codebook", 7: "raw"}
 CODING_WIDTH_MAX: Final[dict[int, int]] = {1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8}
 
@@ -130,10 +127,7 @@ TRANSFORM_NAMES: Final[dict[int, str]] = {0: "none", 1: "delta", 2: "zigzag", 3:
 # Coders
 CODER_STORED: Final = 0
 CODER_DEFLATE: Final = 1
-CODER_ZSTD: Final = 2
-CODER_RANS: Final = 3  # reserved
-CODER_NAMES: Final[dict[int, str]] = {0: "stored", 1: "deflate", 2: "zstd"}
-CODER_PROFILE: Final[dict[int, str]] = {0: "base", 1: "base", 2: "archive"}
+CODER_NAMES: Final[dict[int, str]] = {0: "stored", 1: "deflate"}
 
 # Types of extra columns
 EXTRA_DTYPE_U8: Final = 1
@@ -168,7 +162,6 @@ CHUNK_METADATA: Final = b"META"
 CHUNK_CAMERAS: Final = b"CAMS"
 CHUNK_OPTIONS: Final = b"OPTS"
 CHUNK_STATED_ERRORS: Final = b"SERR"
-CHUNK_PROBABILITIES: Final = b"PROB"  # reserved
 CHUNK_TREE: Final = b"TREE"  # reserved
 CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "stated_errors"}
 CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CODB": ("critical",), b"META": ("safe_to_copy",), b"CAMS": ("safe_to_copy",), b"OPTS": (), b"SERR": ()}

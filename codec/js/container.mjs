@@ -56,14 +56,7 @@ export function readFileHeader(bytes) {
   }
   checkReserved(header, 0, spec.HEADER_RESERVED, 'the header');
   if (profile !== spec.PROFILE_BASE) {
-    /** @type {Record<number, string>} */
-    const names = spec.PROFILE_NAMES;
-    throw fault(
-      spec.ERROR_UNSUPPORTED,
-      AT.profile,
-      'HDR-4',
-      `profile ${names[profile] ?? profile}: this decoder reads the profile base`,
-    );
+    throw fault(spec.ERROR_UNSUPPORTED, AT.profile, 'HDR-4', `profile ${profile}: this decoder reads the profile base`);
   }
   const fileSize = Number(header.file_size); // may round above 2^53; no data has that length
   const end = spec.HEADER_SIZE + indexSize;

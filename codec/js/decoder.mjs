@@ -1,4 +1,4 @@
-// Decoder of the csplat format, profile base, from spec/format.md. No dependencies: browsers, workers, Node 20.
+// Decoder of the csplat format, from spec/format.md. No dependencies: browsers, workers, Node 20.
 //
 //   import { CsplatReader, decode, readHeader } from './decoder.mjs';
 //   const scene = await decode(bytes);              // the whole scene as Float32Arrays

@@ -302,7 +302,7 @@ function readDirectory(index) {
   if (flags & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
     throw fault(ERROR_RESERVED, at + places.flags, 'RES-1', `chunk flags ${flags}`);
   }
-  if (type === spec.CHUNK_PROBABILITIES || type === spec.CHUNK_TREE) {
+  if (type === spec.CHUNK_TREE) {
     throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `a chunk ${type}`);
   }
   if (Object.hasOwn(spec.CHUNK_NAMES, type)) {

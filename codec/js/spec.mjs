@@ -20,7 +20,6 @@ export const CODEBOOK_ENTRIES_MAX = 65536; // entries of one stage
 export const TRANSFORMS_MAX = 4; // transforms of a stream
 export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
-export const ZSTD_WINDOW_MAX = 8388608; // bytes of a Zstandard window
 export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
 export const BUDGET_SPLATS = 33554432; // default budget: splats of one whole-scene decode, 2^25
 export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables, 8 GiB
@@ -29,9 +28,8 @@ export const BUDGET_JSON_BYTES = 67108864; // default budget: bytes of one JSON 
 
 // Profiles
 export const PROFILE_BASE = 0;
-export const PROFILE_ARCHIVE = 1;
-export const PROFILE_MAIN = 2; // reserved
-export const PROFILE_NAMES = Object.freeze({ 0: 'base', 1: 'archive' });
+export const PROFILE_ARCHIVE = 1; // reserved
+export const PROFILE_NAMES = Object.freeze({ 0: 'base' });
 
 // Chunk flags (bit masks)
 export const CHUNK_FLAG_CRITICAL = 1;
@@ -97,7 +95,6 @@ export const CODING_OFFSET = 4;
 export const CODING_SIGNED = 5;
 export const CODING_CODEBOOK = 6;
 export const CODING_RAW = 7;
-export const CODING_ADAPTIVE = 16; // reserved
 export const CODING_NAMES = Object.freeze({ 1: 'levels', 2: 'morton', 3: 'axis', 4: 'offset', 5: 'signed', 6: 'codebook', 7: 'raw' });
 export const CODING_WIDTH_MAX = Object.freeze({ 1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8 });
 
@@ -122,10 +119,7 @@ export const TRANSFORM_NAMES = Object.freeze({ 0: 'none', 1: 'delta', 2: 'zigzag
 // Coders
 export const CODER_STORED = 0;
 export const CODER_DEFLATE = 1;
-export const CODER_ZSTD = 2;
-export const CODER_RANS = 3; // reserved
-export const CODER_NAMES = Object.freeze({ 0: 'stored', 1: 'deflate', 2: 'zstd' });
-export const CODER_PROFILE = Object.freeze({ 0: 'base', 1: 'base', 2: 'archive' });
+export const CODER_NAMES = Object.freeze({ 0: 'stored', 1: 'deflate' });
 
 // Types of extra columns
 export const EXTRA_DTYPE_U8 = 1;
@@ -160,7 +154,6 @@ export const CHUNK_METADATA = 'META';
 export const CHUNK_CAMERAS = 'CAMS';
 export const CHUNK_OPTIONS = 'OPTS';
 export const CHUNK_STATED_ERRORS = 'SERR';
-export const CHUNK_PROBABILITIES = 'PROB'; // reserved
 export const CHUNK_TREE = 'TREE'; // reserved
 export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'stated_errors' });
 export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 'CODB': Object.freeze(['critical']), 'META': Object.freeze(['safe_to_copy']), 'CAMS': Object.freeze(['safe_to_copy']), 'OPTS': Object.freeze([]), 'SERR': Object.freeze([]) });

@@ -93,11 +93,6 @@ function readHead(payload, widthMax, checkItsCount) {
     throw fault(spec.ERROR_STREAM, offset, 'STR-2', `elements of ${width} bytes, 1 to ${widthMax} may be`);
   }
   if (!(coder in spec.CODER_NAMES)) throw fault(spec.ERROR_UNSUPPORTED, offset + AT.coder, 'RES-2', `coder ${coder}`);
-  if (
-    spec.CODER_PROFILE[/** @type {keyof typeof spec.CODER_PROFILE} */ (coder)] !== spec.PROFILE_NAMES[spec.PROFILE_BASE]
-  ) {
-    throw fault(spec.ERROR_UNSUPPORTED, offset + AT.coder, 'STR-7', `coder ${coder} in the profile base`);
-  }
   checkTransforms(head.transforms, offset + AT.transforms);
   checkItsCount(head.count, offset + AT.count);
   const plain = head.count * width; // below 2^35

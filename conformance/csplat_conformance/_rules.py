@@ -86,14 +86,14 @@ RANGES: Final[tuple[Range, ...]] = (
 )
 
 CHOICES: Final[tuple[Choice, ...]] = (
-    Choice("header", "profile", "", (0, 1), (2, 3), "HDR-4", "E_UNSUPPORTED"),
+    Choice("header", "profile", "", (0,), (1, 2), "HDR-4", "E_UNSUPPORTED"),
     Choice("index_head", "axes", "", (0, 1, 2, 3, 4, 5, 6), (7,), "IDX-4", "E_VALUE"),
     Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
     Choice("codebook_record", "kind", "", (1, 2, 3, 4, 5, 6), (0, 7), "RES-2", "E_UNSUPPORTED"),
     Choice("extra_record", "dtype", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "RES-2", "E_UNSUPPORTED"),
     Choice("layer_record", "layer", "", (0, 1, 2, 3, 8), (4, 5), "RES-2", "E_UNSUPPORTED"),
-    Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7), (0, 8, 16), "BLK-1", "E_UNSUPPORTED"),
-    Choice("stream_head", "coder", "", (0, 1, 2), (3, 4), "RES-2", "E_UNSUPPORTED"),
+    Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7), (0, 8), "BLK-1", "E_UNSUPPORTED"),
+    Choice("stream_head", "coder", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
     Choice("stream_head", "transforms", "", (0, 1, 2, 3, 4), (5,), "RES-2", "E_UNSUPPORTED"),
     Choice("stated_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7), (0, 8), "SER-1", "E_VALUE"),
 )

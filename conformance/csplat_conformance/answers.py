@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from csplat import _spec
 from csplat_conformance.manifest import Vector
 from csplat_conformance.report import Outcome, Status
 
@@ -57,9 +56,7 @@ def level_name(level: int) -> str:
     return f"L{level}"
 
 
-def judge(
-    vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False, profile: str = "archive"
-) -> list[Outcome]:
+def judge(vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False) -> list[Outcome]:
     """Compare an answer with the manifest: one outcome for each level that applies to the vector.
 
     Args:
@@ -67,11 +64,9 @@ def judge(
         answer: what the decoder did.
         levels: numbers of the levels that are asked for.
         exact: of refusals demand code, clause and offset too, and optional refusals: for csplat's own decoders.
-        profile: what the decoder reads; one of `base` refuses `archive` as unsupported.
     """
-    unsupported = profile == _spec.PROFILE_NAMES[_spec.PROFILE_BASE] and vector.profile != profile
-    if vector.error or unsupported:
-        return [_judge_refusal(vector, answer, exact, unsupported)] if 1 in levels else []
+    if vector.error:
+        return [_judge_refusal(vector, answer, exact)] if 1 in levels else []
     result = []
     for level, parts in PARTS.items():
         if level not in levels or not any(vector.expect[part] for part in parts):
@@ -99,35 +94,29 @@ def judge(
 # Refusals ------------------------------------------------------------------------------------------
 
 
-def _judge_refusal(vector: Vector, answer: Answer, exact: bool, unsupported: bool) -> Outcome:
+def _judge_refusal(vector: Vector, answer: Answer, exact: bool) -> Outcome:
     wanted = vector.error
-    if unsupported:
-        at = _spec.HEADER_OFFSETS["profile"]
-        wanted = {"code": _spec.ERROR_UNSUPPORTED, "clause": "HDR-4", "offset": at, "also": [], "optional": False}
     status, message = answer.status, answer.message
     if status is Status.PASSED:
         optional = wanted["optional"] and not exact
         status = Status.PASSED if optional else Status.FAILED
         message = "accepted, as a decoder may that does not use the chunk" if optional else "accepted"
     elif status is Status.REFUSED:
-        status, message = _compare_refusal(answer, wanted, exact, unsupported and not vector.error)
+        status, message = _compare_refusal(answer, wanted, exact)
     clauses = tuple(vector.clauses)
     if status not in (Status.PASSED, Status.SKIPPED):
         clauses = (wanted["clause"], *(clause for clause in clauses if clause != wanted["clause"]))
     return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds)
 
 
-def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool, code_matters: bool) -> tuple[Status, str]:
+def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
     """A refusal is what counts: another order of checks may find another code first."""
     found = _words(answer.code, answer.clause, answer.offset)
     planted = f"planted {_words(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
     if exact:
         same = (answer.code, answer.clause, answer.offset) == (wanted["code"], wanted["clause"], wanted["offset"])
         return (Status.PASSED, "") if same else (Status.FAILED, planted)
-    if answer.code in (wanted["code"], *wanted["also"]):
-        return Status.PASSED, ""
-    # A decoder that lacks a profile has to say so: its user needs another decoder, not another file.
-    return (Status.FAILED if code_matters else Status.PASSED), planted
+    return Status.PASSED, "" if answer.code in (wanted["code"], *wanted["also"]) else planted
 
 
 def _words(code: str, clause: str | None, offset: int | None) -> str:

@@ -20,7 +20,7 @@ from csplat_conformance.scene import Block, Chunk, Codebook, Scene, Stream, Tile
 
 __all__ = ["Built", "build", "chunk_names"]
 
-_CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE, "zstd": _spec.CODER_ZSTD}
+_CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def build(scene: Scene) -> Built:
         at += len(chunks[name].data)
 
     file = Writer()
-    file.structure("header", "header", _header(scene, index_size, at))
+    file.structure("header", "header", _header(index_size, at))
     index = _index(scene, chunks, offsets)
     file.append(index)
     file.value("index.crc", "I", 0)
@@ -92,9 +92,9 @@ def chunk_names(scene: Scene) -> list[str]:
     return list(_chunks(scene))
 
 
-def _header(scene: Scene, index_size: int, file_size: int) -> list[Any]:
+def _header(index_size: int, file_size: int) -> list[Any]:
     version = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
-    return [_spec.MAGIC, *version, scene.profile, 0, 0, index_size, file_size, 0, bytes(32)]
+    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0, bytes(32)]
 
 
 # Index ---------------------------------------------------------------------------------------------
@@ -307,12 +307,9 @@ def _stream(out: Writer, name: str, values: Sequence[int], how: Stream) -> None:
 def _coded(packed: bytes, how: Stream) -> bytes:
     if how.coder == "stored":
         return packed
-    if how.coder == "zstd_rle":
-        return coders.zstd_rle(packed[0], len(packed))
     coder = {
         "deflate_stored": coders.deflate_stored,
         "deflate_fixed": coders.deflate_fixed,
         "deflate_dynamic": coders.deflate_dynamic,
-        "zstd_raw": coders.zstd_raw,
     }[how.coder]
     return coder(packed)

@@ -16,13 +16,8 @@ __all__ = [
     "deflate_fixed",
     "deflate_stored",
     "to_bytes",
-    "zstd_raw",
-    "zstd_rle",
 ]
 
-_ZSTD_MAGIC = 0xFD2FB528
-_ZSTD_BLOCK_RAW, _ZSTD_BLOCK_RLE = 0, 1
-_ZSTD_BLOCK_MAX = 1 << 17
 _DEFLATE_ORDER = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
 _END_OF_BLOCK = 256
 
@@ -181,34 +176,3 @@ def _canonical(lengths: dict[int, int]) -> dict[int, int]:
             code += 1
         code <<= 1
     return codes
-
-
-def zstd_raw(data: bytes, content_size: int | None = None, window: int | None = None) -> bytes:
-    """Return a Zstandard frame of raw blocks (RFC 8878).
-
-    Args:
-        data: the content.
-        content_size: what the frame header says; the content's size where left out.
-        window: window descriptor; None makes a single-segment frame.
-    """
-    size = struct.pack("<I", len(data) if content_size is None else content_size)
-    head = b"\xa0" if window is None else bytes([0x80, window])
-    out = struct.pack("<I", _ZSTD_MAGIC) + head + size
-    pieces = [data[i : i + _ZSTD_BLOCK_MAX] for i in range(0, len(data), _ZSTD_BLOCK_MAX)] or [b""]
-    for i, piece in enumerate(pieces):
-        out += _zstd_block(_ZSTD_BLOCK_RAW, len(piece), i == len(pieces) - 1) + piece
-    return out
-
-
-def zstd_rle(value: int, count: int) -> bytes:
-    """Return a Zstandard frame that repeats one byte."""
-    out = struct.pack("<IBI", _ZSTD_MAGIC, 0xA0, count)
-    while count:
-        size = min(count, _ZSTD_BLOCK_MAX)
-        count -= size
-        out += _zstd_block(_ZSTD_BLOCK_RLE, size, count == 0) + bytes([value])
-    return out
-
-
-def _zstd_block(kind: int, size: int, last: bool) -> bytes:
-    return struct.pack("<I", size << 3 | kind << 1 | last)[:3]

@@ -21,8 +21,6 @@ __all__ = ["VECTORS", "Vector", "describe", "load", "picture_name", "summarise",
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
 
-_PROFILE_AT = _spec.HEADER_OFFSETS["profile"]
-
 
 @dataclass(frozen=True)
 class Vector:
@@ -35,7 +33,6 @@ class Vector:
         why: one line.
         clauses: ids that the vector covers.
         since: version of the format.
-        profile: name of the profile that a decoder needs; for refusals base where the file names none.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
         error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted).
         views: renderings: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (dB at least).
@@ -47,7 +44,6 @@ class Vector:
     why: str
     clauses: list[str]
     since: str
-    profile: str
     expect: dict[str, Any]
     error: dict[str, Any]
     views: list[dict[str, Any]] = field(default_factory=list)
@@ -90,7 +86,6 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
         }
         for number, (view, picture) in enumerate(zip(recipe.views, pictures, strict=True))
     ]
-    named = data[_PROFILE_AT] if len(data) >= _spec.HEADER_SIZE else _spec.PROFILE_BASE
     return Vector(
         name=recipe.name,
         file=f"{recipe.name}.csplat",
@@ -98,7 +93,6 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
         why=recipe.why,
         clauses=list(recipe.clauses),
         since=f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
-        profile=_spec.PROFILE_NAMES.get(named, _spec.PROFILE_NAMES[_spec.PROFILE_BASE]),
         expect=expect,
         error=error,
         views=views,

@@ -52,7 +52,7 @@ def expected(scene: Scene) -> Expected:
 
 def _header(scene: Scene) -> dict[str, Any]:
     return {
-        "profile": _spec.PROFILE_NAMES[scene.profile],
+        "profile": _spec.PROFILE_NAMES[_spec.PROFILE_BASE],
         "splat_count": sum(tile.splat_count for tile in scene.tiles),
         "tile_count": len(scene.tiles),
         "sh_degree": scene.sh_degree,

@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from csplat import _spec
 from csplat.errors import InputError
 from csplat_conformance import adapter, views
 from csplat_conformance.answers import LEVELS, PARTS, judge
@@ -25,10 +24,7 @@ from csplat_conformance.process import split_command
 from csplat_conformance.protocol import ask
 from csplat_conformance.report import Outcome, Report
 
-__all__ = ["PROFILES", "TIMEOUT_SECONDS", "Choice", "parse_levels", "run_builtin", "run_command"]
-
-#: Profiles that a decoder may have.
-PROFILES = (_spec.PROFILE_NAMES[_spec.PROFILE_BASE], _spec.PROFILE_NAMES[_spec.PROFILE_ARCHIVE])
+__all__ = ["TIMEOUT_SECONDS", "Choice", "parse_levels", "run_builtin", "run_command"]
 
 #: Seconds that another decoder has for each vector; the largest is of 65,536 splats.
 TIMEOUT_SECONDS = 60.0
@@ -45,7 +41,6 @@ class Choice:
         pattern: shell pattern of the vectors' names, `invalid/*`; None for all.
         clause: shell pattern of clauses, `HDR-*`: vectors that cover one of them; None for all.
         levels: of 1 to 4.
-        profile: what the decoder reads; one of `base` has to refuse `archive` as unsupported.
         exact: of refusals demand code, clause and offset, and optional refusals too: for csplat's own decoders.
         timeout: seconds for one process.
         jobs: processes at a time; None for as many as there are processors.
@@ -54,7 +49,6 @@ class Choice:
     pattern: str | None = None
     clause: str | None = None
     levels: tuple[int, ...] = tuple(PARTS)
-    profile: str = PROFILES[-1]
     exact: bool = False
     timeout: float = TIMEOUT_SECONDS
     jobs: int | None = None
@@ -62,8 +56,6 @@ class Choice:
     def __post_init__(self) -> None:
         if not self.levels or any(level not in LEVELS for level in self.levels):
             raise InputError(f"levels {list(self.levels)}, wanted some of {list(LEVELS)}")
-        if self.profile not in PROFILES:
-            raise InputError(f"the profile {self.profile!r}, wanted {' or '.join(PROFILES)}")
         if not self.timeout > 0:
             raise InputError(f"a timeout of {self.timeout:g} s, wanted more than 0")
         if self.jobs is not None and self.jobs < 1:
@@ -89,7 +81,7 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
     """Run this package's own decoder over the vectors: code, clause and offset of refusals are demanded of it.
 
     Args:
-        choice: what is run; `profile`, `exact`, `timeout` and `jobs` do not apply.
+        choice: what is run; `exact`, `timeout` and `jobs` do not apply.
         progress: is told how many vectors are done.
     """
     choice = choice or Choice()
@@ -111,7 +103,7 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
         results.append(run(vector))
         if progress:
             progress(done, len(chosen))
-    return _report("csplat's decoder", choice, results)
+    return _report("csplat's decoder", results)
 
 
 def run_command(
@@ -138,7 +130,7 @@ def run_command(
         outcomes = []
         if command is not None and any(level in choice.levels for level in PARTS):
             answer = ask(command, VECTORS / vector.file, choice.timeout)
-            outcomes = judge(vector, answer, choice.levels, exact=choice.exact, profile=choice.profile)
+            outcomes = judge(vector, answer, choice.levels, exact=choice.exact)
         if 4 in choice.levels:
             if render is None:
                 outcomes += views.skipped_views(vector, "no command of a renderer was given")
@@ -155,7 +147,7 @@ def run_command(
             results.append(outcomes)
             if progress:
                 progress(done, len(chosen))
-    return _report(command or render or "", choice, results)
+    return _report(command or render or "", results)
 
 
 def _chosen(choice: Choice) -> list[Vector]:
@@ -167,9 +159,6 @@ def _chosen(choice: Choice) -> list[Vector]:
     ]
 
 
-def _report(subject: str, choice: Choice, results: Sequence[list[Outcome]]) -> Report:
+def _report(subject: str, results: Sequence[list[Outcome]]) -> Report:
     outcomes = [outcome for result in results for outcome in result]
-    notes = []
-    if choice.profile != PROFILES[-1]:
-        notes.append(f"profile {choice.profile}: files of another profile have to be refused as unsupported")
-    return Report("decoder", subject, outcomes, notes)
+    return Report("decoder", subject, outcomes)

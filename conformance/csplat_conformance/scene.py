@@ -42,7 +42,7 @@ class Stream:
     Attributes:
         width: bytes of an element.
         transforms: registry values, as they stand in the file.
-        coder: `stored`, `deflate_stored`, `deflate_fixed`, `deflate_dynamic`, `zstd_raw` or `zstd_rle`.
+        coder: `stored`, `deflate_stored`, `deflate_fixed` or `deflate_dynamic`.
         packed: bytes between transforms and coder, in place of the true ones.
         coded: bytes after the coder, in place of the true ones.
     """
@@ -212,7 +212,6 @@ class Scene:
     codebooks: tuple[Codebook, ...] = ()
     extras: tuple[Extra, ...] = ()
     chunks: tuple[Chunk, ...] = ()
-    profile: int = _spec.PROFILE_BASE
     sh_degree: int = 0
     scene_flags: int = 0
     axes: tuple[int, int, int] = (0, 0, 0)

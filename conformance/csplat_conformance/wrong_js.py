@@ -16,8 +16,6 @@ from csplat_conformance.node import JsDecoder, js_folder
 
 __all__ = ["EDITS", "Edit", "catch_all", "catch_edit", "edited"]
 
-_PROFILE = "base"
-
 
 @dataclass(frozen=True)
 class Edit:
@@ -127,6 +125,6 @@ def catch_edit(edit: Edit, vectors: Sequence[Vector] | None = None) -> Caught:
         failed = []
         with JsDecoder(folder) as decoder:
             for vector in load() if vectors is None else vectors:
-                outcomes = judge(vector, decoder.ask(vector.data), tuple(PARTS), profile=_PROFILE)
+                outcomes = judge(vector, decoder.ask(vector.data), tuple(PARTS))
                 failed += [one for one in outcomes if not one.good]
     return Caught("JavaScript", mistake, failed)

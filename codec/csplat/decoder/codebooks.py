@@ -72,7 +72,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
     books: dict[int, Codebook] = {}
     for record in _wanted(header, tiles, degree):
         book = books.setdefault(record.id, Codebook(records[record.id]))
-        book.entries[record.layer] = _read_chunk(view, header.profile, record, book.record)
+        book.entries[record.layer] = _read_chunk(view, record, book.record)
     for book in books.values():
         if book.record.kind == _spec.CODEBOOK_KIND_SH and book.record.stage_count == 1:
             _fill_values(book, header)
@@ -85,7 +85,7 @@ def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
     named = {table for tile in header.tiles for table in tile.tables}
     for record in _codebook_chunks(header):
         if record.id not in named:
-            _read_chunk(view, header.profile, record, records[record.id])
+            _read_chunk(view, record, records[record.id])
 
 
 def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
@@ -98,9 +98,7 @@ def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_sp
     return sorted(chunks, key=lambda record: (record.id, record.layer))
 
 
-def _read_chunk(
-    view: memoryview, profile: str, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
-) -> tuple[Ints, ...]:
+def _read_chunk(view: memoryview, record: _spec.DirectoryRecord, book: _spec.CodebookRecord) -> tuple[Ints, ...]:
     cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "CDB-2")
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)
@@ -121,7 +119,7 @@ def _read_chunk(
     columns = layer_columns(book, record.layer)
     stages = []
     for size in book.sizes[: book.stage_count]:
-        elements = read_stream(cursor, profile, size * columns, _ENTRY_WIDTH_MAX, signed=True)
+        elements = read_stream(cursor, size * columns, _ENTRY_WIDTH_MAX, signed=True)
         # Rows of one entry: a gather then copies whole rows.
         stages.append(np.ascontiguousarray(elements.reshape(columns, size).T))
     cursor.finish()

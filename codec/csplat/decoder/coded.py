@@ -117,7 +117,7 @@ def _read_indices(
     stages = []
     for stage, size in enumerate(book.sizes):
         stream_at = cursor.at
-        index = read_stream(cursor, context.header.profile, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
+        index = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
         largest = int(index.max())
         if largest >= size + (stage == 0):
             raise FormatError(
@@ -148,7 +148,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
     offsets = read_offsets(cursor, 1)
     at = cursor.at
     count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
-    elements = read_stream(cursor, context.header.profile, count, width_max)
+    elements = read_stream(cursor, count, width_max)
     return Columns(elements.reshape(1, count), offsets, 0, at)
 
 

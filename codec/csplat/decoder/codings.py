@@ -43,7 +43,7 @@ def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
     if params.column != column:
         raise FormatError(_spec.ERROR_STREAM, at, "RAW-1", "column", found=params.column, wanted=column)
     width_at = cursor.at
-    elements = read_stream(cursor, context.header.profile, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
+    elements = read_stream(cursor, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
     width, wanted = cursor.view[width_at], np.dtype(context.header.extras[column].dtype).itemsize
     if width != wanted:
         raise FormatError(_spec.ERROR_STREAM, width_at, "RAW-2", "width", found=width, wanted=wanted)
@@ -51,7 +51,7 @@ def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
 
 
 def read_means(cursor: Cursor, context: TileContext, coding: int) -> Columns:
-    tile, profile = context.tile, context.header.profile
+    tile = context.tile
     count, width_max = tile.splat_count, _spec.CODING_WIDTH_MAX[coding]
     if coding == _spec.CODING_MORTON:
         params_at = cursor.take(_spec.MORTON_PARAMS_SIZE)
@@ -62,12 +62,12 @@ def read_means(cursor: Cursor, context: TileContext, coding: int) -> Columns:
                 _spec.ERROR_VALUE, params_at, "MOR-1", "bits", found=params.bits, wanted=f"1 to {_spec.MORTON_BITS_MAX}"
             )
         at = cursor.at
-        codes = read_stream(cursor, profile, count, width_max)
+        codes = read_stream(cursor, count, width_max)
         _check_bits(codes, 3 * params.bits, at, "MOR-2")
         q = morton_axes(codes)
     else:
         at = cursor.at
-        q = read_stream(cursor, profile, 3 * count, width_max).reshape(3, count)
+        q = read_stream(cursor, 3 * count, width_max).reshape(3, count)
         _check_bits(q, _spec.AXIS_BITS_MAX, at, "AXI-1")
     block = Columns(q, tile.corner, tile.exponent, at)
     far = tuple(corner + extent for corner, extent in zip(tile.corner, tile.extent, strict=True))

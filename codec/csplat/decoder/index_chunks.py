@@ -11,7 +11,6 @@ __all__ = ["check_codebook_chunks", "read_codebook_records", "read_directory", "
 
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
-_RESERVED_CHUNKS = (_spec.CHUNK_PROBABILITIES, _spec.CHUNK_TREE)
 _FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + 4
 
 
@@ -157,7 +156,7 @@ def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
             raise FormatError(
                 _spec.ERROR_VALUE, place, "CHK-4", f"flags of {name}", found=record.flags, wanted=registered
             )
-    elif record.type in _RESERVED_CHUNKS:
+    elif record.type == _spec.CHUNK_TREE:
         raise UnsupportedError(f"chunk type {name}", offset=at, clause="RES-2")
     elif record.flags & _spec.CHUNK_FLAG_CRITICAL:
         raise UnsupportedError(f"critical chunk type {name}", offset=at, clause="DIR-2")

@@ -40,7 +40,7 @@ def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: in
         return None
     cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "JSN-2")
     at = cursor.at
-    text = read_stream(cursor, header.profile, None, 1, count_max=json_bytes).tobytes()
+    text = read_stream(cursor, None, 1, count_max=json_bytes).tobytes()
     cursor.finish()
     return parse_json(text, list if kind == _spec.CHUNK_CAMERAS else dict, at)
 

@@ -71,7 +71,6 @@ def read_columns(
     at = cursor.at
     elements = read_stream(
         cursor,
-        header.profile,
         columns * count,
         _spec.CODING_WIDTH_MAX[coding],
         signed=coding == _spec.CODING_SIGNED,

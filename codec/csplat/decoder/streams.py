@@ -19,12 +19,10 @@ __all__ = ["Ints", "read_stream", "undo_transforms"]
 Ints = NDArray[Any]
 
 _PLACES = _spec.STREAM_HEAD_OFFSETS
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, 3.1.1
 
 
 def read_stream(
     cursor: Cursor,
-    profile: str,
     count: int | None,
     width_max: int,
     *,
@@ -35,7 +33,6 @@ def read_stream(
 
     Args:
         cursor: stands at the stream's head.
-        profile: the file's profile, which says what coders may occur.
         count: how many elements the place wants; `None`: as many as the stream says (JSON).
         width_max: bytes of an element at most.
         signed: read the elements as two's complement of `width` bytes.
@@ -47,7 +44,7 @@ def read_stream(
     """
     at = cursor.take(_spec.STREAM_HEAD_SIZE)
     head = _spec.unpack_stream_head(cursor.view, at)
-    _check_head(head, at, profile, count, width_max)
+    _check_head(head, at, count, width_max)
     if count_max is not None and head.count > count_max:
         raise LimitError("json_bytes", head.count, count_max, offset=at + _PLACES["count"], clause="STR-8")
     if head.coded_size > cursor.end - cursor.at:
@@ -67,7 +64,7 @@ def read_stream(
     return _as_signed(elements, head.width) if signed else elements
 
 
-def _check_head(head: _spec.StreamHead, at: int, profile: str, count: int | None, width_max: int) -> None:
+def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: int) -> None:
     check_reserved(head, at, _PLACES)
     wanted = max(1, head.count) if count is None else count
     if head.count != wanted:
@@ -81,14 +78,6 @@ def _check_head(head: _spec.StreamHead, at: int, profile: str, count: int | None
         _refuse(at, "transforms", "STR-3", list(head.transforms), "ascending values, then zeros")
     if head.coder not in _spec.CODER_NAMES:
         raise UnsupportedError(f"coder {head.coder}", offset=at + _PLACES["coder"], clause="RES-2")
-    # Names stand in the registry from the smallest profile to the largest.
-    profiles = list(_spec.PROFILE_NAMES.values())
-    if profiles.index(_spec.CODER_PROFILE[head.coder]) > profiles.index(profile):
-        raise UnsupportedError(
-            f"coder {_spec.CODER_NAMES[head.coder]} in profile {profile}",
-            offset=at + _PLACES["coder"],
-            clause="STR-7",
-        )
     size = head.count * head.width
     if _spec.TRANSFORM_RUN_LENGTH not in used:
         if head.packed_size != size:
@@ -112,9 +101,7 @@ def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | m
                 _spec.ERROR_CODER, at, "COD-1", "coded_size", found=head.coded_size, wanted=head.packed_size
             )
         return coded
-    if head.coder == _spec.CODER_DEFLATE:
-        return _inflate(coded, head.packed_size, at)
-    return _undo_zstd(coded, head.packed_size, at)
+    return _inflate(coded, head.packed_size, at)
 
 
 def _inflate(coded: memoryview, size: int, at: int) -> bytes:
@@ -133,31 +120,6 @@ def _inflate(coded: memoryview, size: int, at: int) -> bytes:
     if inflater.unused_data:
         left = len(inflater.unused_data)
         raise FormatError(_spec.ERROR_CODER, at + len(coded) - left, "COD-2", f"{left} bytes follow the final block")
-    return packed
-
-
-def _undo_zstd(coded: memoryview, size: int, at: int) -> bytes:
-    try:
-        import zstandard  # a decoder of the base profile works without it
-    except ImportError:
-        raise UnsupportedError("coder zstd without the package zstandard", offset=at, clause="STR-7") from None
-    try:
-        frame = zstandard.get_frame_parameters(coded)
-        if bytes(coded[:4]) != _ZSTD_MAGIC or frame.content_size != size or frame.dict_id:
-            raise FormatError(
-                _spec.ERROR_CODER, at, "COD-3", "not one frame without dictionary, of the size", wanted=size
-            )
-        if frame.window_size > _spec.ZSTD_WINDOW_MAX:
-            raise FormatError(
-                _spec.ERROR_CODER, at, "COD-3", "window", found=frame.window_size, wanted=_spec.ZSTD_WINDOW_MAX
-            )
-        # One shot into a buffer of the content size, which is `size`: COD-4 holds. (The streaming
-        # interface would hand out whatever the blocks give.)
-        packed: bytes = zstandard.ZstdDecompressor().decompress(coded, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise FormatError(_spec.ERROR_CODER, at, "COD-3", str(error)) from None
-    if len(packed) != size:
-        raise FormatError(_spec.ERROR_CODER, at, "COD-3", found=f"{len(packed)} bytes", wanted=f"{size} bytes")
     return packed
 
 

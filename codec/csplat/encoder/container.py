@@ -54,7 +54,6 @@ class CodebookTable:
 class SceneFields:
     """Everything that a file says about the scene as a whole."""
 
-    profile: int
     sh_degree: int
     scene_flags: int
     axes: bytes
@@ -90,7 +89,7 @@ def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
         offset += len(framed)
     index = _index(scene, tiles, directory, layers)
     assert len(index) == index_size
-    return _with_header(scene.profile, index, parts, offset)
+    return _with_header(index, parts, offset)
 
 
 def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
@@ -178,12 +177,12 @@ def _index(
     return index + zlib.crc32(index).to_bytes(4, "little")
 
 
-def _with_header(profile: int, index: bytes, parts: Sequence[bytes], file_size: int) -> bytes:
+def _with_header(index: bytes, parts: Sequence[bytes], file_size: int) -> bytes:
     header = _spec.Header(
         magic=_spec.MAGIC,
         version_major=_spec.VERSION_MAJOR,
         version_minor=_spec.VERSION_MINOR,
-        profile=profile,
+        profile=_spec.PROFILE_BASE,
         reserved_0=0,
         reserved_1=0,
         index_size=len(index),

@@ -22,7 +22,6 @@ class EncodeOptions:
         preset: "fast", "balanced" or "small".
         attribute_psnr: PSNR in dB that each attribute alone is to keep, not the file's, which is 5 to 12 dB lower;
             overrides the preset's. All steps follow from it.
-        profile: "base" (every decoder reads it) or "archive" (Zstandard too).
         position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from the quality.
         position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
         position_error: largest distance of a centre from where it was, scene units, > 0; overrides both. The step
@@ -59,7 +58,6 @@ class EncodeOptions:
 
     preset: str = "balanced"
     attribute_psnr: float | None = None
-    profile: str = "base"
     position_bits: int | None = None
     position_step: float | None = None
     position_error: float | None = None
@@ -148,7 +146,6 @@ PRESETS = {
 
 _WORDS = {
     "preset": tuple(PRESETS),
-    "profile": tuple(name for id, name in _spec.PROFILE_NAMES.items()),
     "means_coding": ("auto", "morton", "axis"),
     "sh_coding": ("auto", "codebook", "scalar", "none"),
     "deflate": ("auto", "libdeflate", "zlib"),

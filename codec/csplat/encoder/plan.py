@@ -23,7 +23,7 @@ Progress = Callable[[str, float], None]
 
 _SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
 _EDGE = 0.02  # share of splats on either side that does not count as the scene's extent
-_MOST_BITS = 16  # per axis of a tile, in the profile base
+_MOST_BITS = 16  # per axis of a tile
 _LEAST_STEP = 1e-250
 _HALF_DIAGONAL = 3.0**0.5 / 2.0  # of a lattice cell, in steps: no centre is moved farther
 
@@ -63,7 +63,6 @@ class Plan:
     adaptive: float
     tile_splats: int
     coding: Coding
-    profile: int
     gauged: bool = False
 
     def attribute_records(self) -> list[_spec.AttributeRecord]:
@@ -115,11 +114,9 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
         adaptive=_first(options.adaptive, preset.adaptive if importance_given else 0.0),
         tile_splats=options.tile_splats,
         coding=Coding(
-            effort=_first(options.deflate_level, preset.deflate_level),
+            level=_first(options.deflate_level, preset.deflate_level),
             library=deflate_library(options.deflate),
-            zstandard=options.profile == _spec.PROFILE_NAMES[_spec.PROFILE_ARCHIVE],
         ),
-        profile=next(id for id, name in _spec.PROFILE_NAMES.items() if name == options.profile),
     )
 
 

@@ -49,7 +49,7 @@ def chosen_settings(draft: Draft, tables: ShTables) -> dict[str, Any]:
         "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
         **_of_shapes(draft.shapes),
         **({} if draft.grades is None else {"grades": draft.grades.as_json()}),
-        "effort": plan.coding.effort,
+        "deflate_level": plan.coding.level,
         "deflate": plan.coding.library,
         "seed": options.seed,
     }
@@ -109,7 +109,6 @@ def file_scene(draft: Draft, books: Books, chunks: Sequence[FileChunk]) -> Scene
     letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
     flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
     return SceneFields(
-        profile=plan.profile,
         sh_degree=plan.sh_degree,
         scene_flags=flags,
         axes=bytes(directions[letter] for letter in letters),

@@ -17,7 +17,7 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 
 Integers = NDArray[Any]
 
-_HUFFMAN_EFFORT = 1  # at this effort matches are not worth their search where Huffman codes alone do as well
+_HUFFMAN_LEVEL = 1  # at this level matches are not worth their search where Huffman codes alone do as well
 _LONG_RUN = 32  # bytes, of the mean run, from which runs are written as such
 _SAMPLE = 4096  # bytes from which the choice between the two is made
 
@@ -27,20 +27,18 @@ class Coding:
     """How hard to try, and with what.
 
     Attributes:
-        effort: DEFLATE level, 1 to 12 (libdeflate's scale).
+        level: of DEFLATE, 1 to 12 (libdeflate's scale).
         library: "libdeflate" or "zlib".
-        zstandard: Zstandard may be used (profile archive).
     """
 
-    effort: int = 9
+    level: int = 9
     library: str = "libdeflate"
-    zstandard: bool = False
 
     def __post_init__(self) -> None:
         if self.library not in ("libdeflate", "zlib"):
             raise InputError(f"deflate library is {self.library!r}, wanted libdeflate or zlib")
-        if not 1 <= self.effort <= 12:
-            raise InputError(f"effort is {self.effort}, wanted 1 to 12")
+        if not 1 <= self.level <= 12:
+            raise InputError(f"the level of DEFLATE is {self.level}, wanted 1 to 12")
 
 
 def unsigned_stream(
@@ -79,9 +77,9 @@ def smooth_stream(values: Integers, coding: Coding) -> bytes:
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
-        coding: what the coder may do; at the lowest effort the entropies decide instead of trials.
+        coding: what the coder may do; at the lowest level the entropies decide instead of trials.
     """
-    if coding.effort > _HUFFMAN_EFFORT:
+    if coding.level > _HUFFMAN_LEVEL:
         return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
     low = values.astype(np.uint8)
     differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
@@ -193,19 +191,15 @@ def _code(packed: NDArray[np.uint8], coding: Coding) -> tuple[int, bytes]:
         deflated = _deflate(raw, coding)
         if len(deflated) < len(coded):
             best, coded = _spec.CODER_DEFLATE, deflated
-    if coding.zstandard and len(raw) > 3:
-        squeezed = _zstandard(raw, coding.effort)
-        if len(squeezed) < len(coded):
-            best, coded = _spec.CODER_ZSTD, squeezed
     return best, coded
 
 
 def _deflate(raw: bytes, coding: Coding) -> bytes:
     if coding.library == "zlib":
-        return _zlib(raw, min(coding.effort, 9), zlib.Z_DEFAULT_STRATEGY)
-    if coding.effort <= _HUFFMAN_EFFORT and not _has_matches(raw):
+        return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
+    if coding.level <= _HUFFMAN_LEVEL and not _has_matches(raw):
         return _zlib(raw, 1, zlib.Z_HUFFMAN_ONLY)
-    return _libdeflate(raw, coding.effort)
+    return _libdeflate(raw, coding.level)
 
 
 def _libdeflate(raw: bytes, level: int) -> bytes:
@@ -224,22 +218,3 @@ def _has_matches(raw: bytes) -> bool:
     step = max(_SAMPLE, len(raw) // 4)
     sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
     return len(_libdeflate(sample, 1)) < len(_zlib(sample, 1, zlib.Z_HUFFMAN_ONLY))
-
-
-def _zstandard(raw: bytes, effort: int) -> bytes:
-    import zstandard  # files of the profile base do without it
-
-    level = min(22, max(1, 2 * effort - 5))
-    parameters = zstandard.ZstdCompressionParameters.from_level(
-        level, source_size=len(raw), write_checksum=False, write_content_size=True, write_dict_id=False
-    )
-    if parameters.window_log > _spec.ZSTD_WINDOW_MAX.bit_length() - 1:
-        parameters = zstandard.ZstdCompressionParameters.from_level(
-            level,
-            source_size=len(raw),
-            window_log=_spec.ZSTD_WINDOW_MAX.bit_length() - 1,
-            write_checksum=False,
-            write_content_size=True,
-            write_dict_id=False,
-        )
-    return zstandard.ZstdCompressor(compression_params=parameters).compress(raw)

@@ -6,9 +6,8 @@ import { CsplatReader, decode, readHeader } from '../decoder.mjs';
 import { streamInflate } from '../inflate.mjs';
 import { hash, manifest, noStream, refusal, vector } from './helpers.mjs';
 
-const base = manifest.filter(({ profile }) => profile === 'base');
-const valid = base.filter(({ error }) => !error.code);
-const invalid = base.filter(({ error }) => error.code);
+const valid = manifest.filter(({ error }) => !error.code);
+const invalid = manifest.filter(({ error }) => error.code);
 
 const hashes = (scene, expected) =>
   Object.fromEntries(Object.keys(expected).map((name) => [name, scene[name] && hash(scene[name])]));
@@ -72,17 +71,6 @@ test(
     }
   },
 );
-
-test('refuses the profile archive by its name', async () => {
-  const archive = manifest.filter(({ profile }) => profile === 'archive');
-  assert.ok(archive.length > 0);
-  for (const { name } of archive) {
-    const error = await refusal(() => decode(vector(name)));
-    assert.equal(error.name, 'UnsupportedError');
-    assert.equal(error.code, 'E_UNSUPPORTED');
-    assert.match(error.message, /archive/);
-  }
-});
 
 test('the header of every valid vector is read from the beginning of the file alone', () => {
   for (const { name, expect } of valid) {

@@ -170,7 +170,7 @@ class JsTarget(DecoderTarget):
         ours = adapter.answer(data, _JS_LIMITS, threads=1)  # one thread: so it is traced, and quicker
         if ours.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"Python, {ours.status}: {ours.message}"
-        return compared(data, ours, theirs)
+        return compared(ours, theirs)
 
     def memory(self) -> str:
         """Look at Node's resident memory."""
@@ -210,13 +210,11 @@ def _agreed(data: bytes, count: int) -> tuple[str, str]:
     return "decoded", ""
 
 
-def compared(data: bytes, ours: Answer, theirs: Answer) -> tuple[str, str]:
-    """Compare the answers of two decoders, the second of which reads the profile base alone."""
+def compared(ours: Answer, theirs: Answer) -> tuple[str, str]:
+    """Compare the answers of two decoders."""
     codes = (ours.code, theirs.code)
     if _spec.ERROR_LIMIT in codes:
         return _spec.ERROR_LIMIT, ""
-    if theirs.code == _spec.ERROR_UNSUPPORTED and _profile(data) != _spec.PROFILE_BASE:
-        return "another profile", ""
     if ours.status != theirs.status:
         words = [f"{one.status} {one.code} {one.clause or ''}".strip() for one in (ours, theirs)]
         return "finding", f"Python {words[0]}, JavaScript {words[1]}"
@@ -226,11 +224,6 @@ def compared(data: bytes, ours: Answer, theirs: Answer) -> tuple[str, str]:
         return "finding", "the headers differ"
     differ = [key for key in {*ours.arrays, *theirs.arrays} if ours.arrays.get(key) != theirs.arrays.get(key)]
     return ("finding", f"arrays differ: {', '.join(sorted(differ))}") if differ else ("decoded", "")
-
-
-def _profile(data: bytes) -> int:
-    at = _spec.HEADER_OFFSETS["profile"]
-    return data[at] if len(data) > at else _spec.PROFILE_BASE
 
 
 def js_coverage(folder: Path) -> str:

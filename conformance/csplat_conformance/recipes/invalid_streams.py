@@ -7,7 +7,7 @@ from dataclasses import replace
 from csplat import _spec
 from csplat_conformance.broken import patched, small, whole
 from csplat_conformance.builder import build
-from csplat_conformance.coders import deflate_fixed, deflate_stored, zstd_raw
+from csplat_conformance.coders import deflate_fixed, deflate_stored
 from csplat_conformance.samples import (
     MEANS,
     OPACITIES,
@@ -32,7 +32,7 @@ _VALUES = [7, 8]
 
 def stream_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_heads(), *_coders(), *_zstd()]
+    return [*_heads(), *_coders()]
 
 
 def _heads() -> list[Recipe]:
@@ -131,14 +131,6 @@ def _heads() -> list[Recipe]:
         patched(
             "coded_size_huge", "4 GiB of coded bytes", "STR-6", "E_STREAM", runs, {f"{_STREAM}.coded_size": 2**32 - 1}
         ),
-        whole(
-            "zstd_in_base",
-            "Zstandard in profile base",
-            "STR-7",
-            "E_UNSUPPORTED",
-            _opacities(Stream(coder="zstd_raw")),
-            f"{_STREAM}.coder",
-        ),
     ]
 
 
@@ -194,38 +186,6 @@ def _coders() -> list[Recipe]:
         whole("runs_short", "runs of one byte for two", "TRF-1", "E_CODER", _opacities(short), f"{_STREAM}.coded"),
         whole("runs_long", "runs of three bytes for two", "TRF-1", "E_CODER", _opacities(long), f"{_STREAM}.coded"),
         whole("runs_far", "a run of 65,536 for two bytes", "TRF-1", "E_CODER", _opacities(far), f"{_STREAM}.coded"),
-    ]
-
-
-def _zstd() -> list[Recipe]:
-    plain = bytes(_VALUES)
-    frame = zstd_raw(plain)
-    magic = frame[:4]
-    block = b"\x11\x00\x00" + plain
-    cases = {
-        "no_size": (magic + b"\x00\x38" + block, "a frame without content size"),
-        "other_size": (zstd_raw(plain, 3), "a content size that is not the packed size"),
-        "huge_size": (magic + b"\xe0" + b"\xff" * 8 + block, "a content size of 2^64 − 1"),
-        "cut": (frame[:-1], "the last byte is missing"),
-        "trailing": (frame + b"\0", "a byte after the frame"),
-        "two_frames": (frame + frame, "two frames"),
-        "skippable_before": (b"\x50\x2a\x4d\x18\x01\x00\x00\x00x" + frame, "a skippable frame before the frame"),
-        "skippable_after": (frame + b"\x50\x2a\x4d\x18\x00\x00\x00\x00", "a skippable frame after the frame"),
-        "dictionary": (magic + b"\xa1\x07\x02\x00\x00\x00" + block, "a dictionary"),
-        "window": (zstd_raw(plain, window=13 << 3 | 1), "a window of 9 MiB"),
-        "reserved_block": (magic + b"\x20\x02" + b"\x17\x00\x00" + plain, "the reserved block type"),
-        "empty": (b"", "no coded bytes"),
-    }
-    return [
-        whole(
-            f"zstd_{name}",
-            why,
-            "COD-3",
-            "E_CODER",
-            replace(_opacities(Stream(coder="zstd", coded=data)), profile=_spec.PROFILE_ARCHIVE),
-            f"{_STREAM}.coded",
-        )
-        for name, (data, why) in cases.items()
     ]
 
 

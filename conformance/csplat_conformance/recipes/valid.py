@@ -39,7 +39,6 @@ _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_BYTE_PLANES,
     _spec.TRANSFORM_RUN_LENGTH,
 )
-_ARCHIVE = _spec.PROFILE_ARCHIVE
 
 
 def valid_recipes() -> list[Recipe]:

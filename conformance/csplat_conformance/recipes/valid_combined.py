@@ -41,7 +41,7 @@ _EVERY = (
     _spec.TRANSFORM_RUN_LENGTH,
 )
 _TRANSFORMS = [chosen for k in range(len(_EVERY) + 1) for chosen in combinations(_EVERY, k)]
-_BASE_CODERS = ("stored", "deflate_stored", "deflate_fixed", "deflate_dynamic")
+_CODERS = ("stored", "deflate_stored", "deflate_fixed", "deflate_dynamic")
 _N = 4
 
 
@@ -52,9 +52,9 @@ def combined_recipes() -> list[Recipe]:
             f"combined_{coder}",
             f"every coding in every width, streams by {coder} after each of the sixteen transform lists",
             "STR-2 STR-3 STR-4 STR-5 TRF-1",
-            _all_streams((coder,), archive=coder.startswith("zstd")),
+            _all_streams((coder,)),
         )
-        for coder in (*_BASE_CODERS, "zstd_raw")
+        for coder in _CODERS
     ]
     return [
         *result,
@@ -86,14 +86,13 @@ def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
 # Streams -------------------------------------------------------------------------------------------
 
 
-def _all_streams(coders: tuple[str, ...], *, archive: bool) -> Scene:
+def _all_streams(coders: tuple[str, ...]) -> Scene:
     """Return tiles in which each coding has streams of each width it allows, and each transform list occurs."""
     ways = _ways(coders)
     dtypes = (_spec.EXTRA_DTYPE_I8, _spec.EXTRA_DTYPE_I16, _spec.EXTRA_DTYPE_F32, _spec.EXTRA_DTYPE_F64)
     extras = tuple(Extra(_spec.EXTRA_DTYPE_NAMES[dtype], dtype) for dtype in dtypes)
     tiles = tuple(_tile_of_widths(k, ways) for k in range(7))
-    profile = _spec.PROFILE_ARCHIVE if archive else _spec.PROFILE_BASE
-    return replace(scene(3, tiles), extras=extras, profile=profile)
+    return replace(scene(3, tiles), extras=extras)
 
 
 def _ways(coders: tuple[str, ...]) -> Iterator[Stream]:

@@ -33,11 +33,6 @@ _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_BYTE_PLANES,
     _spec.TRANSFORM_RUN_LENGTH,
 )
-_ARCHIVE = _spec.PROFILE_ARCHIVE
-# zstandard.ZstdCompressor(3).compress(bytes(range(40)) * 3): a compressed block with a match
-_ZSTD_COMPRESSED = bytes.fromhex(
-    "28b52ffd20788501008402000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526270100e885aa32"
-)
 _KINDS = {
     "opacities": (_spec.CODEBOOK_KIND_OPACITIES, OPACITIES, 1),
     "scales": (_spec.CODEBOOK_KIND_SCALES, SCALES, 3),
@@ -67,19 +62,6 @@ def _streams() -> list[Recipe]:
         result.append(_recipe(f"coder_{name}", "each block type of RFC 1951", "COD-2 COD-4", made))
     made = coded(wide, lambda how: replace(how, transforms=(_PLANES, _RUNS), coder="deflate_dynamic"))
     result.append(_recipe("run_length_deflate", "runs of byte planes, then DEFLATE", "COD-2 STR-5 TRF-1", made))
-    raw = replace(coded(base, lambda how: replace(how, coder="zstd_raw")), profile=_ARCHIVE)
-    result.append(_recipe("coder_zstd_raw", "profile archive, frames of raw blocks", "COD-3 STR-7", raw))
-    same = replace(_changed({OPACITIES: levels([7] * 40, Stream(coder="zstd_rle"))}, 40), profile=_ARCHIVE)
-    result.append(_recipe("coder_zstd_rle", "a frame of one repeated byte", "COD-3", same))
-    pattern = bytes(range(40)) * 3
-    how = Stream(coder="zstd", coded=_ZSTD_COMPRESSED)
-    packed = [list(pattern[3 * i : 3 * i + 3]) for i in range(40)]
-    columns = [[pattern[i], pattern[40 + i], pattern[80 + i]] for i in range(len(packed))]
-    zstd = replace(_changed({SH0: offset(columns, how, offsets=(0, 0, 0))}, 40), profile=_ARCHIVE)
-    result.append(_recipe("coder_zstd_compressed", "a compressed block with sequences", "COD-3", zstd))
-    result.append(
-        _recipe("profile_archive_base_coders", "archive without Zstandard", "HDR-4", replace(base, profile=_ARCHIVE))
-    )
     return result
 
 

@@ -23,9 +23,9 @@ _CAMERA_KEYS = ("K", "viewmat", "W", "H")
 _TEXT_WIDTH = 1
 
 
-def read_text(payload: Payload, kind: bytes, profile: int, bytes_max: int) -> None:
+def read_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
     """Check META, CAMS or OPTS: STR, JSN-1, JSN-2; keys that the spec names and that are missing are remarks."""
-    stream = read_stream(payload, "stream", profile, None, _TEXT_WIDTH, count_max=bytes_max)
+    stream = read_stream(payload, "stream", None, _TEXT_WIDTH, count_max=bytes_max)
     payload.finish()
     if stream.elements is None:
         return

@@ -111,12 +111,12 @@ def _check(
     else:
         findings.skip("the chunks", "the index does not name all of them")
         return
-    books = _read_directory_chunks(view, directory, index, header.record.profile, json_bytes_max, findings)
+    books = _read_directory_chunks(view, directory, index, json_bytes_max, findings)
     if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
         findings.of("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
         findings.skip("the tiles", "there are more splats than the budget allows")
         return
-    _read_tile_chunks(view, tiles, index, header.record.profile, books, findings, progress)
+    _read_tile_chunks(view, tiles, index, books, findings, progress)
 
 
 # Header --------------------------------------------------------------------------------------------
@@ -193,7 +193,7 @@ def _index_end(view: memoryview, header: Header, findings: Findings) -> int | No
 
 
 def _read_directory_chunks(
-    view: memoryview, directory: list[Chunk], index: Index, profile: int, json_bytes_max: int, findings: Findings
+    view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, findings: Findings
 ) -> dict[tuple[int, int], Entries]:
     """Read every chunk of the directory, used or not, known or not (CHK-2)."""
     books: dict[tuple[int, int], Entries] = {}
@@ -202,12 +202,12 @@ def _read_directory_chunks(
             continue
         payload = check_frame(view, chunk, _ENDS.get(chunk.kind, "CHK-3"), findings)
         if chunk.kind in _TEXTS:
-            _told_apart(payload, findings, partial(read_text, payload, chunk.kind, profile, json_bytes_max))
+            _told_apart(payload, findings, partial(read_text, payload, chunk.kind, json_bytes_max))
         elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
             _told_apart(payload, findings, partial(read_stated_errors, payload, index))
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
             book = books[chunk.identity, chunk.layer] = []
-            _told_apart(payload, findings, partial(read_codebook, payload, chunk, index, profile, book))
+            _told_apart(payload, findings, partial(read_codebook, payload, chunk, index, book))
     return books
 
 
@@ -215,14 +215,13 @@ def _read_tile_chunks(
     view: memoryview,
     tiles: list[Tile],
     index: Index,
-    profile: int,
     books: dict[tuple[int, int], Entries],
     findings: Findings,
     progress: Callable[[str, float], None],
 ) -> None:
     for tile in tiles:
         progress(_STAGE, tile.place / len(tiles))
-        reader = TileReader(view, index, profile, tile, books, findings, read_coded)
+        reader = TileReader(view, index, tile, books, findings, read_coded)
         for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
             if not chunk.whole:
                 reader.lost.add(chunk.layer)

@@ -17,7 +17,6 @@ __all__ = ["Chunk", "check_coverage", "check_frame", "chunk_record", "read_direc
 _CRC_SIZE = 4
 _FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + _CRC_SIZE
 _SINGLE = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
-_RESERVED = (_spec.CHUNK_PROBABILITIES, _spec.CHUNK_TREE)
 #: Where a chunk of the whole file, or one of a layer, belongs among others (4.3.6).
 _LAST = max(_spec.LAYER_NAMES) + 1
 
@@ -116,7 +115,7 @@ def _check_type(findings: Findings, placed: Placed[_spec.DirectoryRecord]) -> No
     if kind in _spec.CHUNK_NAMES:
         if record.flags & ~unlisted != registered_flags(kind):
             findings.of("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
-    elif kind in _RESERVED:
+    elif kind == _spec.CHUNK_TREE:
         findings.of("RES-2", placed, "type", f"{kind.decode()} is reserved")
     elif record.flags & _spec.CHUNK_FLAG_CRITICAL:
         findings.of("DIR-2", placed, "type", f"{kind!r} is critical and not known")

@@ -45,14 +45,13 @@ def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
     return None
 
 
-def read_codebook(payload: Payload, chunk: Chunk, index: Index, profile: int, entries: Entries) -> None:
+def read_codebook(payload: Payload, chunk: Chunk, index: Index, entries: Entries) -> None:
     """Read the payload of a CODB chunk.
 
     Args:
         payload: of the chunk.
         chunk: its record.
         index: of the file.
-        profile: of the file.
         entries: gets the stages; none where no sound record asks for the chunk.
 
     Raises:
@@ -73,7 +72,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, profile: int, en
     of_layer = [a for a in _attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
     columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
     for i, size in enumerate(book.record.sizes[: book.record.stage_count]):
-        stream = read_stream(payload, f"stage[{i}]", profile, size * columns, _WIDTH_MAX, signed=True)
+        stream = read_stream(payload, f"stage[{i}]", size * columns, _WIDTH_MAX, signed=True)
         table = None if stream.elements is None else stream.elements.astype(np.int64).reshape(columns, size).T
         entries.append(table)
     payload.finish()

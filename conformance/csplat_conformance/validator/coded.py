@@ -94,7 +94,7 @@ def _read_indices(reader: TileReader, payload: Payload, name: str, book: Codeboo
     findings, stages = reader.findings, list[Elements | None]()
     for stage, size in enumerate(book.record.sizes[: book.record.stage_count]):
         what = f"{name}.indices[{stage}]"
-        stream = read_stream(payload, what, reader.profile, reader.tile.count, _WIDTH_MAX)
+        stream = read_stream(payload, what, reader.tile.count, _WIDTH_MAX)
         indices = stream.elements
         most = size if stage == 0 else size - 1
         if indices is not None and int(indices.max()) > most:
@@ -137,7 +137,7 @@ def _read_summands(reader: TileReader, payload: Payload, name: str, attribute: i
     """The common summand of the kind SHAPE: LAT-2, LAT-3; [n]."""
     _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
     offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
-    stream = read_stream(payload, f"{name}.summand.stream", reader.profile, reader.tile.count, _WIDTH_MAX)
+    stream = read_stream(payload, f"{name}.summand.stream", reader.tile.count, _WIDTH_MAX)
     if stream.elements is None or not (sound and sane):
         return None
     summands: I64 = stream.elements.astype(np.int64) + offsets[0]

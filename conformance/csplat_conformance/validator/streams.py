@@ -39,7 +39,6 @@ class Stream:
 def read_stream(
     payload: Payload,
     what: str,
-    profile: int,
     count: int | None,
     width_max: int,
     *,
@@ -51,7 +50,6 @@ def read_stream(
     Args:
         payload: stands at the stream's head.
         what: name of the stream within its chunk, `sh0.stream`.
-        profile: of the file, a registry value.
         count: elements that its place requires; `None` for texts, which say themselves.
         width_max: bytes of an element at most.
         signed: two's complement of `width` bytes.
@@ -68,7 +66,7 @@ def read_stream(
     if count is None and head.record.count > count_max:
         findings.of("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
         sound = False
-    coder_known = _check_coder(findings, head, profile)
+    coder_known = _check_coder(findings, head)
     size = head.record.coded_size
     if size > payload.left:
         findings.of("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
@@ -136,21 +134,12 @@ def _check_packed(findings: Findings, head: Placed[_spec.StreamHead], sound: boo
     return True
 
 
-def _check_coder(findings: Findings, head: Placed[_spec.StreamHead], profile: int) -> bool:
-    """STR-7, RES-2."""
+def _check_coder(findings: Findings, head: Placed[_spec.StreamHead]) -> bool:
+    """RES-2."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
         findings.of("RES-2", head, "coder", f"{coder} is no coder that this version uses")
         return False
-    # The profiles of the registry are ordered: each has the coders of those before it.
-    needed = next(value for value, name in _spec.PROFILE_NAMES.items() if name == _spec.CODER_PROFILE[coder])
-    if profile in _spec.PROFILE_NAMES and profile < needed:
-        findings.of(
-            "STR-7",
-            head,
-            "coder",
-            f"{_spec.CODER_NAMES[coder]} is not allowed in the profile {_spec.PROFILE_NAMES[profile]}",
-        )
     return True
 
 

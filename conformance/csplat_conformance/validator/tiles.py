@@ -46,7 +46,6 @@ class TileReader:
     Attributes:
         view: the file.
         index: of the file.
-        profile: of the file.
         tile: its record.
         books: entries by codebook id and layer.
         findings: what is told.
@@ -57,7 +56,6 @@ class TileReader:
 
     view: memoryview
     index: Index
-    profile: int
     tile: Tile
     books: Mapping[tuple[int, int], Entries]
     findings: Findings
@@ -147,7 +145,7 @@ class TileReader:
             bits = params.record.bits
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
                 self.findings.of("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
-            stream = read_stream(payload, f"{name}.stream", self.profile, count, width_max)
+            stream = read_stream(payload, f"{name}.stream", count, width_max)
             rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
             largest = 0 if stream.elements is None else int(stream.elements.max())
             if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _MORTON_AXES * bits:
@@ -155,7 +153,7 @@ class TileReader:
                 self.findings.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         else:
-            stream = read_stream(payload, f"{name}.stream", self.profile, _MORTON_AXES * count, width_max)
+            stream = read_stream(payload, f"{name}.stream", _MORTON_AXES * count, width_max)
             rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_MORTON_AXES, count)
             if rows is not None and int(rows.max()) >> _spec.AXIS_BITS_MAX:
                 message = f"an integer of {int(rows.max())}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
@@ -180,7 +178,7 @@ class TileReader:
         if params.record.column != number:
             self.findings.of("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
-        stream = read_stream(payload, f"{name}.stream", self.profile, self.tile.count, width_max)
+        stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
         size = self.index.extras[number] if number < len(self.index.extras) else None
         if size is not None and stream.head.record.width != size:
             self.findings.of("RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes")
@@ -208,7 +206,7 @@ def read_columns(
         offsets, sane = read_offsets(payload, f"{name}.offsets", columns)
         sound &= sane
     width_max, signed = _spec.CODING_WIDTH_MAX[coding], coding == _spec.CODING_SIGNED
-    stream = read_stream(payload, f"{name}.stream", reader.profile, columns * count, width_max, signed=signed)
+    stream = read_stream(payload, f"{name}.stream", columns * count, width_max, signed=signed)
     if stream.elements is None or not sound:
         return None, exponent
     rows = stream.elements.astype(np.int64).reshape(columns, count) + np.array(offsets, np.int64)[:, None]

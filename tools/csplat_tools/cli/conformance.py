@@ -106,9 +106,6 @@ def decoder(
         str | None,
         typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3. 3, and 4 with --render-cmd."),
     ] = None,
-    profile: Annotated[
-        str, typer.Option(metavar="base|archive", help="What the decoder reads; base must refuse archive.")
-    ] = "archive",
     clause: Annotated[
         str | None, typer.Option(metavar="PATTERN", help="Only vectors that cover such a clause of the spec: 'HDR-*'.")
     ] = None,
@@ -126,7 +123,6 @@ def decoder(
     Examples:
       csplat conformance decoder --filter 'invalid/*'
       csplat conformance decoder --cmd 'dec {input} {outdir}' --clause 'HDR-*'
-      csplat conformance decoder --cmd 'dec {input} {outdir}' --profile base
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
@@ -134,7 +130,7 @@ def decoder(
     with out.bar() as bar:
         # A renderer alone is tested at L4 alone.
         levels = parse_levels(level or ("3" if render_program is None else "4"))
-        choice = Choice(run.pattern, clause, levels, profile, exact, run.timeout or TIMEOUT_SECONDS, run.jobs)
+        choice = Choice(run.pattern, clause, levels, exact, run.timeout or TIMEOUT_SECONDS, run.jobs)
         if program is None and render_program is None:
             report = run_builtin(choice, _moved(bar))
         else:

@@ -76,7 +76,6 @@ class Encoding(Group):
             " measures it, or --importance says it. 1 for one precision throughout.",
         ),
     ] = None
-    profile: Annotated[str, typer.Option(metavar="base|archive", hidden=True, help="Base is read everywhere.")] = "base"
     deflate_level: Annotated[
         int | None, typer.Option(metavar="1..12", hidden=True, help="How hard DEFLATE tries; zlib stops at 9.")
     ] = None

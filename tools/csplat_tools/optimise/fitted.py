@@ -128,7 +128,7 @@ class FittedSplats:
     def said(self, trial: Trial | None) -> Mapping[str, Any]:
         """How many there were, what decided, and how good renders of the last file are."""
         session = self.session
-        said = {"splats": len(session.source), "views": len(session.views.used), "method": "rounds"}
+        said = {"splats": len(session.source), "views": len(session.views.used)}
         figures = {} if trial is None else {"decided_psnr": round(trial.decided_psnr, 3)}
         if trial is not None and trial.is_careful:
             figures["check_psnr"] = round(self._check_psnr, 3)

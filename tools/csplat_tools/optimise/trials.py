@@ -125,7 +125,7 @@ class Trial:
 
     Attributes:
         part, coding, quality: what it was made of, and the PSNR that each attribute was to keep; `None`: the preset's.
-        options: of the encoder, effort and all.
+        options: of the encoder.
         is_careful: it is packed as tightly as the caller wants, and no fit of its colours was left out.
         result: of the encoder.
         judge: the source's renders in the views that judge.
@@ -195,7 +195,7 @@ class Trial:
             "splats": self.splats,
             "preset": self.options.preset,
             "attribute_psnr": None if self.quality is None else round(self.quality, 3),
-            "effort": options["effort"],
+            "deflate_level": options["deflate_level"],
             "sh_coding": options["sh_coding"],
             "sh_degree": options["sh_degree"],
             "codebook_sizes": options["codebook_sizes"],

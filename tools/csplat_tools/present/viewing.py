@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED, PROFILE_BASE, PROFILE_NAMES
+from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, read_header
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import FormatError, InputError
@@ -59,7 +59,7 @@ def open_scene(path: str, *, preset: str, progress: Progress | None = None) -> I
         The scene; the file of standard input is there as long as the context.
 
     Raises:
-        CsplatError: the file is not valid, or the viewer cannot read its profile.
+        CsplatError: the file is not valid.
         OSError: it cannot be read.
     """
     with local_path(path) as local:
@@ -102,11 +102,6 @@ def _checked(path: Path, stem: str) -> ViewScene:
             else (ERROR_TRAILING, header.file_size, "HDR-6", "bytes follow the end of the file")
         )
         raise FormatError(code, at, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
-    if header.profile != PROFILE_NAMES[PROFILE_BASE]:
-        raise InputError(
-            f"browsers do not read the profile {header.profile}: `csplat decode` makes a PLY of this file,"
-            " and that can be viewed"
-        )
     return ViewScene(f"{stem}.csplat", path, size, header)
 
 

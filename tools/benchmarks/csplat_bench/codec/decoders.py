@@ -5,7 +5,7 @@
 
 Python decodes each file with `csplat.decoder`, Node.js with `codec/js`; the float arrays of spec 3, the integer arrays
 of spec 9.2 and the extra columns must have the same bytes, and what one refuses the other must refuse with the same
-code. Status 1 where something differs. The profile archive is Python's alone.
+code. Status 1 where something differs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import numpy as np
 import typer
 
 from csplat import EncodeOptions, decoder, encode, read_ply
-from csplat._spec import ERROR_UNSUPPORTED, PROFILE_ARCHIVE
 from csplat.errors import CsplatError
 from csplat_bench.common.command import JSON, PRESETS, listed, run, tell
 from csplat_bench.common.making import ARRAYS
@@ -33,7 +32,6 @@ from csplat_bench.common.scenes import ROOT
 from csplat_tools.files.streams import is_csplat
 
 _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
-_PROFILE_AT = 12  # in the header
 
 
 class Said(TypedDict, total=False):
@@ -108,8 +106,6 @@ def compare(data: bytes, node: subprocess.Popen[bytes]) -> Compared:
     ours, theirs = _python(data), _javascript(data, node)
     if "arrays" not in ours and ours.get("code") == theirs.get("code"):
         return Compared(f"both refuse it, {ours['code']}")
-    if theirs.get("code") == ERROR_UNSUPPORTED and data[_PROFILE_AT] == PROFILE_ARCHIVE:
-        return Compared("profile archive, which JavaScript refuses")
     if "arrays" not in ours or "arrays" not in theirs:
         said = (("Python", ours), ("JavaScript", theirs))
         return Compared("DIFFERENT: " + ", ".join(f"{who} {_refusal(one)}" for who, one in said if "arrays" not in one))
