@@ -159,6 +159,8 @@ def streams(block):
         yield from block.index_how
     if block.coding != _spec.CODING_CODEBOOK or block.summands:
         yield block.how
+    if block.coding == _spec.CODING_SPARSE:
+        assert block.mask_how.width == 1
 
 
 def ids(names, legal):

@@ -12,6 +12,7 @@ from csplat.decoder import decode_scene, read_options, read_stated_errors
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
+from csplat_tools.inspect.info import describe_file
 from csplat_tools.inspect.proof import prove
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -173,7 +174,8 @@ def test_absent_bands_are_decoded_as_zeros_and_the_others_as_without(make_model,
     np.testing.assert_allclose(expected, scene.model.shN, atol=0.2)
     absent = ~expected[:, 3:].any(axis=(1, 2))
     assert not scene.model.shN[absent, 3:].any()
-    assert scene.header.codebooks
+    codings = describe_file(result.data).as_json()["attributes"]["sh2"]["codings"]
+    assert {"sparse"} == set(codings)
 
 
 def test_absent_bands_cost_next_to_nothing(make_model):
@@ -181,12 +183,13 @@ def test_absent_bands_cost_next_to_nothing(make_model):
     for share in (0.0, 0.95, 1.0):
         sizes[share] = len(encode(sparse_model(big, share), scalar))
     full = sizes[0.0] - sizes[1.0]
-    # A twentieth of the values, and two index streams of at most three tenths of a bit and some.
+    # A twentieth of the values, and two masks of at most three tenths of a bit and some.
     assert sizes[0.95] - sizes[1.0] < 0.05 * full + 2 * 20_000 * 0.5 / 8
 
 
-def test_scenes_without_absent_bands_have_no_codebook_for_them(make_model):
-    assert not decode_scene(encode(make_model(400, 3), EncodeOptions(sh_coding="scalar"))).header.codebooks
+def test_scenes_without_absent_bands_have_no_mask(make_model):
+    described = describe_file(encode(make_model(400, 3), EncodeOptions(sh_coding="scalar"))).as_json()
+    assert {"signed"} == set(described["attributes"]["sh2"]["codings"])
 
 
 def test_those_who_use_the_encoder_import_none_of_its_modules():

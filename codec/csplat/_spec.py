@@ -75,7 +75,7 @@ ATTRIBUTE_NAMES: Final[dict[int, str]] = {1: "opacities", 2: "scales", 3: "quats
 ATTRIBUTE_COLUMNS: Final[dict[int, int]] = {1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 32: 1}
 ATTRIBUTE_LAYER: Final[dict[int, int]] = {1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 32: 8}
 ATTRIBUTE_MAPPINGS: Final[dict[int, tuple[str, ...]]] = {1: ("linear", "square",), 2: ("lattice",), 3: ("unit_w",), 4: ("lattice",), 5: ("lattice", "ycocg",), 6: ("lattice", "ycocg",), 7: ("lattice", "ycocg",), 8: ("lattice", "ycocg",), 32: ()}
-ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels", "codebook",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed", "codebook",), 6: ("offset", "signed", "codebook",), 7: ("offset", "signed", "codebook",), 8: ("offset", "signed", "codebook",), 32: ("raw",)}
+ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels", "codebook",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed", "codebook",), 6: ("offset", "signed", "codebook", "sparse",), 7: ("offset", "signed", "codebook", "sparse",), 8: ("offset", "signed", "codebook", "sparse",), 32: ("raw",)}
 ATTRIBUTE_KIND: Final[dict[int, str]] = {1: "levels", 2: "lattice", 3: "levels", 4: "lattice", 5: "lattice", 6: "lattice", 7: "lattice", 8: "lattice", 32: "raw"}
 
 # Layers
@@ -103,8 +103,9 @@ CODING_OFFSET: Final = 4
 CODING_SIGNED: Final = 5
 CODING_CODEBOOK: Final = 6
 CODING_RAW: Final = 7
-CODING_NAMES: Final[dict[int, str]] = {1: "levels", 2: "morton", 3: "axis", 4: "offset", 5: "signed", 6: "codebook", 7: "raw"}
-CODING_WIDTH_MAX: Final[dict[int, int]] = {1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8}
+CODING_SPARSE: Final = 8
+CODING_NAMES: Final[dict[int, str]] = {1: "levels", 2: "morton", 3: "axis", 4: "offset", 5: "signed", 6: "codebook", 7: "raw", 8: "sparse"}
+CODING_WIDTH_MAX: Final[dict[int, int]] = {1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8, 8: 4}
 
 # Codebook kinds
 CODEBOOK_KIND_OPACITIES: Final = 1
@@ -582,6 +583,30 @@ def unpack_codebook_params(data: bytes | bytearray | memoryview, offset: int = 0
 def pack_codebook_params(r: CodebookParams) -> bytes:
     """Return the 8 bytes of a CodebookParams."""
     return CODEBOOK_PARAMS_STRUCT.pack(r.codebook_id, r.reserved_0, r.escape_count)
+
+
+class SparseParams(NamedTuple):
+    """Parameters of SPARSE."""
+
+    exponent: int
+    reserved_0: int
+    present_count: int
+
+
+SPARSE_PARAMS_STRUCT: Final = struct.Struct("<hHI")
+SPARSE_PARAMS_SIZE: Final = 8
+SPARSE_PARAMS_OFFSETS: Final[dict[str, int]] = {"exponent": 0, "reserved_0": 2, "present_count": 4}
+
+
+def unpack_sparse_params(data: bytes | bytearray | memoryview, offset: int = 0) -> SparseParams:
+    """Read a SparseParams at a byte offset; struct.error where the data is too short."""
+    v = SPARSE_PARAMS_STRUCT.unpack_from(data, offset)
+    return SparseParams(v[0], v[1], v[2])
+
+
+def pack_sparse_params(r: SparseParams) -> bytes:
+    """Return the 8 bytes of a SparseParams."""
+    return SPARSE_PARAMS_STRUCT.pack(r.exponent, r.reserved_0, r.present_count)
 
 
 class RawParams(NamedTuple):

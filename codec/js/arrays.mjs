@@ -118,8 +118,9 @@ function putQuats(out, { attribute: { levels }, columns }, n) {
  * @param {number} n splats
  * @param {number} s step
  */
-function putColour(out, stride, start, first, { attribute, columns, lookup }, n, s) {
+function putColour(out, stride, start, first, { attribute, columns, lookup, present }, n, s) {
   const width = columnCount(attribute);
+  if (present !== undefined) return scatterRows(out, stride, start, first, columns, width / 3, present, s); // others are +0
   if (lookup === undefined) return putRows(out, stride, start, first, columns, width / 3, n, s);
   copyRows(out, stride, start, first, tableValues(lookup.table, attribute), width, lookup.index);
   scatterRows(out, stride, start, first, columns, width / 3, lookup.escaped, s);

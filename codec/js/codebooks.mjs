@@ -331,8 +331,8 @@ async function readEscapes(tile, payload, attribute, count) {
       `escapes of attribute ${head.attribute} in a block of ${attribute.name}`,
     );
   }
-  if (head.coding === spec.CODING_CODEBOOK)
-    throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', 'escapes coded CODEBOOK');
+  if (head.coding === spec.CODING_CODEBOOK || head.coding === spec.CODING_SPARSE)
+    throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', `escapes coded ${head.name}`);
   checkCoding(head); // all other codings that it allows are those of CBK-5
   return readValues(tile, payload, attribute, head.coding, count, true);
 }

@@ -16,6 +16,7 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
  * @property {Float64Array} columns [C × n], or with `lookup` those of the escaped splats alone
  * @property {{id: number, table: Table, index: Uint32Array, escaped: Uint32Array}} [lookup] a codebook of colours, the
  *   entry of each splat, and the splats that have none
+ * @property {Uint32Array} [present] the splats whose integers the columns hold, those of the others are 0; all where absent
  * @property {number} exponent of the tile's lattice of this attribute
  * @property {number} bound what no integer exceeds in magnitude
  * @property {number} offset in the file of the stream, or block, to blame for what the integers are
@@ -80,6 +81,7 @@ export async function readValues(tile, payload, attribute, coding, n, escaped) {
   if (coding === spec.CODING_LEVELS) return readLevels(tile, payload, attribute, n);
   if (coding === spec.CODING_MORTON) return readMorton(tile, payload, attribute, n);
   if (coding === spec.CODING_AXIS) return readAxis(tile, payload, attribute, n);
+  if (coding === spec.CODING_SPARSE) return readSparse(tile, payload, attribute, n);
   const exponent = readLatticeParams(payload, attribute, escaped);
   return coding === spec.CODING_OFFSET
     ? readOffset(tile, payload, attribute, n, exponent)
@@ -105,12 +107,21 @@ export function readLatticeParams(payload, attribute, mustBeZero) {
   if (exponent !== 0 && (mustBeZero || attribute.id === spec.ATTRIBUTE_QUATS)) {
     throw fault(ERROR_VALUE, offset, 'LAT-2', `exponent ${exponent}`);
   }
-  if (attribute.step !== 0) {
-    const step = ldexp(attribute.step, exponent);
-    if (!(step > 0 && step < Infinity))
-      throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
-  }
+  checkStep(attribute, exponent, offset);
   return exponent;
+}
+
+/**
+ * LAT-1
+ *
+ * @param {AttributeRecord} attribute
+ * @param {number} exponent
+ * @param {number} offset
+ */
+function checkStep({ step }, exponent, offset) {
+  if (step === 0) return;
+  const s = ldexp(step, exponent);
+  if (!(s > 0 && s < Infinity)) throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
 }
 
 /**
@@ -270,6 +281,53 @@ async function readSigned(tile, payload, attribute, n, exponent) {
   const block = { attribute, columns, exponent, bound: 2 ** (8 * width - 1), offset };
   checkIntegers(block, n);
   return block;
+}
+
+/**
+ * A mask, and the integers of the splats that it names (spec 6.4.7).
+ *
+ * @param {TileContext} tile
+ * @param {Payload} payload
+ * @param {AttributeRecord} attribute
+ * @param {number} n
+ * @returns {Promise<Block>}
+ */
+async function readSparse(tile, payload, attribute, n) {
+  const { fields, offset: at } = payload.read(
+    spec.unpackSparseParams,
+    spec.SPARSE_PARAMS_SIZE,
+    spec.SPARSE_PARAMS_RESERVED,
+    'sparse parameters',
+  );
+  const { exponent, present_count: count } = fields;
+  checkStep(attribute, exponent, at);
+  if (count < 1 || count > n) {
+    throw fault(ERROR_VALUE, at + spec.SPARSE_PARAMS_OFFSETS.present_count, 'SPA-1', `${count} of ${n} splats`);
+  }
+  const { low: mask, offset } = await readStream(payload, (n + 7) >> 3, 1, tile.inflate);
+  if (n & 7 && mask[n >> 3] >> (n & 7)) throw fault(ERROR_RANGE, offset, 'SPA-3', `a mask of more than ${n} splats`);
+  const present = new Uint32Array(count);
+  let found = 0;
+  for (let i = 0; i < n; i++) if ((mask[i >> 3] >> (i & 7)) & 1) present[found++] = i; // beyond its end nothing is written
+  if (found !== count) throw fault(ERROR_RANGE, offset, 'SPA-2', `a mask that names ${found} splats, not ${count}`);
+  return { ...(await readSigned(tile, payload, attribute, count, exponent)), present };
+}
+
+/**
+ * The same block with columns of all splats.
+ *
+ * @param {Block} block
+ * @param {number} n splats
+ * @returns {Block}
+ */
+export function everySplat({ present, ...block }, n) {
+  if (present === undefined) return block;
+  const { columns } = block;
+  const all = new Float64Array(columnCount(block.attribute) * n);
+  const count = present.length;
+  for (let from = 0, to = 0; from < columns.length; from += count, to += n)
+    for (let i = 0; i < count; i++) all[to + present[i]] = columns[from + i];
+  return { ...block, columns: all };
 }
 
 /**

@@ -1,7 +1,7 @@
 // The form 'packed': integers as narrow as a tile's layer allows, codebooks as tables. For those who draw them as they are.
 
 import { entryColumns } from './codebooks.mjs';
-import { columnCount } from './codings.mjs';
+import { columnCount, everySplat } from './codings.mjs';
 import { ldexp } from './lattice.mjs';
 import * as spec from './spec.mjs';
 
@@ -21,7 +21,7 @@ import * as spec from './spec.mjs';
  * @returns {any} PackedGeometry for layer 0, PackedBand for the others
  */
 export function packLayer(blocks, layer, count) {
-  if (layer !== spec.LAYER_GEOMETRY) return { count, sh: packBlock(blocks[0]) };
+  if (layer !== spec.LAYER_GEOMETRY) return { count, sh: packBlock(everySplat(blocks[0], count)) };
   return { count, ...Object.fromEntries(blocks.map((block) => [block.attribute.name, packBlock(block)])) };
 }
 

@@ -67,7 +67,7 @@ export const ATTRIBUTE_NAMES = Object.freeze({ 1: 'opacities', 2: 'scales', 3: '
 export const ATTRIBUTE_COLUMNS = Object.freeze({ 1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 32: 1 });
 export const ATTRIBUTE_LAYER = Object.freeze({ 1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 32: 8 });
 export const ATTRIBUTE_MAPPINGS = Object.freeze({ 1: Object.freeze(['linear', 'square']), 2: Object.freeze(['lattice']), 3: Object.freeze(['unit_w']), 4: Object.freeze(['lattice']), 5: Object.freeze(['lattice', 'ycocg']), 6: Object.freeze(['lattice', 'ycocg']), 7: Object.freeze(['lattice', 'ycocg']), 8: Object.freeze(['lattice', 'ycocg']), 32: Object.freeze([]) });
-export const ATTRIBUTE_CODINGS = Object.freeze({ 1: Object.freeze(['levels', 'codebook']), 2: Object.freeze(['offset', 'signed', 'codebook']), 3: Object.freeze(['signed', 'codebook']), 4: Object.freeze(['morton', 'axis']), 5: Object.freeze(['offset', 'signed', 'codebook']), 6: Object.freeze(['offset', 'signed', 'codebook']), 7: Object.freeze(['offset', 'signed', 'codebook']), 8: Object.freeze(['offset', 'signed', 'codebook']), 32: Object.freeze(['raw']) });
+export const ATTRIBUTE_CODINGS = Object.freeze({ 1: Object.freeze(['levels', 'codebook']), 2: Object.freeze(['offset', 'signed', 'codebook']), 3: Object.freeze(['signed', 'codebook']), 4: Object.freeze(['morton', 'axis']), 5: Object.freeze(['offset', 'signed', 'codebook']), 6: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 7: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 8: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 32: Object.freeze(['raw']) });
 export const ATTRIBUTE_KIND = Object.freeze({ 1: 'levels', 2: 'lattice', 3: 'levels', 4: 'lattice', 5: 'lattice', 6: 'lattice', 7: 'lattice', 8: 'lattice', 32: 'raw' });
 
 // Layers
@@ -95,8 +95,9 @@ export const CODING_OFFSET = 4;
 export const CODING_SIGNED = 5;
 export const CODING_CODEBOOK = 6;
 export const CODING_RAW = 7;
-export const CODING_NAMES = Object.freeze({ 1: 'levels', 2: 'morton', 3: 'axis', 4: 'offset', 5: 'signed', 6: 'codebook', 7: 'raw' });
-export const CODING_WIDTH_MAX = Object.freeze({ 1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8 });
+export const CODING_SPARSE = 8;
+export const CODING_NAMES = Object.freeze({ 1: 'levels', 2: 'morton', 3: 'axis', 4: 'offset', 5: 'signed', 6: 'codebook', 7: 'raw', 8: 'sparse' });
+export const CODING_WIDTH_MAX = Object.freeze({ 1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8, 8: 4 });
 
 // Codebook kinds
 export const CODEBOOK_KIND_OPACITIES = 1;
@@ -452,6 +453,22 @@ export function unpackCodebookParams(view, at) {
     codebook_id: view.getUint16(at + 0, true),
     reserved_0: view.getUint16(at + 2, true),
     escape_count: view.getUint32(at + 4, true),
+  };
+}
+
+export const SPARSE_PARAMS_SIZE = 8;
+export const SPARSE_PARAMS_OFFSETS = Object.freeze({ exponent: 0, reserved_0: 2, present_count: 4 });
+export const SPARSE_PARAMS_RESERVED = Object.freeze({ reserved_0: 2 });
+/**
+ * Parameters of SPARSE. 64-bit integers are BigInt, u8[n] is a view.
+ * @param {DataView} view
+ * @param {number} at
+ */
+export function unpackSparseParams(view, at) {
+  return {
+    exponent: view.getInt16(at + 0, true),
+    reserved_0: view.getUint16(at + 2, true),
+    present_count: view.getUint32(at + 4, true),
   };
 }
 

@@ -1,7 +1,7 @@
 // One tile: the blocks of its layers, decoded to integers and checked (spec 5.2, 6.4, 7.1, 7.2, 7.4).
 
 import { readCodebookBlock } from './codebooks.mjs';
-import { checkCoding, columnCount, readBlockHead, readValues } from './codings.mjs';
+import { checkCoding, columnCount, everySplat, readBlockHead, readValues } from './codings.mjs';
 import { fault } from './errors.mjs';
 import { ldexp, rgbFromYcocg } from './lattice.mjs';
 import { Payload } from './payload.mjs';
@@ -144,7 +144,8 @@ export class Tile {
     }
     checkCoding(head);
     if (head.coding === spec.CODING_CODEBOOK) return readCodebookBlock(this, payload, attribute, integers);
-    return readValues(this, payload, attribute, head.coding, this.splatCount, false);
+    const block = await readValues(this, payload, attribute, head.coding, this.splatCount, false);
+    return integers && block.present !== undefined ? everySplat(block, this.splatCount) : block;
   }
 
   /**

@@ -16,7 +16,7 @@ from csplat import _spec
 from csplat_conformance._rules import CHOICES, MASKS, RANGES, Choice, Mask, Range
 from csplat_conformance.broken import patched
 from csplat_conformance.builder import Built, build
-from csplat_conformance.samples import MEANS, Recipe, attributes, morton, rich_scene, scene
+from csplat_conformance.samples import MEANS, SH0, Recipe, attributes, morton, rich_scene, rows_of, scene, sparse, tile
 
 __all__ = ["Case", "Rule", "boundary_recipes", "cases", "held"]
 
@@ -197,14 +197,15 @@ def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
 
 @cache
 def _bases() -> tuple[Built, ...]:
-    """Return a small file, and one with every structure."""
+    """Return a small file, one with every structure but one, and one with that."""
     known = (_spec.DIRECTION_RIGHT, _spec.DIRECTION_DOWN, _spec.DIRECTION_FORWARD)
     rich = rich_scene()
     second = replace(rich.tiles[1], blocks=rich.tiles[1].blocks | {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)})
     every = replace(
         rich, tiles=(rich.tiles[0], second), sh_degree=3, attributes=attributes(3, ycocg=True, chroma_shift=1)
     )
-    return build(scene(axes=known)), build(every)
+    some = tile(9, 3, 0, {SH0 + 1: sparse((1, 0, 1), rows_of(1, 2, 9, -9, 9))})
+    return build(scene(axes=known)), build(every), build(scene(1, [some]))
 
 
 def _words(built: Built, structure: str, prefix: str) -> set[str]:
@@ -230,6 +231,8 @@ def _words(built: Built, structure: str, prefix: str) -> set[str]:
             return {"JSON"}
         if block.endswith(".summand"):
             return {"OFFSET"}
+        if part == "mask":
+            return {"masks"}
         coding = _spec.CODING_CODEBOOK if part.startswith("indices") else _holding(built, f"{block}.coding")[0]
         return {_spec.CODING_NAMES[coding].upper()}
     return set()

@@ -252,6 +252,11 @@ def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, p
     out.structure(name, "block_head", [attribute, block.coding, 0])
     if block.coding in (_spec.CODING_OFFSET, _spec.CODING_SIGNED):
         _lattice(out, name, block)
+    elif block.coding == _spec.CODING_SPARSE:
+        out.structure(f"{name}.params", "sparse_params", [block.exponent, 0, len(block.rows)])
+        whole = sum(bit << i for i, bit in enumerate(block.mask))
+        _stream(out, f"{name}.mask", [*whole.to_bytes(-(-len(block.mask) // 8), "little")], block.mask_how)
+        _stream(out, f"{name}.stream", transpose(block.rows), block.how)
     elif block.coding == _spec.CODING_MORTON:
         out.structure(f"{name}.params", "morton_params", [block.bits, 0, 0])
         _stream(out, f"{name}.stream", [_morton(row) for row in block.rows], block.how)

@@ -65,6 +65,9 @@ def _header(scene: Scene) -> dict[str, Any]:
 
 def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[list[int]]:
     """Return [n, C] integers of a block: for means q, for colours before the lifting of 7.1."""
+    if block.coding == _spec.CODING_SPARSE:
+        present, zeros = iter(block.rows), [0] * _spec.ATTRIBUTE_COLUMNS[attribute]
+        return [list(next(present)) if bit else zeros for bit in block.mask]
     if block.coding != _spec.CODING_CODEBOOK:
         return [list(row) for row in block.rows]
     book = next(book for book in scene.codebooks if book.id == block.codebook)

@@ -45,6 +45,7 @@ __all__ = [
     "scene",
     "sh_attribute",
     "signed",
+    "sparse",
     "tile",
 ]
 
@@ -150,6 +151,13 @@ def offset(rows: Rows, how: Stream = PLAIN, exponent: int = 0, offsets: tuple[in
 def signed(rows: Rows, how: Stream = PLAIN, exponent: int = 0) -> Block:
     """Return a block coded SIGNED."""
     return Block(_spec.CODING_SIGNED, rows, how, exponent=exponent)
+
+
+def sparse(
+    mask: tuple[int, ...], rows: Rows, how: Stream = PLAIN, mask_how: Stream = PLAIN, exponent: int = 0
+) -> Block:
+    """Return a block coded SPARSE: a bit per splat, and the rows of those whose bit is 1."""
+    return Block(_spec.CODING_SPARSE, rows, how, exponent=exponent, mask=mask, mask_how=mask_how)
 
 
 def book(

@@ -64,10 +64,13 @@ class Block:
 
     Attributes:
         coding: registry value.
-        rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW.
+        rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW;
+            of SPARSE those of the splats that the mask names.
         how: coding of the stream of these.
-        exponent: of OFFSET and SIGNED.
+        exponent: of OFFSET, SIGNED and SPARSE.
         offsets: of OFFSET, one per column; for SHAPE's summand one.
+        mask: of SPARSE, a bit per splat.
+        mask_how: coding of its stream.
         bits: per axis, of MORTON.
         codebook: id, of CODEBOOK.
         indices: for each stage n indices; empty in a block that is not the first of its codebook.
@@ -82,6 +85,8 @@ class Block:
     how: Stream = PLAIN
     exponent: int = 0
     offsets: tuple[int, ...] = ()
+    mask: tuple[int, ...] = ()
+    mask_how: Stream = PLAIN
     bits: int = 0
     codebook: int = 0
     indices: tuple[tuple[int, ...], ...] = ()

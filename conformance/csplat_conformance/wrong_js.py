@@ -76,6 +76,14 @@ EDITS: Final = (
         "else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];",
         "",
     ),
+    Edit(
+        "mask",
+        "bits from the highest on",
+        "SPA-2",
+        "codings.mjs",
+        "if ((mask[i >> 3] >> (i & 7)) & 1)",
+        "if ((mask[i >> 3] >> (7 - (i & 7))) & 1)",
+    ),
     Edit("quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("),
     Edit(
         "opacities",

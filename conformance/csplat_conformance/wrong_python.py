@@ -7,6 +7,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Final
 from unittest import mock
@@ -122,6 +123,11 @@ def _no_summand(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
     return right(block, *args)
 
 
+def _mask_from_the_top(right: Wrong, cursor: Any, context: Any, attribute: int) -> Any:
+    block = right(cursor, context, attribute)
+    return replace(block, places=np.minimum(block.places ^ 7, context.tile.splat_count - 1))
+
+
 # Numbers -------------------------------------------------------------------------------------------
 
 
@@ -223,6 +229,7 @@ MISTAKES: Final = (
     Mistake("escapes", "escaped splats take the last entry", "CBK-3", _method(blocks.Coded, "rows", _no_escapes)),
     Mistake("stages", "stages after the first are dropped", "CBR-3", _method(blocks.Coded, "rows", _one_stage)),
     Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", _method(blocks.Coded, "rows", _no_summand)),
+    Mistake("mask", "bits from the highest on", "SPA-2", _replaced("read_sparse", _mask_from_the_top)),
     Mistake("rounding", "products in binary32", "NUM-1", _replaced("_scale", _binary32_product)),
     Mistake("quats, order of operations", "q / M / √2", "NUM-1", _replaced("write_quats", _loose_quats)),
     Mistake("quats, sign of w", "w is negative", "QUA-2", _replaced("write_quats", _minus_w)),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder.streams import Ints
 
-__all__ = ["Block", "Codebook", "Coded", "Columns", "Indices", "runs", "work_dtype"]
+__all__ = ["Block", "Codebook", "Coded", "Columns", "Indices", "Sparse", "runs", "work_dtype"]
 
 _RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
 _RUN_SPLATS = 1 << 14
@@ -154,7 +154,42 @@ class Coded:
         return out
 
 
-Block = Columns | Coded
+@dataclass(frozen=True)
+class Sparse:
+    """A block coded SPARSE: the integers of some splats, those of the others are 0 (spec 6.4.7).
+
+    Attributes:
+        values: of the splats that the mask names.
+        places: of these splats, ascending.
+    """
+
+    values: Columns
+    places: NDArray[np.intp]
+
+    @property
+    def at(self) -> int:
+        """Where the stream of the values begins in the file."""
+        return self.values.at
+
+    @property
+    def exponent(self) -> int:
+        """The block's lattice is coarser by 2^exponent."""
+        return self.values.exponent
+
+    @property
+    def bound(self) -> int:
+        """Largest magnitude of an integer."""
+        return self.values.bound
+
+    def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
+        """Return the integers of splats `start` to `stop`, as `Columns.rows` does."""
+        out = np.zeros((len(self.values.elements), stop - start), dtype)
+        first, last = np.searchsorted(self.places, (start, stop))
+        out[:, self.places[first:last] - start] = self.values.rows(int(first), int(last), dtype)
+        return out
+
+
+Block = Columns | Coded | Sparse
 
 
 def work_dtype(bound: int) -> np.dtype[np.signedinteger]:

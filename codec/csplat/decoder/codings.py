@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder.blocks import Block, Columns
+from csplat.decoder.blocks import Block, Columns, Sparse
 from csplat.decoder.coded import TileContext, read_coded
 from csplat.decoder.container import Cursor, check_reserved
-from csplat.decoder.lattice import read_block_head, read_columns
+from csplat.decoder.lattice import check_step, read_block_head, read_columns, read_signed
 from csplat.decoder.morton import morton_axes
 from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
@@ -31,7 +31,37 @@ def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
         return read_coded(cursor, context, attribute, at)
     if coding in (_spec.CODING_MORTON, _spec.CODING_AXIS):
         return read_means(cursor, context, coding)
+    if coding == _spec.CODING_SPARSE:
+        return read_sparse(cursor, context, attribute)
     return read_columns(cursor, context.header, attribute, coding, count)
+
+
+def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> Sparse:
+    """Read mask and values: SPA-1 to SPA-3, LAT-1, LAT-4."""
+    at, places = cursor.take(_spec.SPARSE_PARAMS_SIZE), _spec.SPARSE_PARAMS_OFFSETS
+    params = _spec.unpack_sparse_params(cursor.view, at)
+    check_reserved(params, at, places)
+    record, count = context.header.attribute(attribute), context.tile.splat_count
+    check_step(record, params.exponent, at + places["exponent"])
+    if not 1 <= params.present_count <= count:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at + places["present_count"],
+            "SPA-1",
+            "present_count",
+            found=params.present_count,
+            wanted=f"1 to {count}",
+        )
+    mask_at = cursor.at
+    bits = np.unpackbits(read_stream(cursor, (count + 7) >> 3, 1), bitorder="little")
+    if bits[count:].any():
+        raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-3", "bits of the mask beyond the last splat", wanted=0)
+    present = np.flatnonzero(bits)
+    if len(present) != params.present_count:
+        raise FormatError(
+            _spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=len(present), wanted=params.present_count
+        )
+    return Sparse(read_signed(cursor, record, params.exponent, len(present)), present)
 
 
 def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Coded, runs
+from csplat.decoder.blocks import Columns, runs
 from csplat.decoder.header import SceneHeader
 from csplat.decoder.reconstruct import lattice_rows, quat_rows
 from csplat.decoder.tiles import TileBlocks, check_max_scale
@@ -69,8 +69,8 @@ def write_integers(
             for start, stop, parts in lattice_rows(block, record, count):
                 for i, part in enumerate(parts):
                     by_channel[start:stop, :, i] = part.T
-                if isinstance(block, Coded):
+                if not isinstance(block, Columns):
                     largest.append(max(int(part.max()) for part in parts))
             if attribute == _spec.ATTRIBUTE_SCALES:
-                top = max(largest) if isinstance(block, Coded) else max(block.highs)
+                top = max(block.highs) if isinstance(block, Columns) else max(largest)
                 check_max_scale(source, record, top)

@@ -12,7 +12,16 @@ from csplat.decoder.index_tiles import scaled_step
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError, UnsupportedError
 
-__all__ = ["check_lattice_range", "check_level", "read_block_head", "read_columns", "read_exponent", "read_offsets"]
+__all__ = [
+    "check_lattice_range",
+    "check_level",
+    "check_step",
+    "read_block_head",
+    "read_columns",
+    "read_exponent",
+    "read_offsets",
+    "read_signed",
+]
 
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
@@ -92,14 +101,29 @@ def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool)
     check_reserved(params, at, _spec.LATTICE_PARAMS_OFFSETS)
     if fixed and params.exponent != 0:
         raise FormatError(_spec.ERROR_VALUE, at, "LAT-2", "exponent", found=params.exponent, wanted=0)
-    if not fixed and scaled_step(record.step, params.exponent) is None:
+    if not fixed:
+        check_step(record, params.exponent, at)
+    return params.exponent
+
+
+def check_step(record: _spec.AttributeRecord, exponent: int, at: int) -> None:
+    """LAT-1: step × 2^exponent is a step."""
+    if scaled_step(record.step, exponent) is None:
         raise FormatError(
             _spec.ERROR_VALUE,
             at,
             "LAT-1",
-            f"{record.step} x 2^{params.exponent} is not positive, finite and at least 2^-1022",
+            f"{record.step} x 2^{exponent} is not positive, finite and at least 2^-1022",
         )
-    return params.exponent
+
+
+def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, count: int) -> Columns:
+    """Read a stream of signed integers in columns, [C, count] (LAT-4)."""
+    at, columns = cursor.at, _spec.ATTRIBUTE_COLUMNS[record.attribute]
+    elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[_spec.CODING_SIGNED], signed=True)
+    block = Columns(elements.reshape(columns, count), (0,) * columns, exponent, at)
+    check_lattice_range(block.lows, block.highs, record, at)
+    return block
 
 
 def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Block, Coded, Columns, runs, work_dtype
+from csplat.decoder.blocks import Block, Coded, Columns, Sparse, runs, work_dtype
 from csplat.decoder.streams import Ints
 from csplat.errors import FormatError
 
@@ -103,9 +103,9 @@ def write_lattice(block: Block, record: _spec.AttributeRecord, out: F32) -> int:
     for start, stop, parts in lattice_rows(block, record, len(out)):
         for axis, part in enumerate(parts):
             _scale(part[0], step, out[start:stop, axis])
-        if isinstance(block, Coded):
+        if not isinstance(block, Columns):
             largest.append(max(int(part.max()) for part in parts))
-    return max(largest) if isinstance(block, Coded) else max(block.highs)
+    return max(block.highs) if isinstance(block, Columns) else max(largest)
 
 
 def write_colour(block: Block, record: _spec.AttributeRecord, out: F32, *, check: bool = True) -> None:
@@ -131,10 +131,13 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
         block = blocks.get(band)
         if block is None:
             part[:] = 0.0
+        elif isinstance(block, Sparse):
+            part[:] = 0.0
+            _write_some(block.places, block.values, record, part)
         elif not copied:
             write_colour(block, record, part)
         elif isinstance(block, Coded) and block.escapes:
-            _write_escapes(block, block.escapes, record, part)
+            _write_some(block.indices.escaped, block.escapes, record, part)
 
 
 def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
@@ -156,10 +159,10 @@ def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRe
     return True
 
 
-def _write_escapes(block: Coded, escapes: Columns, record: _spec.AttributeRecord, out: F32) -> None:
-    values = np.empty((len(block.indices.escaped), *out.shape[1:]), np.float32)
-    write_colour(escapes, record, values)
-    out[block.indices.escaped] = values
+def _write_some(places: NDArray[np.intp], columns: Columns, record: _spec.AttributeRecord, out: F32) -> None:
+    values = np.empty((len(places), *out.shape[1:]), np.float32)
+    write_colour(columns, record, values)
+    out[places] = values
 
 
 def _scale(integers: Ints, step: float, out: F32) -> None:

@@ -18,10 +18,14 @@ __all__ = [
     "offset_block",
     "raw_block",
     "signed_block",
+    "signed_or_sparse_block",
+    "sparse_block",
 ]
 
 Integers = NDArray[Any]
 I64 = NDArray[np.int64]
+
+_MOSTLY = 0.95  # share of the splats from which on a mask is not worth trying
 
 
 def levels_block(q: Integers, coding: Coding) -> bytes:
@@ -51,6 +55,24 @@ def signed_block(attribute: int, integers: Integers, exponent: int, coding: Codi
     """SIGNED: integers [C, n] of at most 32 bits."""
     head = _head(attribute, _spec.CODING_SIGNED) + _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0))
     return head + signed_stream(np.ascontiguousarray(integers).reshape(-1), coding)
+
+
+def sparse_block(attribute: int, integers: Integers, exponent: int, coding: Coding) -> bytes:
+    """SPARSE: integers [C, n] of at most 32 bits, not all of them 0."""
+    has = integers.any(axis=0)
+    params = _spec.SparseParams(exponent, 0, int(np.count_nonzero(has)))
+    mask = unsigned_stream(np.packbits(has, bitorder="little"), coding, fixed_width=1)
+    head = _head(attribute, _spec.CODING_SPARSE) + _spec.pack_sparse_params(params)
+    return head + mask + signed_stream(np.ascontiguousarray(integers[:, has]).reshape(-1), coding)
+
+
+def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, coding: Coding) -> bytes:
+    """SIGNED or SPARSE, whichever is smaller: integers [C, n] of at most 32 bits, not all of them 0."""
+    plain = signed_block(attribute, integers, exponent, coding)
+    if np.count_nonzero(integers.any(axis=0)) > _MOSTLY * integers.shape[1]:
+        return plain
+    sparse = sparse_block(attribute, integers, exponent, coding)
+    return sparse if len(sparse) < len(plain) else plain
 
 
 def codebook_block(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.encoder import blocks
 from csplat.encoder.colour import ShTables, quantise_rows
 from csplat.encoder.container import CodebookTable, FileChunk
 from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
@@ -18,14 +19,13 @@ from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
 from csplat.encoder.quantise import colour_integers, largest_exact
-from csplat.encoder.sparse import zero_book, zero_or_value_block
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
 
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Books", "books_of", "choose_sh", "with_zero_books"]
+__all__ = ["Books", "books_of", "choose_sh"]
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -98,15 +98,6 @@ def choose_sh(
     if plan.sh_coding == "auto" and not _codebook_pays(model, judge, stages, books, sample[:_SAMPLE], plan):
         return scalar
     return fine, books
-
-
-def with_zero_books(books: Books, plan: Plan, used: Iterable[int]) -> Books:
-    """Add the codebooks of absent bands that tiles turned out to want."""
-    if books.records:
-        return books
-    bands = sorted(set(used))  # their ids are their bands
-    pairs = [zero_book(band, plan) for band in bands]
-    return replace(books, records=[record for record, _ in pairs], chunks=[chunk for _, chunk in pairs])
 
 
 def _reference(weights: F32 | None) -> float:
@@ -290,6 +281,7 @@ def _try_scalar(model: SplatModel, judge: _Judge, sample: Rows, plan: Plan) -> t
     for band in range(1, plan.sh_degree + 1):
         part = columns[:, band * band - 1 : (band + 1) ** 2 - 1]
         if part.any():
-            size += len(zero_or_value_block(band, part.reshape(-1, len(sample)), 0, plan)[0])
+            flat = part.reshape(-1, len(sample))
+            size += len(blocks.signed_or_sparse_block(_spec.ATTRIBUTE_SH0 + band, flat, 0, plan.coding))
     errors = judge.errors((source - decoded).reshape(len(sample), -1), sample)
     return size / len(sample), float(errors.sum() / (judge.weights[sample].sum(dtype=np.float64) or 1.0))

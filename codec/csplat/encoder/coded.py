@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.codebook import Books, with_zero_books
+from csplat.encoder.codebook import Books
 from csplat.encoder.container import write
 from csplat.encoder.measure import ErrorSums, measured_sums
 from csplat.encoder.plan import Progress
 from csplat.encoder.scene import chosen_settings, file_chunks, file_scene, stated_errors
-from csplat.encoder.shape_tables import SHAPE_BOOK, shape_book
+from csplat.encoder.shape_tables import shape_book
 from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
@@ -94,9 +94,6 @@ class Coded:
         """
         tiles = _coded_tiles(draft, books, progress)
         errors = errors or ErrorSums.total(part.errors for part in tiles)
-        books = with_zero_books(
-            books, draft.plan, (id for part in tiles for id in part.tile.tables if id != SHAPE_BOOK)
-        )
         if draft.shapes is not None:
             record, chunk = shape_book(draft.shapes, draft.plan.coding)
             books = replace(books, records=[*books.records, record], chunks=[*books.chunks, chunk])

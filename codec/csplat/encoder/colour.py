@@ -20,7 +20,6 @@ from csplat.encoder.quantise import (
     lattice_step,
     lattice_values,
 )
-from csplat.encoder.sparse import zero_or_value_block
 from csplat.errors import InputError
 
 __all__ = ["Colour", "ShTables", "code_sh", "quantise_colour", "quantise_rows", "served_rows"]
@@ -104,19 +103,17 @@ def code_sh(shN: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, coar
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
     exponent = 0
-    used: set[int] = set()
     if tables.entries:
         layers = _code_by_codebook(source[:, :kept], rows, plan, tables, sums)
-        used.update(tables.ids)
     elif kept:
         columns, exponent, decoded = quantise_rows(source[:, :kept], plan, coarse)
         sums.add(source[:, :kept], decoded, 0)
         for band in range(1, plan.sh_degree + 1):
             part = columns[:, _span(band)]
             if part.any():
-                layers[band], wanted = zero_or_value_block(band, part.reshape(-1, len(rows)), exponent, plan)
-                used.update(wanted)
-    return CodedSh(layers, sums.by_band(), exponent, tuple(sorted(used)))
+                flat = part.reshape(-1, len(rows))
+                layers[band] = blocks.signed_or_sparse_block(_spec.ATTRIBUTE_SH0 + band, flat, exponent, plan.coding)
+    return CodedSh(layers, sums.by_band(), exponent, tuple(tables.ids))
 
 
 def quantise_rows(source: F32, plan: Plan, coarse: I32 | None) -> tuple[Integers, int, F32]:

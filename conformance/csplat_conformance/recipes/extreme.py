@@ -21,6 +21,7 @@ from csplat_conformance.samples import (
     offset,
     scene,
     signed,
+    sparse,
     tile,
 )
 from csplat_conformance.scene import Attribute, Block, Chunk, Extra, Scene, StatedErrors, Stream
@@ -210,6 +211,7 @@ def _tiles() -> list[Recipe]:
     same = tile(1, 1)
     full = {a: replace(b, rows=[list(b.rows[0])] * n) for a, b in same.blocks.items()}
     full |= {QUATS: signed([[1, 2, 3]] * (n - 1) + [[9, 9, 9]])}
+    full |= {SH0 + 1: sparse((1,) * n, [[5] * 9] * n, mask_how=Stream(1, _RUNS))}
     many = [tile(k, 1, k % 2, corner=(k, -k, 2 * k), exponent=k % 5 - 2) for k in range(24)]
     extras = tuple(Extra("x" * _spec.EXTRA_NAME_MAX if i == 0 else f"é{i}", _spec.EXTRA_DTYPE_U8) for i in range(9))
     raws = tuple(Block(_spec.CODING_RAW, [[i], [255 - i]]) for i in range(9))
@@ -217,8 +219,8 @@ def _tiles() -> list[Recipe]:
         _recipe(
             "tile_of_65536",
             "a full tile, one run after the other",
-            "TIL-1 STR-5 TRF-1",
-            coded(scene(tiles=[replace(same, blocks=full)]), lambda how: replace(how, transforms=_RUNS)),
+            "TIL-1 STR-5 TRF-1 SPA-1",
+            coded(scene(1, tiles=[replace(same, blocks=full)]), lambda how: replace(how, transforms=_RUNS)),
         ),
         _recipe("tiles_of_one", "many tiles, each with layers and exponents of its own", "TIL-1 TIL-4", scene(1, many)),
         _recipe(

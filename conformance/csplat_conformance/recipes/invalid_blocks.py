@@ -15,15 +15,18 @@ from csplat_conformance.samples import (
     SH0,
     Recipe,
     attributes,
+    book,
     levels,
     morton,
     offset,
+    rows_of,
     scene,
     sh_attribute,
     signed,
+    sparse,
     tile,
 )
-from csplat_conformance.scene import Attribute, Block, Extra, Scene, Stream
+from csplat_conformance.scene import Attribute, Block, Codebook, Extra, Scene, Stream
 
 __all__ = ["block_recipes"]
 
@@ -32,7 +35,7 @@ _STREAM = "TILE.0.0/opacities.stream"
 
 def block_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_blocks(), *_values(), *_extras()]
+    return [*_blocks(), *_values(), *_extras(), *_sparse()]
 
 
 def _blocks() -> list[Recipe]:
@@ -210,6 +213,48 @@ def _extras() -> list[Recipe]:
         ),
         whole(
             "extra_width", "two bytes for a column of one", "RAW-2", "E_STREAM", made, "TILE.0.8/extra[0].stream.width"
+        ),
+    ]
+
+
+def _sparse() -> list[Recipe]:
+    sh1, rows = SH0 + 1, rows_of(1, 2, 9, -9, 9)
+    params, mask = "TILE.0.1/sh1.params", "TILE.0.1/sh1.mask.width"
+
+    def one(block: Block) -> Scene:
+        return scene(1, [tile(1, 3, 0, {sh1: block})])
+
+    def range_(name: str, why: str, clause: str, bits: tuple[int, ...]) -> Recipe:
+        return whole(f"sparse_{name}", why, clause, "E_RANGE", one(sparse(bits, rows)), mask)
+
+    made = one(sparse((1, 0, 1), rows))
+    base, few, many = build(made), {f"{params}.present_count": 1}, {f"{params}.present_count": 4}
+    escape = one(book(1, ((0, 2, 1),), sparse((1,), rows[:1])))
+    table = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: rows_of(2, 2, 9, -9, 9)},), (1, 1))
+    far = one(sparse((1, 0, 1), [[2**20] * 9] * 2, Stream(4)))
+    limit = far.attributes | {sh1: Attribute(_spec.MAPPING_LATTICE, 2.0**115)}
+    return [
+        patched("sparse_count", "four of three splats", "SPA-1", "E_VALUE", base, many),
+        patched("sparse_exponent", "the step overflows", "LAT-1", "E_VALUE", base, {f"{params}.exponent": 1100}),
+        patched("sparse_fewer", "less than the mask names", "SPA-2", "E_RANGE", base, few, at=mask),
+        range_("missing", "the mask names one splat, two have values", "SPA-2", (1, 0, 0)),
+        range_("several", "the mask names three splats, two have values", "SPA-2", (1, 1, 1)),
+        range_("beyond", "a bit behind the last splat", "SPA-3", (1, 0, 1, 1)),
+        whole(
+            "sparse_escape",
+            "an escape block coded SPARSE",
+            "CBK-5",
+            "E_STREAM",
+            replace(escape, codebooks=(table,)),
+            "TILE.0.1/sh1.escape.coding",
+        ),
+        whole(
+            "sparse_value_beyond_float32",
+            "values that overflow",
+            "LAT-5",
+            "E_RANGE",
+            replace(far, attributes=limit),
+            "TILE.0.1/sh1.stream.width",
         ),
     ]
 

@@ -27,6 +27,7 @@ from csplat_conformance.samples import (
     rows_of,
     scene,
     signed,
+    sparse,
     tile,
 )
 from csplat_conformance.scene import PLAIN, Attribute, Block, Chunk, Extra, Scene, StatedErrors, Stream
@@ -206,12 +207,37 @@ def _colours() -> list[Recipe]:
     )
     by_offset = tile(7, 3, 1, {SH0 + 1: offset(rows_of(8, 3, 9, -9, 9), exponent=2)})
     result.append(_recipe("sh1_offset", "a band with offsets and an exponent", "LAT-1", scene(1, [by_offset])))
+    result += _sparse()
     lone = tile(8, 3, 0, {SH0 + 2: signed(rows_of(9, 3, 15, -9, 9))})
     result.append(_recipe("absent_band", "band 1 left out, band 2 there", "TIL-4", scene(2, [lone])))
     result.append(_recipe("absent_bands", "degree 3 and no band at all: zeros", "TIL-4", scene(3, [tile(9, 3, 0)])))
     mixed = scene(2, [tile(1, 2, 2), tile(2, 3, 0), tile(3, 1, 1)])
     result.append(_recipe("absent_in_some_tiles", "each tile with layers of its own", "TIL-4 TIL-2", mixed))
     return result
+
+
+def _sparse() -> list[Recipe]:
+    """Bands of some splats: masks that end within a byte, with it, and behind it."""
+    masks = (0, 1, 0, 0, 1, 1, 0), (1, 0, 0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 0, 0, 1)
+    made = [
+        _recipe(
+            f"sparse_{len(mask)}",
+            f"a mask of {len(mask)} splats, {sum(mask)} of which have the band",
+            "SPA-1 SPA-2 SPA-3",
+            scene(1, [tile(8, len(mask), 0, {SH0 + 1: sparse(mask, rows_of(7, sum(mask), 9, -99, 99))})]),
+        )
+        for mask in masks
+    ]
+    long = (0,) * 400 + (1,) * 24 + (0,) * 76
+    values = rows_of(3, 24, 15, -300, 300)
+    runs = sparse(long, values, Stream(2, (_ZIGZAG, _PLANES)), Stream(1, (_RUNS,)), exponent=-3)
+    far = scene(2, [tile(2, 500, 0, {SH0 + 2: runs})])
+    made.append(_recipe("sparse_runs", "a mask of runs, an exponent", "SPA-2 LAT-1", far))
+    zero = sparse((1, 1, 0), [[0] * 21, rows_of(4, 1, 21, -9, 9)[0]])
+    whole = tile(1, 3, 0, {SH0 + 1: sparse((1, 1, 1), rows_of(5, 3, 9, -9, 9)), SH0 + 3: zero})
+    ycocg = replace(scene(3, [whole]), attributes=attributes(3, ycocg=True, chroma_shift=1))
+    made.append(_recipe("sparse_all", "a mask of ones, and zeros that the mask names", "SPA-1", ycocg))
+    return made
 
 
 def _files() -> list[Recipe]:

@@ -28,6 +28,7 @@ from csplat_conformance.samples import (
     scene,
     sh_attribute,
     signed,
+    sparse,
     tile,
 )
 from csplat_conformance.scene import Block, Chunk, Codebook, Extra, Scene, Stream, Tile
@@ -91,7 +92,7 @@ def _all_streams(coders: tuple[str, ...]) -> Scene:
     ways = _ways(coders)
     dtypes = (_spec.EXTRA_DTYPE_I8, _spec.EXTRA_DTYPE_I16, _spec.EXTRA_DTYPE_F32, _spec.EXTRA_DTYPE_F64)
     extras = tuple(Extra(_spec.EXTRA_DTYPE_NAMES[dtype], dtype) for dtype in dtypes)
-    tiles = tuple(_tile_of_widths(k, ways) for k in range(7))
+    tiles = tuple(_tile_of_widths(k, ways) for k in range(8))
     return replace(scene(3, tiles), extras=extras)
 
 
@@ -120,6 +121,10 @@ def _tile_of_widths(k: int, ways: Iterator[Stream]) -> Tile:
     for band in (1, 2, 3):
         rows = rows_of(seed + 4 + band, _N, 3 * (2 * band + 1), -90, 90)
         blocks[sh_attribute(band)] = (offset if (k + band) % 2 else signed)(rows, way(4))
+    if k > 3:  # a band of some splats
+        band = k % 3 + 1
+        rows = rows_of(seed, 2, 3 * (2 * band + 1), -90, 90)
+        blocks[sh_attribute(band)] = sparse((0, 1, 1, 0), rows, way(4), way(1))
     sizes = (1, 2, 4, 8)
     extras = tuple(
         Block(_spec.CODING_RAW, rows_of(seed + size, _N, 1, 0, 127), replace(next(ways), width=size)) for size in sizes

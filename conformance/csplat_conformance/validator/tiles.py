@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ __all__ = ["BlockHead", "First", "TileReader", "read_block_head", "read_columns"
 
 BlockHead = Placed[_spec.BlockHead]
 
+_SPARSE_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_SPARSE]
 _MORTON_AXES = 3
 
 
@@ -112,12 +114,49 @@ class TileReader:
             raise UnreadableError
         if coding == _spec.CODING_CODEBOOK:
             self.read_coded(self, payload, name, attribute, at)
+        elif coding == _spec.CODING_SPARSE:
+            self._read_sparse(payload, name, attribute)
         elif coding == _spec.CODING_RAW:
             self._read_raw(payload, name, number)
         elif attribute == _spec.ATTRIBUTE_MEANS:
             self._read_means(payload, name, coding)
         else:
             self._read_plain(payload, name, attribute, coding)
+
+    def _read_sparse(self, payload: Payload, name: str, attribute: int) -> None:
+        """SPA-1 to SPA-3, and what holds for SIGNED."""
+        params = payload.structure(
+            _spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS, f"{name}.params"
+        )
+        exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
+        sound = self.check_step(params, exponent, attribute)
+        if not 1 <= announced <= count:
+            self.findings.of("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
+        mask = read_stream(payload, f"{name}.mask", -(-count // 8), 1)
+        where = (mask.head.offset, f"{payload.name}/{name}.mask")
+        if mask.elements is not None:
+            bits = int.from_bytes(bytes(mask.elements.astype(np.uint8)), "little")
+            if bits >> count:
+                self.findings.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
+            found = (bits & (1 << count) - 1).bit_count()
+            if found != announced:
+                self.findings.add("SPA-2", *where, f"{found} bits are set, present_count is {announced}")
+        if not 1 <= announced <= count:
+            raise UnreadableError
+        columns = _spec.ATTRIBUTE_COLUMNS[attribute]
+        stream = read_stream(payload, f"{name}.stream", columns * announced, _SPARSE_WIDTH_MAX, signed=True)
+        if stream.elements is not None and sound:
+            rows = stream.elements.astype(np.int64).reshape(columns, announced)
+            where = (stream.head.offset, f"{payload.name}/{name}.stream")
+            check_integers(self.findings, self.index, attribute, rows, exponent, where)
+
+    def check_step(self, params: Placed[Any], exponent: int, attribute: int) -> bool:
+        """Whether LAT-1 holds."""
+        step = self.index.steps.get(attribute)
+        if step is None or scaled(step, exponent) is not None:
+            return True
+        self.findings.of("LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite and at least 2^-1022")
+        return False
 
     def _read_plain(self, payload: Payload, name: str, attribute: int, coding: int) -> None:
         rows, exponent = read_columns(self, payload, name, attribute, coding, self.tile.count)
@@ -221,14 +260,10 @@ def read_exponent(reader: TileReader, payload: Payload, name: str, attribute: in
         _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
     )
     exponent = params.record.exponent
-    step = reader.index.steps.get(attribute)
     if fixed and exponent:
         reader.findings.of("LAT-2", params, "exponent", f"{exponent}, wanted 0")
-    elif not fixed and step is not None and scaled(step, exponent) is None:
-        reader.findings.of("LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite and at least 2^-1022")
-    else:
-        return exponent, True
-    return exponent, False
+        return exponent, False
+    return exponent, fixed or reader.check_step(params, exponent, attribute)
 
 
 def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:

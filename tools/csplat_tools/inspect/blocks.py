@@ -122,6 +122,9 @@ def _walk_coding(
         cursor.skip(_spec.LATTICE_PARAMS_SIZE)
     elif coding == _spec.CODING_RAW:
         cursor.skip(_spec.RAW_PARAMS_SIZE)
+    elif coding == _spec.CODING_SPARSE:
+        cursor.skip(_spec.SPARSE_PARAMS_SIZE)
+        _walk_stream(cursor, use)
     elif coding == _spec.CODING_CODEBOOK:
         _walk_codebook(cursor, attribute, codebooks, use)
         return
