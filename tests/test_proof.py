@@ -63,10 +63,19 @@ def test_no_log_scale_is_too_large(make_model):
     np.testing.assert_allclose(found, np.expm1(2 * 0.0078125), rtol=1e-12)
 
 
-def test_what_leaves_float64_is_infinite(make_model):
-    source = make_model(1, 0, scales=np.full((1, 3), -1e6, np.float32))
-    decoded = replace(source, scales=np.full((1, 3), 1e6, np.float32))
-    assert measure_pairs(source, decoded, np.zeros(1, int))["covariance"] == (np.inf, np.inf)
+@pytest.mark.parametrize(
+    ("source", "decoded", "same"), [(-1e6, 1e6, (-88, 88)), (90, 3e38, (1, 1)), (-1, 99, (-1, 88))]
+)
+def test_scales_beyond_binary32_count_as_its_ends(make_model, source, decoded, same):
+    def error(wanted, found):
+        pair = [make_model(1, 0, scales=np.full((1, 3), scale, np.float32)) for scale in (wanted, found)]
+        return measure_pairs(*pair, np.zeros(1, int))["covariance"], measure_errors(*pair, np.zeros(1, int))[
+            "covariance"
+        ]
+
+    found, expected = error(source, decoded), error(*same)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
 
 
 def test_equal_descriptions_of_one_rotation_have_no_error(make_model):

@@ -114,27 +114,42 @@ def test_colour_lifting(spec, shift, bound):
     ("step", "exponent"),
     [(1.0, 0), (0.1, 0), (0.1, -3), (1e-30, 0), (2.0**-1022, 0), (1e300, -2000), (2.0**-1022, 1100), (1e-12, 5)],
 )
-def test_lattice_values(spec, step, exponent):
+def test_lattice_values_of_means(spec, step, exponent):
     rng = np.random.default_rng(1)
-    integers = [0, 1, -1, 2, 3, -3, 255, 2**24 + 1, 2**31, -(2**49) + 1, *(int(v) for v in rng.integers(-999, 999, 90))]
+    wide = 2**24 + 1, 2**31, -(2**49) + 1
+    integers = [0, 1, -1, 2, 3, -3, 255, *wide, *(int(v) for v in rng.integers(-999, 999, 90))]
     with np.errstate(over="ignore"):
         expected = [spec.lattice_value(n, step, exponent) for n in integers]
     keep = [i for i, value in enumerate(expected) if np.isfinite(value)]
     rows = [[integers[i]] * 3 for i in keep]
     out = np.empty((len(rows), 3), np.float32)
-    largest = write_lattice(columns(rows, exponent), record(_spec.ATTRIBUTE_SCALES, 0, step=step), out)
+    largest = write_lattice(columns(rows, exponent), record(_spec.ATTRIBUTE_MEANS, 0, step=step), out)
     assert max(integers[i] for i in keep) == largest
     assert np.array([expected[i] for i in keep], np.float32).tobytes() == out[:, 1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("step", "exponent"), [(1.0, 0), (0.1, 0), (0.1, -3), (1e-30, 0), (2.0**-126, 0), (1e30, -220), (2.0**-126, 200)]
+)
+def test_values_of_scales_and_colours_are_products_in_binary32(spec, step, exponent):
+    step = float(np.float32(step))
+    rng = np.random.default_rng(1)
+    integers = [0, 1, -1, 3, 2**22, -(2**22), *(int(v) for v in rng.integers(-(2**22), 2**22, 999))]
+    expected = np.array([spec.lattice_value(n, step, exponent) for n in integers], np.float32)
+    single = np.array(integers, np.float32) * np.float32(math.ldexp(step, exponent))
+    out = np.empty((len(integers), 3), np.float32)
+    write_lattice(columns([[n] * 3 for n in integers], exponent), record(_spec.ATTRIBUTE_SCALES, 0, step=step), out)
+    assert expected.tobytes() == single.tobytes() == out[:, 1].tobytes()
 
 
 def test_bands_are_laid_out_by_channel_then_coefficient(spec):
     rows = np.random.default_rng(2).integers(-2000, 2000, (30, 15)).tolist()
     out = np.empty((30, 5, 3), np.float32)
-    write_colour(columns(rows), record(_spec.ATTRIBUTE_SH2, 0, step=0.02), out)
+    write_colour(columns(rows), record(_spec.ATTRIBUTE_SH2, 0, step=0.015625), out)
     for i, row in enumerate(rows):
         for m in range(5):
             for channel in range(3):
-                assert spec.lattice_value(row[channel * 5 + m], 0.02, 0) == out[i, m, channel]
+                assert spec.lattice_value(row[channel * 5 + m], 0.015625, 0) == out[i, m, channel]
 
 
 @pytest.mark.parametrize("levels", [1, 2, 3, 63, 255, 256, 65535])

@@ -15,7 +15,7 @@ MAGIC: Final = b"\x93\x43\x53\x50\x0d\x0a\x1a\x0a"
 
 TILE_SPLATS_MAX: Final = 65536  # splats in one tile
 INTEGER_MAX: Final = 9007199254740992  # magnitude of a lattice integer of the means, 2^53
-COLUMN_MAX: Final = 1125899906842624  # magnitude of a coded column after its chroma shift, 2^50; colour integers then stay within 2^53
+COLUMN_MAX: Final = 4194304  # magnitude of a coded column after its chroma shift, 2^22; scales and colours then stay within 2^24
 MORTON_BITS_MAX: Final = 17  # bits per axis in MORTON
 AXIS_BITS_MAX: Final = 24  # bits per axis in AXIS, hence of an extent
 OPACITY_LEVELS_MAX: Final = 65535  # largest M of the opacities

@@ -1,7 +1,7 @@
 // Attribute codings other than CODEBOOK: from streams to integers (spec section 6.4).
 
 import { fault } from './errors.mjs';
-import { ldexp } from './lattice.mjs';
+import { SINGLE_MIN, ldexp } from './lattice.mjs';
 import { nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { readIntegers, readStream } from './streams.mjs';
@@ -121,24 +121,24 @@ export function readLatticeParams(payload, attribute, mustBeZero) {
 function checkStep({ step }, exponent, offset) {
   if (step === 0) return;
   const s = ldexp(step, exponent);
-  if (!(s > 0 && s < Infinity)) throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
+  if (!(s >= SINGLE_MIN && s < 2 ** 128)) throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
 }
 
 /**
- * Offsets i64[count] (LAT-3).
+ * Offsets i32[count] (LAT-3).
  *
  * @param {Payload} payload
  * @param {number} count
- * @returns {number[]} exact: at most 2^50 in magnitude
+ * @returns {number[]}
  */
 export function readOffsets(payload, count) {
   const offsets = [];
   for (let i = 0; i < count; i++) {
     const { offset } = payload;
-    const value = payload.view.getBigInt64(payload.claim(BigInt64Array.BYTES_PER_ELEMENT, 'an offset'), true);
+    const value = payload.view.getInt32(payload.claim(Int32Array.BYTES_PER_ELEMENT, 'an offset'), true);
     if (value > spec.COLUMN_MAX || value < -spec.COLUMN_MAX)
       throw fault(ERROR_VALUE, offset, 'LAT-3', `an offset of ${value}`);
-    offsets.push(Number(value));
+    offsets.push(value);
   }
   return offsets;
 }

@@ -3,7 +3,7 @@
 import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
 import { checkIndexCrc, typeName } from './container.mjs';
-import { STEP_MIN } from './lattice.mjs';
+import { SINGLE_MIN, STEP_MIN } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import { nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
@@ -179,6 +179,8 @@ function readAttribute(index, place) {
     if (levels !== 0) throw fault(ERROR_RESERVED, offset + places.levels, 'ATT-5', `levels ${levels}`);
     if (!(step >= STEP_MIN && Number.isFinite(step)))
       throw fault(ERROR_VALUE, offset + places.step, 'ATT-6', `a step of ${step}`);
+    if (id !== spec.ATTRIBUTE_MEANS && !(step >= SINGLE_MIN && Math.fround(step) === step && step < Infinity))
+      throw fault(ERROR_VALUE, offset + places.step, 'ATT-10', `a step of ${step}`);
   } else {
     const isQuats = id === spec.ATTRIBUTE_QUATS;
     const [low, high] = isQuats ? [spec.QUAT_LEVELS_MIN, spec.QUAT_LEVELS_MAX] : [1, spec.OPACITY_LEVELS_MAX];

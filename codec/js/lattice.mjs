@@ -2,8 +2,11 @@
 
 const ROWS_AT_ONCE = 1024; // of shN, so that the rows written column by column stay in the cache
 
-/** Smallest step × 2^exponent (ATT-6, TIL-9, LAT-1): no product with it is subnormal in binary64. */
+/** Smallest step × 2^exponent of means (ATT-6, TIL-9): no product with it is subnormal in binary64. */
 export const STEP_MIN = 2 ** -1022;
+
+/** The same of scales and colours (ATT-10, LAT-1), in binary32. */
+export const SINGLE_MIN = 2 ** -126;
 
 /**
  * x × 2^e without the power, which may lie outside binary64 (spec 7.2).

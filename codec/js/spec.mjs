@@ -7,7 +7,7 @@ export const MAGIC = Object.freeze([147, 67, 83, 80, 13, 10, 26, 10]);
 
 export const TILE_SPLATS_MAX = 65536; // splats in one tile
 export const INTEGER_MAX = 9007199254740992; // magnitude of a lattice integer of the means, 2^53
-export const COLUMN_MAX = 1125899906842624; // magnitude of a coded column after its chroma shift, 2^50; colour integers then stay within 2^53
+export const COLUMN_MAX = 4194304; // magnitude of a coded column after its chroma shift, 2^22; scales and colours then stay within 2^24
 export const MORTON_BITS_MAX = 17; // bits per axis in MORTON
 export const AXIS_BITS_MAX = 24; // bits per axis in AXIS, hence of an extent
 export const OPACITY_LEVELS_MAX = 65535; // largest M of the opacities

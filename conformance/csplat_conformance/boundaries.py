@@ -218,7 +218,12 @@ def _words(built: Built, structure: str, prefix: str) -> set[str]:
         attribute, mapping = number("attribute"), number("mapping")
         kind = "lattice" if _spec.ATTRIBUTE_KIND[attribute] == "lattice" else "level"
         is_shifted = mapping == _spec.MAPPING_YCOCG
-        return {_spec.ATTRIBUTE_NAMES[attribute], f"{kind} attributes", "YCOCG" if is_shifted else "other mappings"}
+        words = {"scales and colours"} if kind == "lattice" and attribute != MEANS else set()
+        return words | {
+            _spec.ATTRIBUTE_NAMES[attribute],
+            f"{kind} attributes",
+            "YCOCG" if is_shifted else "other mappings",
+        }
     if structure == "codebook_record":
         return {"stages in use", "SH" if number("kind") == _spec.CODEBOOK_KIND_SH else "other kinds"}
     block, _, part = prefix.rpartition(".")

@@ -275,7 +275,7 @@ def _lattice(out: Writer, name: str, block: Block) -> None:
     columns = [list(column) for column in zip(*block.rows, strict=True)]
     if block.coding == _spec.CODING_OFFSET:
         offsets = block.offsets or tuple(min(column) for column in columns)
-        out.value(f"{name}.offsets", f"{len(offsets)}q", offsets)
+        out.value(f"{name}.offsets", f"{len(offsets)}i", offsets)
         columns = [[v - offset for v in column] for column, offset in zip(columns, offsets, strict=True)]
     _stream(out, f"{name}.stream", [v for column in columns for v in column], block.how)
 
@@ -289,7 +289,7 @@ def _codebook_block(out: Writer, name: str, scene: Scene, attribute: int, block:
     if block.summands:
         (offset,) = block.offsets or (min(block.summands),)
         out.structure(f"{name}.summand", "lattice_params", [0, 0])
-        out.value(f"{name}.summand.offset", "q", offset)
+        out.value(f"{name}.summand.offset", "i", offset)
         _stream(out, f"{name}.summand.stream", [v - offset for v in block.summands], block.how)
     if block.escape:
         _block(out, f"{name}.escape", scene, attribute, block.escape, 0)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from csplat import _spec
 from csplat_conformance.scene import (
     PAIRS,
@@ -45,6 +47,7 @@ __all__ = [
     "scene",
     "sh_attribute",
     "signed",
+    "single",
     "sparse",
     "tile",
 ]
@@ -177,17 +180,22 @@ def sh_attribute(band: int) -> int:
     return SH0 + band
 
 
+def single(step: float) -> float:
+    """Return the binary32 value nearest to a step."""
+    return float(np.float32(step))
+
+
 def attributes(degree: int = 0, ycocg: bool = False, chroma_shift: int = 0) -> dict[int, Attribute]:
-    """Return attribute records with steps that are not powers of two."""
+    """Return attribute records with steps that are not powers of two, of colours and scales in binary32."""
     colour = _spec.MAPPING_YCOCG if ycocg else _spec.MAPPING_LATTICE
     result = {
         OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=_LEVELS_OPACITIES),
-        SCALES: Attribute(_spec.MAPPING_LATTICE, 0.1),
+        SCALES: Attribute(_spec.MAPPING_LATTICE, single(0.1)),
         QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=_LEVELS_QUATS),
         MEANS: Attribute(_spec.MAPPING_LATTICE, 0.001),
     }
     for band in range(degree + 1):
-        result[SH0 + band] = Attribute(colour, 0.03 / (band + 1), chroma_shift=chroma_shift)
+        result[SH0 + band] = Attribute(colour, single(0.03 / (band + 1)), chroma_shift=chroma_shift)
     return result
 
 

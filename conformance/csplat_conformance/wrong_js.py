@@ -97,7 +97,7 @@ EDITS: Final = (
     Edit(
         "power",
         "step × 2^exponent by way of 2^exponent, which may overflow",
-        "LAT-1",
+        "TIL-9",
         "lattice.mjs",
         "return view.getFloat64(0);",
         "return x * 2 ** exponent;",

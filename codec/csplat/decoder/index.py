@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import TYPE_CHECKING
 
 from csplat import _spec
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["read_header"]
 
 _STEP_MIN = 2.0**-1022
+_SINGLE_MIN, _SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104
 
 
 def read_header(data: Buffer) -> SceneHeader:
@@ -198,7 +200,24 @@ def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -
             raise FormatError(
                 _spec.ERROR_VALUE, at + places["step"], "ATT-6", "step", found=record.step, wanted="2^-1022 or more"
             )
+        if record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(record.step):
+            raise FormatError(
+                _spec.ERROR_VALUE,
+                at + places["step"],
+                "ATT-10",
+                "step",
+                found=record.step,
+                wanted="a binary32 value of 2^-126 or more",
+            )
     _check_chroma(record, at + places["chroma_shift"])
+
+
+def _is_single(step: float) -> bool:
+    """Whether a step > 0 is a normal binary32 value."""
+    if not _SINGLE_MIN <= step <= _SINGLE_MAX:
+        return False
+    (nearest,) = struct.unpack("<f", struct.pack("<f", step))
+    return bool(nearest == step)
 
 
 def _check_chroma(record: _spec.AttributeRecord, at: int) -> None:

@@ -12,18 +12,17 @@ from csplat.errors import FormatError, UnsupportedError
 
 __all__ = ["check_coverage", "read_tiles", "scaled_step"]
 
-_STEP_MIN = 2.0**-1022
 _FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + 4
 
 
-def scaled_step(step: float, exponent: int) -> float | None:
-    """Return step × 2^exponent (exact), or `None` where TIL-9 or LAT-1 refuses it."""
+def scaled_step(step: float, exponent: int, least: float = 2.0**-1022) -> float | None:
+    """Return step × 2^exponent (exact), or `None` where it is not finite or below `least` (TIL-9, LAT-1)."""
     try:
         scaled = math.ldexp(step, exponent)
     except OverflowError:
         return None
     # Just below 2^-1022 the product may round up to it: then it is not exact.
-    return scaled if scaled >= _STEP_MIN and math.ldexp(scaled, -exponent) == step else None
+    return scaled if scaled >= least and math.ldexp(scaled, -exponent) == step else None
 
 
 def read_tiles(

@@ -23,6 +23,8 @@ __all__ = [
     "read_signed",
 ]
 
+_STEP_MIN, _STEP_MAX = 2.0**-126, 2.0**128 - 2.0**104
+
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
     """Read a block head, or that of an escape block if `legal` codings are given; return the coding."""
@@ -107,13 +109,14 @@ def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool)
 
 
 def check_step(record: _spec.AttributeRecord, exponent: int, at: int) -> None:
-    """LAT-1: step × 2^exponent is a step."""
-    if scaled_step(record.step, exponent) is None:
+    """LAT-1: step × 2^exponent is normal and finite in binary32; levels have no step."""
+    scaled = scaled_step(record.step, exponent, _STEP_MIN)
+    if record.step and (scaled is None or scaled > _STEP_MAX):
         raise FormatError(
             _spec.ERROR_VALUE,
             at,
             "LAT-1",
-            f"{record.step} x 2^{exponent} is not positive, finite and at least 2^-1022",
+            f"{record.step} x 2^{exponent} is not finite in binary32 and at least 2^-126",
         )
 
 
@@ -127,14 +130,14 @@ def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, co
 
 
 def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:
-    """Read i64[columns], the offsets (LAT-3)."""
-    at = cursor.take(8 * columns)
-    offsets = tuple(int(value) for value in np.frombuffer(cursor.view, "<i8", columns, at))
+    """Read i32[columns], the offsets (LAT-3)."""
+    at = cursor.take(4 * columns)
+    offsets = tuple(int(value) for value in np.frombuffer(cursor.view, "<i4", columns, at))
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
             raise FormatError(
                 _spec.ERROR_VALUE,
-                at + 8 * i,
+                at + 4 * i,
                 "LAT-3",
                 "offset",
                 found=offset,

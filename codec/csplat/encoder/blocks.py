@@ -111,7 +111,7 @@ def raw_block(column: int, values: NDArray[Any], coding: Coding) -> bytes:
 
 
 def _offset_columns(integers: Integers, exponent: int, coding: Coding) -> bytes:
-    offsets = integers.min(axis=1).astype("<i8")
+    offsets = integers.min(axis=1).astype("<i4")
     elements = integers - offsets.astype(integers.dtype)[:, None]
     stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
     return stored + smooth_stream(elements.reshape(-1), coding)

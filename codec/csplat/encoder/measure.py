@@ -29,6 +29,7 @@ __all__ = [
 Floats = NDArray[Any]
 F64 = NDArray[np.float64]
 
+_SCALE_MOST = 88.0  # logarithm of a standard deviation beyond which binary32 does not hold it
 _BLOCK = 8192  # splats at a time: the temporaries of a covariance stay in the second-level cache
 _ROUNDING = 2.0**-40  # relative
 
@@ -106,17 +107,17 @@ def covariance_errors(
 
     Args:
         source_quats, quats: [4, n], w x y z, any length above 0.
-        source_scales, scales: [3, n], log standard deviations; all are taken relative to the source's largest, so
-            that ± 60 neither overflows nor vanishes.
+        source_scales, scales: [3, n], log standard deviations, clipped to ± 88 (SER-5); all are taken relative to the
+            source's largest, so that nothing overflows.
     """
     largest = squares = 0.0
     for at in range(0, source_quats.shape[1], _BLOCK):
         part = slice(at, at + _BLOCK)
-        reference = source_scales[:, part].astype(np.float64)
+        reference = np.clip(source_scales[:, part], -_SCALE_MOST, _SCALE_MOST).astype(np.float64)
         top = reference.max(axis=0)
         reference -= top
         variances = np.exp(2.0 * reference)
-        decoded = np.exp(np.minimum(2.0 * (scales[:, part] - top), 600.0))
+        decoded = np.exp(2.0 * (np.clip(scales[:, part], -_SCALE_MOST, _SCALE_MOST) - top))
         difference = covariance_entries(quats[:, part], decoded)
         difference -= covariance_entries(source_quats[:, part], variances)
         with np.errstate(over="ignore"):  # infinity is what `stated` refuses

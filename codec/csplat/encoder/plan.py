@@ -99,12 +99,12 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
     return Plan(
         lattice=_lattice(model, options, steps.means),
         morton=options.means_coding != "axis",
-        scale_step=_first(options.scale_step, steps.scales),
+        scale_step=_single(_first(options.scale_step, steps.scales)),
         opacity_levels=_first(options.opacity_levels, steps.opacity_levels),
         quat_levels=_first(options.quat_levels, steps.quat_levels),
-        sh0_step=_first(options.sh0_step, steps.sh0),
-        sh_step=_first(options.sh_step, steps.sh),
-        codebook_step=_first(options.sh_step, steps.sh / 2**preset.codebook_finer),
+        sh0_step=_single(_first(options.sh0_step, steps.sh0)),
+        sh_step=_single(_first(options.sh_step, steps.sh)),
+        codebook_step=_single(_first(options.sh_step, steps.sh / 2**preset.codebook_finer)),
         codebook_share=preset.codebook_share,
         escape_fraction=preset.escape_fraction,
         escape_coarse=0 if options.sh_step else preset.codebook_finer,
@@ -155,6 +155,11 @@ def _steps(statistics: Statistics, quality: float, sh_quality: float, *, has_sh:
         sh0=0.07 * coarse(quality + for_sh0),
         sh=0.0135 * coarse(sh_quality),
     )
+
+
+def _single(step: float) -> float:
+    """The binary32 value nearest to a step (ATT-10)."""
+    return float(np.float32(step))
 
 
 def _first(chosen: Any, otherwise: Any) -> Any:

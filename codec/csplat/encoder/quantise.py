@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.errors import InputError
 
 __all__ = [
@@ -35,18 +36,18 @@ I64 = NDArray[np.int64]
 Floats = NDArray[Any]
 Integers = NDArray[Any]
 
-_WIDE = 2.0**30  # lattice integers beyond this do not fit the 32-bit elements of a stream
+_WIDE = _spec.COLUMN_MAX / 2  # lattice integers of scales and colours stay below, with room for rounding
 _EXACT32 = 2.0**20  # colours beyond this many steps are quantised in float64
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")
 
 
 def lattice_step(step: float, exponent: int) -> float:
-    """Return step × 2**exponent, which LAT-1 and TIL-9 want normal and finite."""
+    """Return step × 2**exponent, which LAT-1 and TIL-9 want normal and finite: in binary32, and in binary64."""
     return math.ldexp(step, exponent)
 
 
 def lattice_exponent(largest: float, step: float) -> int:
-    """Return the smallest exponent >= 0 at which integers fit the streams.
+    """Return the smallest exponent >= 0 at which the integers of scales or colours keep LAT-4.
 
     Args:
         largest: largest magnitude of the values, in the unit of `step`.

@@ -61,13 +61,13 @@ def _reduced(values: F64) -> tuple[float, float]:
 
 
 def _covariance_errors(source: SplatModel, decoded: SplatModel, index: NDArray[Any]) -> F64:
-    """‖Σi − Σj‖ / ‖Σj‖, both divided by the source's largest variance, so that no logarithm is too large."""
-    top = source.scales[index].max(axis=1, keepdims=True).astype(np.float64)
-    theirs = _covariances(source.quats[index], source.scales[index] - top)
-    ours = _covariances(decoded.quats, decoded.scales - top)
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors: F64 = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
-    return np.nan_to_num(errors, nan=np.inf)
+    """‖Σi − Σj‖ / ‖Σj‖, both divided by the source's largest variance; scales clipped to ± 88."""
+    clipped = np.clip(source.scales[index], -88.0, 88.0).astype(np.float64)
+    top = clipped.max(axis=1, keepdims=True)
+    theirs = _covariances(source.quats[index], clipped - top)
+    ours = _covariances(decoded.quats, np.clip(decoded.scales, -88.0, 88.0) - top)
+    errors: F64 = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+    return errors
 
 
 def _covariances(quats: NDArray[Any], scales: F64) -> F64:
@@ -81,9 +81,7 @@ def _covariances(quats: NDArray[Any], scales: F64) -> F64:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     ).transpose(2, 0, 1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        scaled = rotation * np.exp(2.0 * scales)[:, None, :]
-        product: F64 = np.einsum("nij,nkj->nik", scaled, rotation)
+    product: F64 = np.einsum("nij,nkj->nik", rotation * np.exp(2.0 * scales)[:, None, :], rotation)
     return product
 
 

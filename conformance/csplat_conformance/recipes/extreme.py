@@ -21,6 +21,7 @@ from csplat_conformance.samples import (
     offset,
     scene,
     signed,
+    single,
     sparse,
     tile,
 )
@@ -30,6 +31,7 @@ __all__ = ["extreme_recipes"]
 
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _MAX = _spec.INTEGER_MAX
+_SINGLE_LARGEST = float(2**128 - 2**104)
 _LARGEST = float_info.max
 
 
@@ -54,9 +56,11 @@ def _lattice(step: float, mapping: int = _spec.MAPPING_LATTICE, chroma_shift: in
 def _numbers() -> list[Recipe]:
     tiny = 2.0**-1022
     far = {MEANS: _lattice(2.0**-30)}
+    near = axis([[0, 1, 0], [2, 0, 1], [3, 1, 0]])
     box = {MEANS: axis([[0, 2**24 - 1, 0], [2**24 - 1, 0, 5], [77, 1, 2**24 - 1]], Stream(3))}
     column = _spec.COLUMN_MAX
-    lifted = _lattice(1e-9, _spec.MAPPING_YCOCG)
+    lifted = _lattice(2.0**-30 / 3.0, _spec.MAPPING_YCOCG)
+    lifted = replace(lifted, step=single(lifted.step))
     shifted = _lattice(0.5, _spec.MAPPING_YCOCG, 16)
     return [
         _recipe(
@@ -93,30 +97,49 @@ def _numbers() -> list[Recipe]:
             "step_smallest",
             "values that vanish in binary32: zeros of either sign",
             "ATT-6 TIL-11",
-            _with({SCALES: signed([[-1, -2, -3], [-9, -1, -1], [-5, -5, -5]])}, records={SCALES: _lattice(tiny)}),
-        ),
-        _recipe(
-            "scales_zero_of_both_signs",
-            "the largest scale is +0 beside −0",
-            "TIL-11",
-            _with({SCALES: signed([[-1, 0, -3], [-9, -1, -1], [-5, -5, -5]])}, records={SCALES: _lattice(tiny)}),
+            _with({MEANS: near}, corner=(-3, -1, 0), exponent=0, records={MEANS: _lattice(tiny)}),
         ),
         _recipe(
             "exponent_beyond_1023",
             "2^exponent alone overflows binary64, step × 2^exponent does not",
-            "LAT-1 ATT-6",
-            _with(
-                {SH0: signed([[0, 0, 0], [1, -1, 0], [-1, 0, 1]], exponent=1040)}, records={SH0: _lattice(2.0**-1000)}
-            ),
+            "TIL-9 ATT-6",
+            _with({MEANS: near}, corner=(-3, -1, 0), exponent=1040, records={MEANS: _lattice(2.0**-1000)}),
         ),
         _recipe(
             "exponent_below_1074",
             "2^exponent alone vanishes, step × 2^exponent does not",
+            "TIL-9",
+            _with({MEANS: near}, corner=(-3, -1, 0), exponent=-1080, records={MEANS: _lattice(1.75 * 2.0**1000)}),
+        ),
+        _recipe(
+            "exponent_beyond_127",
+            "2^exponent alone overflows binary32, step × 2^exponent does not",
+            "LAT-1 ATT-10",
+            _with({SH0: signed([[0, 0, 0], [1, -1, 0], [-1, 0, 1]], exponent=240)}, records={SH0: _lattice(2.0**-120)}),
+        ),
+        _recipe(
+            "exponent_below_149",
+            "2^exponent alone vanishes in binary32, step × 2^exponent does not",
             "LAT-1",
             _with(
-                {SH0: signed([[0, 9, 0], [1, -1, 0], [-1, 0, 1]], exponent=-1080)},
-                records={SH0: _lattice(1.75 * 2.0**1000)},
+                {SH0: signed([[0, 9, 0], [1, -1, 0], [-1, 0, 1]], exponent=-240)},
+                records={SH0: _lattice(1.75 * 2.0**120)},
             ),
+        ),
+        _recipe(
+            "single_step_smallest",
+            "scales and colours whose step is the smallest normal number of binary32",
+            "ATT-10 TIL-11",
+            _with(
+                {SCALES: signed([[-1, -2, -3], [-9, -1, -1], [-5, -5, -5]])},
+                records={SCALES: _lattice(2.0**-126), SH0: _lattice(2.0**-126)},
+            ),
+        ),
+        _recipe(
+            "single_step_largest",
+            "colours on the largest step of binary32, whose integers are 1, 0 and −1",
+            "ATT-10 LAT-5",
+            _with({SH0: signed([[0, 1, 0], [1, -1, 0], [-1, 0, 1]])}, records={SH0: _lattice(_SINGLE_LARGEST)}),
         ),
         _recipe(
             "step_largest_lattice_zero",
@@ -128,26 +151,30 @@ def _numbers() -> list[Recipe]:
             "subnormal_values",
             "products that binary32 holds as subnormals",
             "NUM-1",
-            _with({SH0: signed([[1, 2, 3], [-1, -7, 100], [33, 0, 127]])}, records={SH0: _lattice(1.1 * 2.0**-149)}),
+            _with(
+                {MEANS: axis([[0, 9, 3], [99, 0, 100], [33, 7, 0]])},
+                corner=(-7, 0, 2),
+                exponent=0,
+                records={MEANS: _lattice(1.1 * 2.0**-149)},
+            ),
         ),
         _recipe(
             "ties_to_even",
-            "float32 halfway cases of large integers",
+            "float32 halfway cases: of large integers, and of products",
             "NUM-1",
             _with(
                 {
-                    SH0: offset(
-                        [[2**24 + 1, 2**24 + 3, -(2**24) - 1], [2**25 + 2, 2**25 + 6, 0], [2**24, 1, 3]],
-                        Stream(4),
-                        offsets=(0, 0, -(2**24) - 1),
-                    )
+                    MEANS: axis([[0, 0, 0], [2, 2, 5], [2**23, 6, 1]], Stream(3)),
+                    SH0: signed([[3, -3, 5], [7, 9, -11], [2**21 + 1, 0, 1]], Stream(4)),
                 },
-                records={SH0: _lattice(1.0)},
+                corner=(2**24 + 1, -(2**25) - 6, 0),
+                exponent=0,
+                records={MEANS: _lattice(1.0), SH0: _lattice(1.0 + 2.0**-23)},
             ),
         ),
         _recipe(
             "column_limits",
-            "colour columns of ±2^50 through the lifting",
+            "colour columns of ±2^22 through the lifting",
             "LAT-3 LAT-4",
             _with({SH0: _limits(column)}, records={SH0: lifted}),
         ),
@@ -155,7 +182,7 @@ def _numbers() -> list[Recipe]:
             "chroma_shift_16",
             "the coarsest chroma, negative and odd",
             "ATT-8 LAT-4",
-            _with({SH0: signed([[1, -1, 3], [0, 2**14, -(2**14)], [-5, 7, -7]], Stream(4))}, records={SH0: shifted}),
+            _with({SH0: signed([[1, -1, 3], [0, 2**6, -(2**6)], [-5, 7, -7]], Stream(4))}, records={SH0: shifted}),
         ),
         _recipe(
             "levels_of_one",

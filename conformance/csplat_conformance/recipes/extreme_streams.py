@@ -50,7 +50,8 @@ def _codebooks() -> list[Recipe]:
     stages = tuple({0: rows_of(k, 2, 3, -9, 9)} for k in range(2))
     two = Codebook(4, _spec.CODEBOOK_KIND_SH0, stages)
     junk = book(4, ((2, 0, 2), (1, 1, 0)), signed([[9, 8, 7], [6, 5, 4]]))
-    far = Codebook(6, _spec.CODEBOOK_KIND_SCALES, ({0: [[-(2**31), 2**31 - 1, 0]]},) * 4, how=Stream(4))
+    low, high = {0: [[-(2**31), 2**31 - 1, 0]]}, {0: [[2**31 - 1, -(2**31), 0]]}
+    far = Codebook(6, _spec.CODEBOOK_KIND_SCALES, (low, low, high, high), how=Stream(4))
     alone = Codebook(3, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[-5]]}, {0: [[5], [260]]}))
     shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(3, 2, 6, -9, 9)},))
     ignored = {
@@ -93,9 +94,9 @@ def _codebooks() -> list[Recipe]:
         ),
         _recipe(
             "codebook_sums_beyond_32_bits",
-            "four entries of −2^31 add up to −2^33",
+            "entries of ±2^31 that add up to −2, by way of −2^32",
             "CBK-6 LAT-4",
-            replace(_with({SCALES: book(6, ((0, 0, 0),) * 4)}, records={SCALES: _lattice(1e-9)}), codebooks=(far,)),
+            replace(_with({SCALES: book(6, ((0, 0, 0),) * 4)}, records={SCALES: _lattice(2.0**-30)}), codebooks=(far,)),
         ),
         _recipe(
             "codebook_unused_entries",

@@ -87,8 +87,15 @@ def _blocks() -> list[Recipe]:
             base,
             {coding("quats"): _spec.CODING_OFFSET},
         ),
-        patched("lattice_exponent_high", "step × 2^exponent overflows", "LAT-1", "E_VALUE", base, {exponent: 1100}),
-        patched("lattice_exponent_low", "step × 2^exponent is subnormal", "LAT-1", "E_VALUE", base, {exponent: -1020}),
+        patched("lattice_exponent_high", "the step overflows binary32", "LAT-1", "E_VALUE", base, {exponent: 134}),
+        patched(
+            "lattice_exponent_low",
+            "the step is subnormal in binary32",
+            "LAT-1",
+            "E_VALUE",
+            base,
+            {exponent: -123},
+        ),
         patched("lattice_exponent_highest", "the largest exponent", "LAT-1", "E_VALUE", base, {exponent: 32767}),
         patched("lattice_exponent_lowest", "the smallest exponent", "LAT-1", "E_VALUE", base, {exponent: -32768}),
         patched(
@@ -115,8 +122,8 @@ def _values() -> list[Recipe]:
     column = _spec.COLUMN_MAX
     offsets = "TILE.0.0/sh0.offsets"
     at_limit = offset([[column, 0, 0], [column + 1, 0, 0]], offsets=(column, 0, 0))
-    limit, far = Attribute(_spec.MAPPING_LATTICE, 1e-9), Attribute(_spec.MAPPING_LATTICE, 2.0**100)
-    shifted = offset([[0, 2**34, 0], [0, 2**34 + 1, 0]], offsets=(0, 2**34, 0))
+    limit, far = Attribute(_spec.MAPPING_LATTICE, 2.0**-30), Attribute(_spec.MAPPING_LATTICE, 2.0**100)
+    shifted = offset([[0, 2**6, 0], [0, 2**6 + 1, 0]], offsets=(0, 2**6, 0))
     rgb, m = scene().attributes[SH0], 127
 
     def quats(name: str, why: str, clause: str, row: list[int], code: str = "E_RANGE") -> Recipe:
@@ -142,16 +149,16 @@ def _values() -> list[Recipe]:
         ),
         whole(
             "offset_too_large",
-            "an offset of 2^50 + 1",
+            "an offset of 2^22 + 1",
             "LAT-3",
             "E_VALUE",
             _with({SH0: offset([[column + 1, 0, 0]] * 2)}, {SH0: limit}),
             offsets,
         ),
-        patched("offset_smallest", "an offset of −2^63", "LAT-3", "E_VALUE", base, {offsets: (-(2**63), 0, 0)}),
+        patched("offset_smallest", "an offset of −2^31", "LAT-3", "E_VALUE", base, {offsets: (-(2**31), 0, 0)}),
         whole(
             "integer_too_large",
-            "an integer of 2^50 + 1",
+            "an integer of 2^22 + 1",
             "LAT-4",
             "E_RANGE",
             _with({SH0: at_limit}, {SH0: limit}),
@@ -159,10 +166,10 @@ def _values() -> list[Recipe]:
         ),
         whole(
             "chroma_too_large",
-            "2^50 + 2^16 after the chroma shift",
+            "2^22 + 2^16 after the chroma shift",
             "LAT-4",
             "E_RANGE",
-            _with({SH0: shifted}, {SH0: Attribute(_spec.MAPPING_YCOCG, 1e-9, chroma_shift=16)}),
+            _with({SH0: shifted}, {SH0: Attribute(_spec.MAPPING_YCOCG, 2.0**-30, chroma_shift=16)}),
             "TILE.0.0/sh0.stream.width",
         ),
         whole(
@@ -170,7 +177,10 @@ def _values() -> list[Recipe]:
             "a colour above binary32",
             "LAT-5",
             "E_RANGE",
-            _with({SH0: signed([[0, 0, 0], [0, 0, 2**28]], Stream(4))}, {SH0: replace(far, mapping=rgb.mapping)}),
+            _with(
+                {SH0: signed([[0, 0, 0], [0, 0, 2**22]], Stream(4))},
+                {SH0: replace(rgb, step=2.0**106)},
+            ),
             "TILE.0.0/sh0.stream.width",
         ),
         whole(
@@ -178,7 +188,7 @@ def _values() -> list[Recipe]:
             "a colour that rounds up to infinity",
             "LAT-5",
             "E_RANGE",
-            _with({SH0: signed([[0, 0, 0], [0, 0, -(2**25) + 1]], Stream(4))}, {SH0: replace(far, step=2.0**103)}),
+            _with({SH0: signed([[0, 0, 0], [0, 0, -31]])}, {SH0: replace(far, step=1082401 * 2.0**103)}),
             "TILE.0.0/sh0.stream.width",
         ),
         whole(
@@ -235,7 +245,7 @@ def _sparse() -> list[Recipe]:
     limit = far.attributes | {sh1: Attribute(_spec.MAPPING_LATTICE, 2.0**115)}
     return [
         patched("sparse_count", "four of three splats", "SPA-1", "E_VALUE", base, many),
-        patched("sparse_exponent", "the step overflows", "LAT-1", "E_VALUE", base, {f"{params}.exponent": 1100}),
+        patched("sparse_exponent", "the step overflows", "LAT-1", "E_VALUE", base, {f"{params}.exponent": 140}),
         patched("sparse_fewer", "less than the mask names", "SPA-2", "E_RANGE", base, few, at=mask),
         range_("missing", "the mask names one splat, two have values", "SPA-2", (1, 0, 0)),
         range_("several", "the mask names three splats, two have values", "SPA-2", (1, 1, 1)),

@@ -63,12 +63,12 @@ def _codebooks() -> list[Recipe]:
         made = scene(tiles=[tile(changes={QUATS: book(1, indices)})], codebooks=(quat_book,))
         return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/quats.attribute")
 
-    far = Attribute(_spec.MAPPING_LATTICE, 2.0**100)
-    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: [[1, 0, 0] * 3, [2**30, 0, 0] * 3]},), (1, 1), Stream(4))
-    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [0, 2**28, 0]]},), how=Stream(4))
-    halves = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[2**27, 0, 0]]},) * 2, how=Stream(4))
-    summed = {SCALES: replace(book(2, ((0, 2, 1),), summands=(0, 2**28, 0)), how=Stream(4))}
-    shape = {SCALES: book(2, ((0, 2, 1),), summands=(2**50, 2**50, 2**50))}
+    far = Attribute(_spec.MAPPING_LATTICE, 2.0**107)
+    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]},), (1, 1), Stream(4))
+    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [0, 2**21, 0]]},), how=Stream(4))
+    halves = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[2**20, 0, 0]]},) * 2, how=Stream(4))
+    summed = {SCALES: replace(book(2, ((0, 2, 1),), summands=(0, 2**21, 0)), how=Stream(4))}
+    shape = {SCALES: book(2, ((0, 2, 1),), summands=(2**22, 2**22, 2**22))}
     return [
         whole(
             "codebook_unlisted",
@@ -218,10 +218,10 @@ def _codebooks() -> list[Recipe]:
         quats("codebook_quat_component", "a sum beyond M", "QUA-1 CBK-6", ((0, 2), (0, 1))),
         whole(
             "codebook_summand_large",
-            "entry plus summand beyond 2^50",
+            "entry plus summand beyond 2^22",
             "LAT-4 CBK-6",
             "E_RANGE",
-            replace(tiled(shape), attributes=made.attributes | {SCALES: Attribute(0, 1e-9)}),
+            replace(tiled(shape), attributes=made.attributes | {SCALES: Attribute(0, 2.0**-30)}),
             "TILE.0.0/scales.attribute",
         ),
     ]

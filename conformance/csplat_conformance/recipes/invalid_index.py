@@ -174,6 +174,14 @@ def _attributes() -> list[Recipe]:
         ),
         patched("step_zero", "a step of 0", "ATT-6", "E_VALUE", base, {step: 0.0}),
         patched("step_negative", "a step below 0", "ATT-6", "E_VALUE", base, {step: -1.0}),
+        patched(
+            "step_of_colours",
+            "a step that is no binary32 value",
+            "ATT-10",
+            "E_VALUE",
+            base,
+            {"attribute[sh0].step": 0.1},
+        ),
         patched("step_nan", "a step that is no number", "ATT-6", "E_VALUE", base, {"attribute[sh0].step": _NAN}),
         patched(
             "level_step_minus_zero",

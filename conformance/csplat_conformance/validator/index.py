@@ -14,6 +14,7 @@ __all__ = ["Index", "read_records", "scaled"]
 
 _CRC_SIZE = 4
 _STEP_MIN = Fraction(1, 2**1022)
+_SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
 _LINES = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
 
@@ -51,12 +52,13 @@ class Index:
     end: int = 0
 
 
-def scaled(step: float, exponent: int) -> float | None:
-    """Return step × 2^exponent, `None` where it is not finite or below 2^−1022 (TIL-9, LAT-1). Exact."""
+def scaled(step: float, exponent: int, *, single: bool = False) -> float | None:
+    """Return step × 2^exponent, `None` where it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
     if abs(exponent) > 4096:  # beyond any pair of binary64 values, and not worth such an integer
         return None
     product = Fraction(step) * Fraction(2) ** exponent
-    return float(product) if _STEP_MIN <= product <= _STEP_MAX else None
+    low, high = (_SINGLE_MIN, _SINGLE_MAX) if single else (_STEP_MIN, _STEP_MAX)
+    return float(product) if low <= product <= high else None
 
 
 def read_records(view: memoryview, end: int, findings: Findings) -> Index:
@@ -171,10 +173,20 @@ def _check_lattice(findings: Findings, placed: AttributeAt, index: Index) -> Non
     record = placed.record
     if record.levels:
         findings.of("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
-    if 2.0**-1022 <= record.step < math.inf:
-        index.steps[record.attribute] = record.step
-    else:
+    if not 2.0**-1022 <= record.step < math.inf:
         findings.of("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
+    elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(Fraction(record.step)):
+        findings.of("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
+    else:
+        index.steps[record.attribute] = record.step
+
+
+def _is_single(step: Fraction) -> bool:
+    """Whether a normal binary32 value: at most 24 bits from the first that is 1 to the last."""
+    if not _SINGLE_MIN <= step <= _SINGLE_MAX:
+        return False
+    odd = step.numerator  # a binary fraction: either over a power of two, or whole
+    return (odd // (odd & -odd)).bit_length() <= 24
 
 
 # Codebook records ----------------------------------------------------------------------------------

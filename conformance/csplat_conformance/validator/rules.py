@@ -38,6 +38,7 @@ CODES: Final[dict[str, str]] = {
     "ATT-4": _spec.ERROR_VALUE,
     "ATT-5": _spec.ERROR_RESERVED,
     "ATT-6": _spec.ERROR_VALUE,
+    "ATT-10": _spec.ERROR_VALUE,
     "ATT-7": _spec.ERROR_RESERVED,
     "ATT-8": _spec.ERROR_VALUE,
     "ATT-9": _spec.ERROR_VALUE,

@@ -153,9 +153,11 @@ class TileReader:
     def check_step(self, params: Placed[Any], exponent: int, attribute: int) -> bool:
         """Whether LAT-1 holds."""
         step = self.index.steps.get(attribute)
-        if step is None or scaled(step, exponent) is not None:
+        if step is None or scaled(step, exponent, single=True) is not None:
             return True
-        self.findings.of("LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite and at least 2^-1022")
+        self.findings.of(
+            "LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite in binary32 and at least 2^-126"
+        )
         return False
 
     def _read_plain(self, payload: Payload, name: str, attribute: int, coding: int) -> None:
@@ -268,13 +270,13 @@ def read_exponent(reader: TileReader, payload: Payload, name: str, attribute: in
 
 def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:
     """Read the offsets, and whether LAT-3 holds."""
-    at = payload.take(8 * columns, name)
-    offsets = [int(value) for value in np.frombuffer(payload.view, "<i8", columns, at)]
+    at = payload.take(4 * columns, name)
+    offsets = [int(value) for value in np.frombuffer(payload.view, "<i4", columns, at)]
     sound = True
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
             message = f"offset {i} is {offset}, wanted {_spec.COLUMN_MAX} in magnitude at most"
-            payload.findings.add("LAT-3", at + 8 * i, f"{payload.name}/{name}", message)
+            payload.findings.add("LAT-3", at + 4 * i, f"{payload.name}/{name}", message)
             sound = False
     return offsets, sound
 

@@ -117,7 +117,7 @@ def _walk_coding(
     if coding == _spec.CODING_MORTON:
         cursor.skip(_spec.MORTON_PARAMS_SIZE)
     elif coding == _spec.CODING_OFFSET:
-        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 8 * columns)
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4 * columns)
     elif coding == _spec.CODING_SIGNED:
         cursor.skip(_spec.LATTICE_PARAMS_SIZE)
     elif coding == _spec.CODING_RAW:
@@ -143,7 +143,7 @@ def _walk_codebook(
         for _ in range(record.stage_count):
             _walk_stream(cursor, use)
     if record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
-        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 8)
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4)
         _walk_stream(cursor, use)
     use.escaped_count += params.escape_count
     if params.escape_count:

@@ -136,14 +136,12 @@ def _distances(source: SplatModel, decoded: SplatModel, source_rows: Rows, decod
 
 
 def _covariance_errors(source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
-    """Compute |S' - S| / |S|, both over the source's largest variance: any log scale will do."""
-    scales = source.scales[source_rows]
+    """Compute |S' - S| / |S|, both over the source's largest variance; logarithms beyond ± 88 count as 88 (SER-5)."""
+    scales = source.scales[source_rows].clip(-88.0, 88.0)
     largest = scales.max(axis=1).astype(np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        theirs = _covariances(source.quats[source_rows], scales, largest)
-        ours = _covariances(decoded.quats[decoded_rows], decoded.scales[decoded_rows], largest)
-        error = _frobenius(ours - theirs) / _frobenius(theirs)  # the norm is at least 1
-    error[np.isnan(error)] = np.inf  # infinite variances: beyond float64
+    theirs = _covariances(source.quats[source_rows], scales, largest)
+    ours = _covariances(decoded.quats[decoded_rows], decoded.scales[decoded_rows].clip(-88.0, 88.0), largest)
+    error: F64 = _frobenius(ours - theirs) / _frobenius(theirs)  # the norm is at least 1
     return error
 
 
