@@ -37,7 +37,7 @@ class Vector:
         since: version of the format.
         profile: name of the profile that a decoder needs; for refusals base where the file names none.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
-        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted).
+        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted: CHK-6).
         views: renderings: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (dB at least).
     """
 

@@ -210,12 +210,13 @@ def _texts() -> list[Recipe]:
             "E_JSON",
             scene(chunks=(Chunk(meta, text),)),
             "META/stream.width",
-            optional=True,
         )
         for name, (text, why) in bad.items()
     ]
     cameras = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"{}"),))
     numbers = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"[{},1]"),))
+    options = scene(chunks=(Chunk(_spec.CHUNK_OPTIONS, b"[]"),))
+    garbage = scene(chunks=(Chunk(meta, b"{}", Stream(1, coder="deflate", coded=b"\xff\xff")),))
     tail = scene(chunks=(Chunk(meta, b"{}", tail=b"\0"),))
     runs = 1024  # of 65,536 spaces: beyond the default budget, and 3 kB in the file
     values = b"{}" + b" " * runs
@@ -226,12 +227,10 @@ def _texts() -> list[Recipe]:
     record = "SERR/record[means]"
     return [
         *result,
-        whole(
-            "json_cameras_object", "an object in CAMS", "JSN-1", "E_JSON", cameras, "CAMS/stream.width", optional=True
-        ),
-        whole(
-            "json_cameras_number", "a number in CAMS", "JSN-1", "E_JSON", numbers, "CAMS/stream.width", optional=True
-        ),
+        whole("json_cameras_object", "an object in CAMS", "JSN-1", "E_JSON", cameras, "CAMS/stream.width"),
+        whole("json_cameras_number", "a number in CAMS", "JSN-1", "E_JSON", numbers, "CAMS/stream.width"),
+        whole("json_options_array", "an array in OPTS", "JSN-1", "E_JSON", options, "OPTS/stream.width"),
+        whole("json_coded_garbage", "a text of damaged bytes", "COD-2", "E_CODER", garbage, "META/stream.coded"),
         whole("json_tail", "a byte after the stream", "JSN-2", "E_STREAM", tail, "META/tail"),
         patched(
             "json_beyond_budget",
