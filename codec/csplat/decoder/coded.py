@@ -147,7 +147,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
     read_exponent(cursor, context.header.attribute(attribute), fixed=True)
     offsets = read_offsets(cursor, 1)
     at = cursor.at
-    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
+    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
     elements = read_stream(cursor, context.header.profile, count, width_max)
     return Columns(elements.reshape(1, count), offsets, 0, at)
 

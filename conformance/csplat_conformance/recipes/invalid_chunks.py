@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from csplat import _spec
@@ -18,6 +19,8 @@ from csplat_conformance.scene import Chunk, Scene, StatedErrors, Stream
 __all__ = ["chunk_recipes"]
 
 _NAN, _INF = float("nan"), float("inf")
+_LARGEST = 0.0048828125
+_RMS = math.nextafter(_LARGEST * math.sqrt(3.0) * (1.0 + 2.0**-20), 1.0)
 _KNOWN = _spec.CHUNK_FLAG_CRITICAL
 
 
@@ -250,6 +253,15 @@ def _texts() -> list[Recipe]:
             base,
             {f"{record}.rms": 0.75},
             at="SERR/record[means].max",
+        ),
+        patched(
+            "error_rms_next_above",
+            "rms next above its bound, which two other orders of the product would let pass",
+            "SER-2 NUM-1",
+            "E_VALUE",
+            base,
+            {f"{record}.measure": _spec.MEASURE_SH0, f"{record}.max": _LARGEST, f"{record}.rms": _RMS},
+            at=f"{record}.max",
         ),
         patched(
             "error_records_missing",
