@@ -250,7 +250,7 @@ export class CsplatReader {
     const record = this.codebookChunks.get(key);
     const codebook = this.codebooks.get(id);
     if (!record || !codebook) throw new InputError(`no codebook ${key}`); // DIR-5 and CBK-1 leave no way here
-    return readTable(await this.readChunk(record), record, codebook, this.inflate);
+    return readTable(await this.readChunk(record), record, codebook, this.header.attributes, this.inflate);
   }
 
   /**

@@ -78,6 +78,14 @@ EDITS: Final = (
         "else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];",
         "",
     ),
+    Edit(
+        "unused entries",
+        "entries of a codebook are believed",
+        "CBK-7",
+        "codebooks.mjs",
+        "if (stageCount === 1) checkEntries(",
+        "if (false) checkEntries(",
+    ),
     Edit("quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("),
     Edit(
         "opacities",
