@@ -176,12 +176,18 @@ def test_another_code_fails_where_exactness_is_asked_for(faulty):
     assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
 
 
-def test_a_broken_text_may_be_accepted_by_decoders_that_do_not_read_it(faulty):
-    report = run_command(faulty("silent"), Choice(pattern="invalid/json_open"))
+@pytest.mark.parametrize("name", ["json_open", "json_coded_garbage", "json_beyond_budget", "error_counts"])
+def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread(faulty, name):
+    report = run_command(faulty("silent"), Choice(pattern=f"invalid/{name}"))
 
     assert report.passed
-    assert "as a decoder may" in report.outcomes[0].message
-    assert not run_command(faulty("silent"), Choice(pattern="invalid/json_open", exact=True)).passed
+    assert "leaves the payload unread" in report.outcomes[0].message
+    assert not run_command(faulty("silent"), Choice(pattern=f"invalid/{name}", exact=True)).passed
+
+
+@pytest.mark.parametrize("name", ["metadata_crc", "stated_errors_crc", "chunk_flags_differ", "metadata_twice"])
+def test_what_is_wrong_about_the_frame_of_an_unread_chunk_has_to_be_refused(faulty, name):
+    assert not run_command(faulty("silent"), Choice(pattern=f"invalid/{name}")).passed
 
 
 def test_names_of_extra_columns_are_percent_encoded():

@@ -1,7 +1,12 @@
 """Decoders that are wrong on purpose: the suite notices each, and names the clause."""
 
+from unittest import mock
+
 import pytest
 
+from csplat import _spec
+from csplat.decoder import scene
+from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter, wrong
 from csplat_conformance.manifest import load
 from csplat_conformance.node import missing_javascript
@@ -35,6 +40,19 @@ def test_a_right_decoder_is_not_caught():
     nothing = wrong.Mistake("none", "", "CHK-1", lambda _: None)
 
     assert [] == list(wrong.catch(nothing).failed)
+
+
+def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector():
+    # CHK-6: frame and CRC of these chunks are looked at all the same.
+    def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):
+        if record := header.chunk(kind):
+            open_chunk(view, record.offset, record.size, record.type, record.flags, "CHK-6")
+
+    def apply(stack):
+        for name in ("read_json", "read_serr"):
+            stack.enter_context(mock.patch.object(scene, name, frames))
+
+    assert [] == list(wrong.catch(wrong.Mistake("none", "", "CHK-6", apply)).failed)
 
 
 @needs_javascript

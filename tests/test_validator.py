@@ -41,9 +41,10 @@ ELSEWHERE = {
 UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which hold no more than 24 bits"}
 
 #: Clauses of sections 2 to 8 that are not about a file's bytes: decoders, readers of parts, editors, permissions; and
-#: CBK-6, which says where other clauses hold.
+#: CBK-6 and CBK-7, which say where other clauses hold.
 NOT_ABOUT_FILES = {
-    "NUM-1", "ORD-1", "HDR-9", "HDR-10", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5", "JSN-3", "COD-4", "CBK-6",
+    "NUM-1", "ORD-1", "HDR-9", "HDR-10", "HDR-12", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5", "CHK-6", "CHK-7",
+    "COD-4", "CBK-6", "CBK-7",
 }  # fmt: skip
 
 

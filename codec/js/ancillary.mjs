@@ -108,7 +108,7 @@ function readStatedError(payload, last, stated) {
   if (name === undefined || measure <= last)
     throw fault(ERROR_VALUE, offset, 'SER-1', `measure ${measure} after ${last}`);
   const components = Math.sqrt(measureComponents(measure));
-  const room = 1 + 2 ** -20;
+  const room = 1 + 2 ** -20; // SER-2: the product from left to right
   const isBound = (/** @type {number} */ value) => value >= 0 && Number.isFinite(value);
   if (!(isBound(max) && isBound(rms) && rms <= max * components * room)) {
     throw fault(ERROR_VALUE, offset + AT.max, 'SER-2', `${name}: maximum ${max}, rms ${rms}`);

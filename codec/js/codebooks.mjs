@@ -2,8 +2,10 @@
 
 import {
   checkCoding,
+  checkFinite,
   checkIntegers,
   columnCount,
+  liftColours,
   readBlockHead,
   readLatticeParams,
   readOffsets,
@@ -79,10 +81,11 @@ export function tableBytes(directory, codebooks) {
  * @param {Uint8Array<ArrayBuffer>} bytes
  * @param {DirectoryRecord} record
  * @param {CodebookRecord} codebook
+ * @param {AttributeRecord[]} attributes all of the file
  * @param {Inflate} inflate
  * @returns {Promise<Table>}
  */
-export async function readTable(bytes, { id, layer, offset }, codebook, inflate) {
+export async function readTable(bytes, { id, layer, offset }, codebook, attributes, inflate) {
   const payload = new Payload(bytes, offset + spec.CHUNK_HEADER_SIZE, 'CDB-2');
   const { fields, offset: at } = payload.read(
     spec.unpackCodebookHead,
@@ -101,15 +104,45 @@ export async function readTable(bytes, { id, layer, offset }, codebook, inflate)
   /** @type {Stage[]} */
   const stages = [];
   for (const size of codebook.sizes) {
-    const integers = signed(await readStream(payload, size * count, ENTRY_WIDTH_MAX, inflate));
+    const stream = await readStream(payload, size * count, ENTRY_WIDTH_MAX, inflate);
+    const integers = signed(stream);
     const entries = new Int32Array((size + 1) * count);
     for (let c = 0; c < count; c++) entries.set(integers.subarray(c * size, (c + 1) * size), c * (size + 1));
     let bound = 0;
     for (let i = 0; i < integers.length; i++) bound = Math.max(bound, Math.abs(integers[i]));
     stages.push({ size, entries, bound });
+    if (stageCount === 1) checkEntries({ integers, size, bound, offset: stream.offset }, codebook, layer, attributes);
   }
   payload.finish();
   return { stages };
+}
+
+/**
+ * CBK-7: each entry of a codebook of one stage obeys by itself what sums must.
+ *
+ * @param {{integers: Int32Array, size: number, bound: number, offset: number}} stage column after column, and where its
+ *   stream begins
+ * @param {CodebookRecord} codebook
+ * @param {number} layer of the chunk
+ * @param {AttributeRecord[]} attributes all of the file
+ */
+function checkEntries({ integers, size, bound, offset }, codebook, layer, attributes) {
+  let first = 0;
+  for (const name of codebook.attributes) {
+    const attribute = /** @type {AttributeRecord} */ (attributes.find((one) => one.name === name)); // by CBR-2
+    if (layer > 0 && attribute.id !== spec.ATTRIBUTE_SH0 + layer) continue;
+    const end = first + size * columnCount(attribute);
+    // To the scales of shapes a summand comes: their sums are bound, by CBK-6.
+    if (codebook.kind !== KIND_SHAPE || attribute.id !== spec.ATTRIBUTE_SCALES) {
+      const block = { attribute, columns: new Float64Array(integers.subarray(first, end)), exponent: 0, bound, offset };
+      checkIntegers(block, size);
+      if (attribute.step !== 0) {
+        liftColours(block);
+        checkFinite(block, attribute.step, 'LAT-5');
+      }
+    }
+    first = end;
+  }
 }
 
 /**
@@ -145,7 +178,8 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   const isSh = codebook.bandFirst > 0;
   const table = await tile.table(id, isSh ? attribute.id - spec.ATTRIBUTE_SH0 : 0);
   const offset = at - spec.BLOCK_HEAD_SIZE;
-  if (!integers && isPlain(table, attribute)) {
+  const isBound = codebook.sizes.length === 1; // CBK-7: nothing is left to check, but where a summand comes
+  if (!integers && isBound && attribute.id >= spec.ATTRIBUTE_SH0) {
     const lookup = { id, table, index: shared.indices[0], escaped: shared.escaped };
     if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
     return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
@@ -153,9 +187,10 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   // Columns of the codebook's attributes before this one; a band has a chunk of its own.
   const before = isSh ? 0 : codebook.attributes.indexOf(attribute.name) * spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SCALES];
   const block = sumEntries(tile.sums(attribute), table, before, shared.indices, attribute, offset);
-  if (codebook.kind === KIND_SHAPE && isFirst) await addSummand(tile, payload, block);
+  const hasSummand = codebook.kind === KIND_SHAPE && isFirst;
+  if (hasSummand) await addSummand(tile, payload, block);
   if (escapeCount) putEscapes(block, shared.escaped, await readEscapes(tile, payload, attribute, escapeCount));
-  checkIntegers(block, tile.splatCount);
+  if (!isBound || hasSummand) checkIntegers(block, tile.splatCount);
   return block;
 }
 
@@ -224,18 +259,6 @@ async function knownIndices(tile, codebook, escapeCount, at) {
     );
   }
   return shared;
-}
-
-/**
- * Whether splats may stay indices: a colour table of one stage, no entry of which can break LAT-4 or LAT-5.
- *
- * @param {Table} table
- * @param {AttributeRecord} attribute
- */
-function isPlain({ stages }, { id, chromaShift, step }) {
-  const coarse = stages[0].bound * 2 ** chromaShift;
-  if (id < spec.ATTRIBUTE_SH0 || stages.length > 1 || coarse > spec.COLUMN_MAX) return false;
-  return Number.isFinite(Math.fround(4 * coarse * step)); // colour lifting at most triples
 }
 
 /**

@@ -1,7 +1,7 @@
 // Attribute codings other than CODEBOOK: from streams to integers (spec section 6.4).
 
 import { fault } from './errors.mjs';
-import { SINGLE_MIN, ldexp } from './lattice.mjs';
+import { SINGLE_MIN, ldexp, rgbFromYcocg } from './lattice.mjs';
 import { nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { readIntegers, readStream } from './streams.mjs';
@@ -377,5 +377,33 @@ function checkColumns(attribute, columns, n, offset) {
     const most = i < firstChroma ? spec.COLUMN_MAX : spec.COLUMN_MAX / 2 ** attribute.chromaShift;
     if (Math.abs(columns[i]) > most)
       throw fault(ERROR_RANGE, offset, 'LAT-4', `an integer of ${columns[i]} in column ${Math.floor(i / n)}`);
+  }
+}
+
+/**
+ * Spec 7.1, in place; nothing where the columns are no Y, Co, Cg.
+ *
+ * @param {Block} block
+ */
+export function liftColours(block) {
+  const { mapping, chromaShift } = block.attribute;
+  if (mapping !== spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) return;
+  rgbFromYcocg(block.columns, block.columns.length / 3, chromaShift);
+  block.bound *= 4 * 2 ** chromaShift; // |R| <= |Y| + |Cg| / 2 + 3 |Co| / 2 and 1 for each rounding
+}
+
+/**
+ * Refuse integers whose value leaves binary32.
+ *
+ * @param {Block} block
+ * @param {number} step
+ * @param {string} clause
+ */
+export function checkFinite({ attribute, columns, bound, offset }, step, clause) {
+  if (Number.isFinite(Math.fround(bound * step))) return;
+  for (const n of columns) {
+    if (!Number.isFinite(Math.fround(n * step))) {
+      throw fault(ERROR_RANGE, offset, clause, `${attribute.name}: ${n} × ${step} is beyond binary32`);
+    }
   }
 }

@@ -80,15 +80,15 @@ export function checkFileSize(size, { fileSize }) {
  * HDR-8: the SHA-256 of everything but the digest.
  *
  * @param {Uint8Array<ArrayBuffer>} bytes the whole file
- * @param {FileHeader} file
+ * @param {Uint8Array} digest of its header
  */
-export async function checkDigest(bytes, file) {
+export async function checkDigest(bytes, digest) {
   const field = AT.digest; // the last of the header
   const covered = allocate(() => new Uint8Array(bytes.length - spec.HEADER_SIZE + field));
   covered.set(bytes.subarray(0, field));
   covered.set(bytes.subarray(spec.HEADER_SIZE), field);
   const computed = await sha256(covered);
-  if (computed.some((byte, i) => byte !== file.digest[i])) {
+  if (computed.some((byte, i) => byte !== digest[i])) {
     throw fault(spec.ERROR_DIGEST, field, 'HDR-8', 'the SHA-256 of the file is another');
   }
 }

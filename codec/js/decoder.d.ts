@@ -331,6 +331,11 @@ export class CsplatReader {
     options: { form: 'packed'; signal?: AbortSignal },
   ): Promise<PackedBand | null>;
   describe(options?: { signal?: AbortSignal }): Promise<Description>;
+  /**
+   * Resolves when nothing is left to check. Where a server without ranges sends the whole file, that is when its last
+   * byte is here; rejects with E_DIGEST where it is not the file that its digest names.
+   */
+  finish(): Promise<Checks>;
   /** Begin to fetch layers that will be read soon, neighbours with one request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
 }

@@ -62,7 +62,7 @@ export async function decode(data, options = {}) {
   const integers = checkedForm(options.form);
   const file = readFileHeader(bytes);
   checkFileSize(bytes.length, file);
-  const digest = checkDigest(bytes, file); // beside the rest where the platform can
+  const digest = checkDigest(bytes, file.digest); // beside the rest where the platform can
   digest.catch(() => {}); // another error may be found first
   const header = readIndex(bytes.subarray(spec.HEADER_SIZE, file.end), file, limits);
   const tiles = checkedTiles(options.tiles, header);
@@ -122,7 +122,9 @@ async function readDirectory({ header, codebooks, inflate }, payloads, jsonBytes
   for (const record of header.directory) {
     const codebook = codebooks.get(record.id);
     if (record.type === spec.CHUNK_CODEBOOK && codebook) {
-      tables.set(`${record.id}.${record.layer}`, await readTable(payloads(record), record, codebook, inflate));
+      const { attributes } = header;
+      const table = await readTable(payloads(record), record, codebook, attributes, inflate);
+      tables.set(`${record.id}.${record.layer}`, table);
     } else if (Object.hasOwn(spec.CHUNK_NAMES, record.type)) {
       await describe(description, record, payloads(record), { splatCount: header.splatCount, jsonBytes, inflate });
     }

@@ -10,7 +10,7 @@ import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed.mjs';
-import { openSource } from './source.mjs';
+import { HttpSource, openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
 import { WholeSource } from './whole.mjs';
@@ -29,7 +29,6 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./codebooks.mjs').Table} Table
- * @typedef {import('./container.mjs').FileHeader} FileHeader
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 
@@ -59,7 +58,8 @@ export class CsplatReader {
     progress.fileSize = file.fileSize;
     const header = readIndex(await source.read(spec.HEADER_SIZE, file.indexSize, signal), file, limits);
     const reader = new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
-    if (source instanceof WholeSource) reader.checkWhole(source, file);
+    reader.digest = file.digest;
+    if (source instanceof WholeSource) reader.checkWhole(source);
     return reader;
   }
 
@@ -78,6 +78,10 @@ export class CsplatReader {
     this.checks = { header: true, index: true, chunks: 0, digest: false };
     /** How long reads have waited for bytes so far, each for itself. */
     this.waitedMs = 0;
+    /** @type {Uint8Array} of the header */
+    this.digest = new Uint8Array(0);
+    /** @type {Promise<void> | undefined} the check of the digest, where the whole file comes */
+    this.whole = undefined;
     this.codebooks = codebooksById(header.codebooks);
     this.tableBytes = tableBytes(header.directory, this.codebooks);
     /** @type {Map<string, DirectoryRecord>} */
@@ -161,6 +165,18 @@ export class CsplatReader {
   }
 
   /**
+   * Wait until nothing is left to check: of a file that comes as one body the digest, of parts nothing.
+   *
+   * @returns {Promise<import('./decoder.d.ts').Checks>}
+   */
+  async finish() {
+    const { source } = this;
+    if (source instanceof HttpSource && source.whole) this.checkWhole(source.whole); // ranges were honoured at first
+    await this.whole;
+    return this.checks;
+  }
+
+  /**
    * Begin to fetch layers that will be read soon, neighbours in the file with one request, and the codebooks that lie
    * between them.
    *
@@ -234,7 +250,7 @@ export class CsplatReader {
     const record = this.codebookChunks.get(key);
     const codebook = this.codebooks.get(id);
     if (!record || !codebook) throw new InputError(`no codebook ${key}`); // DIR-5 and CBK-1 leave no way here
-    return readTable(await this.readChunk(record), record, codebook, this.inflate);
+    return readTable(await this.readChunk(record), record, codebook, this.header.attributes, this.inflate);
   }
 
   /**
@@ -268,15 +284,16 @@ export class CsplatReader {
   }
 
   /**
-   * Check the digest of a file that came whole, once it is here; after a failure nothing more is read.
+   * HDR-12: check the digest of a file that comes whole, once it is here; after a failure nothing more is read.
    *
    * @param {WholeSource} source
-   * @param {FileHeader} file
    */
-  checkWhole(source, file) {
-    source.complete
-      .then(() => checkDigest(source.bytes, file))
-      .then(() => (this.checks.digest = true))
-      .catch((error) => source.fail(error));
+  checkWhole(source) {
+    this.whole ??= source.complete
+      .then(() => checkDigest(source.bytes, this.digest))
+      .then(() => {
+        this.checks.digest = true;
+      });
+    this.whole.catch((error) => source.fail(error));
   }
 }

@@ -123,11 +123,11 @@ function checkCount(found, count, offset) {
  * @param {number} offset
  */
 function checkTransforms(transforms, offset) {
+  const unknown = transforms.find((transform) => !(transform in spec.TRANSFORM_NAMES));
+  if (unknown !== undefined) throw fault(spec.ERROR_UNSUPPORTED, offset, 'RES-2', `transform ${unknown}`);
   let last = 0;
   for (let i = 0; i < transforms.length; i++) {
     const transform = transforms[i];
-    if (!(transform in spec.TRANSFORM_NAMES))
-      throw fault(spec.ERROR_UNSUPPORTED, offset, 'RES-2', `transform ${transform}`);
     const after = i > 0 && last === spec.TRANSFORM_NONE; // nothing but NONE may follow NONE
     if (after ? transform !== spec.TRANSFORM_NONE : transform !== spec.TRANSFORM_NONE && transform <= last) {
       throw fault(spec.ERROR_STREAM, offset, 'STR-3', `transforms ${[...transforms].join(', ')}`);

@@ -1,14 +1,22 @@
 // One tile: the blocks of its layers, decoded to integers and checked (spec 5.2, 6.4, 7.1, 7.2, 7.4).
 
 import { readCodebookBlock } from './codebooks.mjs';
-import { checkCoding, columnCount, everySplat, readBlockHead, readValues } from './codings.mjs';
+import {
+  checkCoding,
+  checkFinite,
+  columnCount,
+  everySplat,
+  liftColours,
+  readBlockHead,
+  readValues,
+} from './codings.mjs';
 import { fault } from './errors.mjs';
-import { ldexp, rgbFromYcocg } from './lattice.mjs';
+import { ldexp } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import * as spec from './spec.mjs';
 import { readStream } from './streams.mjs';
 
-const { ERROR_BOX, ERROR_INDEX, ERROR_RANGE, ERROR_STREAM } = spec;
+const { ERROR_BOX, ERROR_INDEX, ERROR_STREAM } = spec;
 const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
 
 /**
@@ -181,15 +189,12 @@ export class Tile {
    * @returns {Block}
    */
   finish(block) {
-    const { id, mapping, chromaShift, step } = block.attribute;
+    const { id, step } = block.attribute;
     if (id === spec.ATTRIBUTE_MEANS) {
       this.placeMeans(block);
       checkFinite(block, this.record.step, 'MEA-1');
     } else if (step !== 0) {
-      if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) {
-        rgbFromYcocg(block.columns, block.columns.length / 3, chromaShift);
-        block.bound *= 4 * 2 ** chromaShift; // |R| <= |Y| + |Cg| / 2 + 3 |Co| / 2 and 1 for each rounding
-      }
+      liftColours(block);
       const s = ldexp(step, block.exponent);
       checkFinite(block, s, 'LAT-5');
       if (id === spec.ATTRIBUTE_SCALES) this.checkMaxScale(block.columns, s);
@@ -243,22 +248,6 @@ export class Tile {
         'TIL-11',
         `the largest scale is ${value}, the record says ${maxScale}`,
       );
-    }
-  }
-}
-
-/**
- * Refuse integers whose value leaves binary32.
- *
- * @param {Block} block
- * @param {number} step
- * @param {string} clause
- */
-function checkFinite({ attribute, columns, bound, offset }, step, clause) {
-  if (Number.isFinite(Math.fround(bound * step))) return;
-  for (const n of columns) {
-    if (!Number.isFinite(Math.fround(n * step))) {
-      throw fault(ERROR_RANGE, offset, clause, `${attribute.name}: ${n} × ${step} is beyond binary32`);
     }
   }
 }

@@ -100,7 +100,7 @@ def _judge_refusal(vector: Vector, answer: Answer, exact: bool) -> Outcome:
     if status is Status.PASSED:
         optional = wanted["optional"] and not exact
         status = Status.PASSED if optional else Status.FAILED
-        message = "accepted, as a decoder may that does not use the chunk" if optional else "accepted"
+        message = "accepted, as a decoder does that leaves the payload unread (CHK-6)" if optional else "accepted"
     elif status is Status.REFUSED:
         status, message = _compare_refusal(answer, wanted, exact)
     clauses = tuple(vector.clauses)

@@ -6,11 +6,15 @@ import struct
 from functools import cache
 from typing import Any
 
+from csplat import _spec
 from csplat_conformance.builder import Built, build
 from csplat_conformance.samples import Recipe, rich_scene, scene
 from csplat_conformance.scene import Scene
 
 __all__ = ["patched", "rich", "small", "swapped", "whole"]
+
+#: CHK-6: chunks whose payload a decoder may leave unread.
+_ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 
 
 @cache
@@ -51,17 +55,22 @@ def patched(
     """
     place = base.fields[at or next(iter(changes))].offset + within
     ids = tuple(clauses.split())
-    return Recipe(f"invalid/{name}", why, ids, lambda: base.patched(changes), None, code, place, also)
+    optional = all(map(_may_be_unread, changes))
+    return Recipe(f"invalid/{name}", why, ids, lambda: base.patched(changes), None, code, place, also, optional)
 
 
-def whole(
-    name: str, why: str, clauses: str, code: str, made: Scene, at: str, within: int = 0, optional: bool = False
-) -> Recipe:
+def whole(name: str, why: str, clauses: str, code: str, made: Scene, at: str, within: int = 0) -> Recipe:
     """Return a recipe whose scene is declared wrong; `at` names the field that is to blame."""
     built = build(made)
     place = built.fields[at].offset + within
     ids = tuple(clauses.split())
-    return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=optional)
+    return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=_may_be_unread(at))
+
+
+def _may_be_unread(field: str) -> bool:
+    """Whether a field lies in the payload of an ancillary chunk: neither in its frame nor in its CRC."""
+    chunk, _, part = field.partition("/")
+    return chunk.encode() in _ANCILLARY and part != "crc" and not part.startswith("header.")
 
 
 def swapped(base: Built, one: str, other: str) -> dict[str, Any]:

@@ -88,7 +88,7 @@ class Recipe:
         code: error code where it must be refused.
         offset: the defect's byte, if a single one is to blame.
         also: further codes that a decoder may report.
-        optional: decoders that do not use the chunk may accept the file.
+        optional: decoders that leave the chunk's payload unread (CHK-6) accept the file.
         views: how it has to look, for scenes that are rendered.
     """
 

@@ -84,6 +84,14 @@ EDITS: Final = (
         "if ((mask[i >> 3] >> (i & 7)) & 1)",
         "if ((mask[i >> 3] >> (7 - (i & 7))) & 1)",
     ),
+    Edit(
+        "unused entries",
+        "entries of a codebook are believed",
+        "CBK-7",
+        "codebooks.mjs",
+        "if (stageCount === 1) checkEntries(",
+        "if (false) checkEntries(",
+    ),
     Edit("quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("),
     Edit(
         "opacities",

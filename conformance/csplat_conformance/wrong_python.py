@@ -165,7 +165,7 @@ def _bands_swapped(right: Wrong, parts: Any, records: Any, out: Any) -> None:
 
 def _channels_innermost(_right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any, **_: Any) -> None:
     step = math.ldexp(record.step, block.exponent)
-    for start, stop, parts in reconstruct.lattice_rows(block, record, len(out), check=False):
+    for start, stop, parts in reconstruct.lattice_rows(block, record, len(out)):
         columns = np.concatenate(parts)
         for channel in range(3):
             for coefficient, row in enumerate(columns[channel::3]):
@@ -228,6 +228,7 @@ MISTAKES: Final = (
     Mistake("order", "Morton codes taken for sorted", "ORD-1", _replaced("morton_axes", _sorted_codes)),
     Mistake("escapes", "escaped splats take the last entry", "CBK-3", _method(blocks.Coded, "rows", _no_escapes)),
     Mistake("stages", "stages after the first are dropped", "CBR-3", _method(blocks.Coded, "rows", _one_stage)),
+    Mistake("unused entries", "entries of a codebook are believed", "CBK-7", _replaced("_check_entries", _nothing)),
     Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", _method(blocks.Coded, "rows", _no_summand)),
     Mistake("mask", "bits from the highest on", "SPA-2", _replaced("read_sparse", _mask_from_the_top)),
     Mistake("rounding", "products in binary32", "NUM-1", _replaced("_scale", _binary32_product)),

@@ -72,6 +72,7 @@ export async function load(source, sink, signal) {
       tell(layer);
     }
   }
+  await reader.finish();
   if (isLocal) {
     state.received = header.fileSize;
     tell(header.shDegree);

@@ -75,13 +75,11 @@ class Codebook:
         entries: for each layer (0, or an SH band) the entries of each stage, [size, C] integers.
         values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
             on, for SH codebooks of one stage.
-        values_finite: whether all of `values` are.
     """
 
     record: _spec.CodebookRecord
     entries: dict[int, tuple[Ints, ...]] = field(default_factory=dict)
     values: NDArray[np.float32] | None = None
-    values_finite: bool = True
 
     @property
     def sizes(self) -> tuple[int, ...]:

@@ -10,7 +10,8 @@ from csplat import _spec
 from csplat.decoder.blocks import Codebook, Columns
 from csplat.decoder.container import open_chunk
 from csplat.decoder.header import SceneHeader, Tile
-from csplat.decoder.reconstruct import write_colour
+from csplat.decoder.lattice import check_integers
+from csplat.decoder.reconstruct import check_values, quat_rows, write_colour
 from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
 
@@ -72,7 +73,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
     books: dict[int, Codebook] = {}
     for record in _wanted(header, tiles, degree):
         book = books.setdefault(record.id, Codebook(records[record.id]))
-        book.entries[record.layer] = _read_chunk(view, record, book.record)
+        book.entries[record.layer] = _read_chunk(view, header, record, book.record)
     for book in books.values():
         if book.record.kind == _spec.CODEBOOK_KIND_SH and book.record.stage_count == 1:
             _fill_values(book, header)
@@ -85,7 +86,7 @@ def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
     named = {table for tile in header.tiles for table in tile.tables}
     for record in _codebook_chunks(header):
         if record.id not in named:
-            _read_chunk(view, record, records[record.id])
+            _read_chunk(view, header, record, records[record.id])
 
 
 def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
@@ -98,7 +99,9 @@ def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_sp
     return sorted(chunks, key=lambda record: (record.id, record.layer))
 
 
-def _read_chunk(view: memoryview, record: _spec.DirectoryRecord, book: _spec.CodebookRecord) -> tuple[Ints, ...]:
+def _read_chunk(
+    view: memoryview, header: SceneHeader, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
+) -> tuple[Ints, ...]:
     cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "CDB-2")
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)
@@ -119,11 +122,39 @@ def _read_chunk(view: memoryview, record: _spec.DirectoryRecord, book: _spec.Cod
     columns = layer_columns(book, record.layer)
     stages = []
     for size in book.sizes[: book.stage_count]:
+        stream_at = cursor.at
         elements = read_stream(cursor, size * columns, _ENTRY_WIDTH_MAX, signed=True)
+        if book.stage_count == 1:
+            _check_entries(elements.reshape(columns, size), header, book, record.layer, stream_at)
         # Rows of one entry: a gather then copies whole rows.
         stages.append(np.ascontiguousarray(elements.reshape(columns, size).T))
     cursor.finish()
     return tuple(stages)
+
+
+def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecord, layer: int, at: int) -> None:
+    """CBK-7.
+
+    Args:
+        entries: [C, size], of the one stage.
+        header: the scene.
+        book: the codebook's record.
+        layer: of the chunk.
+        at: where the stream begins in the file.
+    """
+    for attribute, record in enumerate(header.attributes, _spec.ATTRIBUTE_OPACITIES):
+        columns = attribute_columns(book, attribute)
+        if columns is None or _spec.ATTRIBUTE_LAYER[attribute] != layer:
+            continue
+        if book.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
+            continue  # a summand comes to them: their sums are bound, by CBK-6
+        block = Columns(entries[columns], (0,) * _spec.ATTRIBUTE_COLUMNS[attribute], 0, at)
+        check_integers(block.lows, block.highs, record, at)
+        if attribute == _spec.ATTRIBUTE_QUATS:
+            for _ in quat_rows(block, record, entries.shape[1]):
+                pass  # QUA-2
+        elif record.levels == 0:
+            check_values(block, record, entries.shape[1])
 
 
 def _fill_values(book: Codebook, header: SceneHeader) -> None:
@@ -135,7 +166,5 @@ def _fill_values(book: Codebook, header: SceneHeader) -> None:
     for band in sorted(book.entries):
         columns = Columns(book.entries[band][0].T, (0,) * (3 * (2 * band + 1)), 0, 0)
         record = header.attribute(_spec.ATTRIBUTE_SH0 + band)
-        # An entry that overflows is at fault only if a splat uses it (CBK-6): no check here.
-        write_colour(columns, record, book.values[:, row : row + 2 * band + 1], check=False)
+        write_colour(columns, record, book.values[:, row : row + 2 * band + 1])
         row += 2 * band + 1
-    book.values_finite = bool(np.isfinite(book.values).all())

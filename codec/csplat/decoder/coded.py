@@ -13,8 +13,7 @@ from csplat.decoder.codebooks import attribute_columns
 from csplat.decoder.container import Cursor, check_reserved
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.lattice import (
-    check_lattice_range,
-    check_level,
+    check_integers,
     read_block_head,
     read_columns,
     read_exponent,
@@ -147,7 +146,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
     read_exponent(cursor, context.header.attribute(attribute), fixed=True)
     offsets = read_offsets(cursor, 1)
     at = cursor.at
-    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
+    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
     elements = read_stream(cursor, count, width_max)
     return Columns(elements.reshape(1, count), offsets, 0, at)
 
@@ -155,18 +154,12 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
 def _check_sums(block: Coded, context: TileContext, attribute: int) -> None:
     """CBK-6: the sums obey what LEV-1, QUA-1 and LAT-4 ask of integers that stand in a stream."""
     record = context.header.attribute(attribute)
-    levels = record.levels
-    if levels == 0 and block.bound << record.chroma_shift <= _spec.COLUMN_MAX:
+    if len(block.entries) == 1 and block.summand is None:
+        return  # CBK-7: the entries do
+    if record.levels == 0 and block.bound << record.chroma_shift <= _spec.COLUMN_MAX:
         return
     for start, stop in runs(context.tile.splat_count, 3):
         rows = block.rows(start, stop, _WIDE)
         lows = tuple(int(value) for value in rows.min(axis=1))
         highs = tuple(int(value) for value in rows.max(axis=1))
-        if levels == 0:
-            check_lattice_range(lows, highs, record, block.at)
-        elif attribute == _spec.ATTRIBUTE_OPACITIES:
-            check_level(highs[0], levels, block.at, "LEV-1")
-            if lows[0] < 0:
-                raise FormatError(_spec.ERROR_RANGE, block.at, "LEV-1", "level", found=lows[0], wanted="0 or more")
-        else:
-            check_level(max(*(-low for low in lows), *highs), levels, block.at, "QUA-1")
+        check_integers(lows, highs, record, block.at)

@@ -13,8 +13,7 @@ from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError, UnsupportedError
 
 __all__ = [
-    "check_lattice_range",
-    "check_level",
+    "check_integers",
     "check_step",
     "read_block_head",
     "read_columns",
@@ -87,12 +86,7 @@ def read_columns(
         signed=coding == _spec.CODING_SIGNED,
     )
     block = Columns(elements.reshape(columns, count), offsets, exponent, at)
-    if attribute == _spec.ATTRIBUTE_OPACITIES:
-        check_level(block.highs[0], record.levels, at, "LEV-1")
-    elif attribute == _spec.ATTRIBUTE_QUATS:
-        check_level(block.bound, record.levels, at, "QUA-1")
-    else:
-        check_lattice_range(block.lows, block.highs, record, at)
+    check_integers(block.lows, block.highs, record, at)
     return block
 
 
@@ -125,7 +119,7 @@ def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, co
     at, columns = cursor.at, _spec.ATTRIBUTE_COLUMNS[record.attribute]
     elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[_spec.CODING_SIGNED], signed=True)
     block = Columns(elements.reshape(columns, count), (0,) * columns, exponent, at)
-    check_lattice_range(block.lows, block.highs, record, at)
+    check_integers(block.lows, block.highs, record, at)
     return block
 
 
@@ -146,13 +140,33 @@ def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:
     return offsets
 
 
-def check_level(found: int, levels: int, at: int, clause: str) -> None:
-    """LEV-1, QUA-1: no integer exceeds `levels` in magnitude."""
-    if found > levels:
-        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=found, wanted=f"{levels} at most")
+def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
+    """Check the extremes of columns by LEV-1, QUA-1 or LAT-4, whichever the attribute is under.
+
+    Args:
+        lows: smallest integer of each column.
+        highs: largest integer of each column.
+        record: the attribute.
+        at: byte of the file that is to blame.
+
+    Raises:
+        FormatError: E_RANGE.
+    """
+    if record.attribute == _spec.ATTRIBUTE_OPACITIES:
+        _check_level(lows[0] if lows[0] < 0 else highs[0], 0, record.levels, at, "LEV-1")
+    elif record.attribute == _spec.ATTRIBUTE_QUATS:
+        for found in (min(lows), max(highs)):
+            _check_level(found, -record.levels, record.levels, at, "QUA-1")
+    else:
+        _check_columns(lows, highs, record, at)
 
 
-def check_lattice_range(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
+def _check_level(found: int, low: int, high: int, at: int, clause: str) -> None:
+    if not low <= found <= high:
+        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=found, wanted=f"{low} to {high}")
+
+
+def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
     """LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
     for column, (low, high) in enumerate(zip(lows, highs, strict=True)):
         shift = record.chroma_shift if 3 * column >= len(lows) else 0

@@ -19,6 +19,7 @@ from csplat.errors import FormatError
 
 __all__ = [
     "F32",
+    "check_values",
     "lattice_rows",
     "lift",
     "opacity_table",
@@ -40,7 +41,7 @@ _INT32 = np.dtype(np.int32)
 
 
 def lattice_rows(
-    block: Block, record: _spec.AttributeRecord, count: int, *, check: bool = True
+    block: Block, record: _spec.AttributeRecord, count: int
 ) -> Iterator[tuple[int, int, tuple[Ints, Ints, Ints]]]:
     """Yield runs of lattice integers: start, stop and three arrays [C / 3, stop − start].
 
@@ -50,19 +51,16 @@ def lattice_rows(
         block: of means, scales, sh0 or an SH band.
         record: its attribute.
         count: splats of the block.
-        check: refuse integers whose value is not finite in binary32.
 
     Raises:
-        FormatError: E_RANGE by LAT-5 or MEA-1.
+        FormatError: E_RANGE by LAT-5 or MEA-1: a value is not finite in binary32.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[record.attribute]
     colour = record.mapping == _spec.MAPPING_YCOCG
-    bound = max(1, block.bound)
-    if colour:  # |Y| + 2 (|Co| + |Cg|), shifted, covers R, G, B and all on the way
-        bound += bound << (record.chroma_shift + 2)
+    bound = _bound(block, record)
     dtype = work_dtype(bound)
     step = math.ldexp(record.step, block.exponent)
-    check = check and not np.isfinite(np.float32(min(bound * step, math.inf)))
+    check = not _is_finite(bound, step)
     for start, stop in runs(count, columns):
         rows = block.rows(start, stop, dtype)
         third = columns // 3
@@ -72,6 +70,25 @@ def lattice_rows(
         if check:
             _check_finite(parts, step, record, block.at)
         yield start, stop, parts
+
+
+def check_values(block: Block, record: _spec.AttributeRecord, count: int) -> None:
+    """Raise what `lattice_rows` raises, and do nothing where a look at the bound is enough."""
+    if not _is_finite(_bound(block, record), math.ldexp(record.step, block.exponent)):
+        for _ in lattice_rows(block, record, count):
+            pass
+
+
+def _bound(block: Block, record: _spec.AttributeRecord) -> int:
+    """Largest magnitude of a lattice integer of the block, and of all on the way to it."""
+    bound = max(1, block.bound)
+    if record.mapping == _spec.MAPPING_YCOCG:  # |Y| + 2 (|Co| + |Cg|), shifted, covers R, G, B
+        bound += bound << (record.chroma_shift + 2)
+    return bound
+
+
+def _is_finite(integer: int, step: float) -> bool:
+    return bool(np.isfinite(np.float32(min(integer * step, math.inf))))
 
 
 def lift(y: Ints, co: Ints, cg: Ints, chroma_shift: int) -> tuple[Ints, Ints, Ints]:
@@ -108,10 +125,10 @@ def write_lattice(block: Block, record: _spec.AttributeRecord, out: F32) -> int:
     return max(block.highs) if isinstance(block, Columns) else max(largest)
 
 
-def write_colour(block: Block, record: _spec.AttributeRecord, out: F32, *, check: bool = True) -> None:
+def write_colour(block: Block, record: _spec.AttributeRecord, out: F32) -> None:
     """Write coefficients of one band, [n, 2 l + 1, 3]."""
     step = math.ldexp(record.step, block.exponent)
-    for start, stop, parts in lattice_rows(block, record, len(out), check=check):
+    for start, stop, parts in lattice_rows(block, record, len(out)):
         for channel, part in enumerate(parts):
             for coefficient, row in enumerate(part):
                 _scale(row, step, out[start:stop, coefficient, channel])
@@ -152,10 +169,6 @@ def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRe
     if not all(isinstance(block, Coded) and block.indices is indices for block in blocks.values()):
         return False
     np.take(values, indices.stages[0], axis=0, out=out, mode="clip")
-    if not indices.book.values_finite:
-        used = np.delete(out, indices.escaped, axis=0)
-        if not np.isfinite(used).all():
-            raise FormatError(_spec.ERROR_RANGE, first.at, "LAT-5", "an entry's value is not finite in binary32")
     return True
 
 

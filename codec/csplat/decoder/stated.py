@@ -21,7 +21,7 @@ _COMPONENTS = {
     _spec.MEASURE_SH2: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH2],
     _spec.MEASURE_SH3: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH3],
 }
-_SLACK = 1.0 + 2.0**-20  # SER-2: room for the rounding of both numbers
+_SLACK = 1.0 + 2.0**-20  # SER-2: room for the rounding of both numbers; the product from left to right
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,9 @@ async function decoded(bytes, limits = {}) {
   return { header: facts, arrays };
 }
 
+/** @param {string} character of ASCII */
+const encodeByte = (character) => `%${character.charCodeAt(0).toString(16).toUpperCase()}`;
+
 /** What a refusal says, by the protocol. Another error is a defect of the decoder. @param {unknown} error */
 function refusal(error) {
   if (!(error instanceof CsplatError)) throw error;
@@ -62,7 +65,7 @@ async function once(input, outdir) {
     writeFileSync(join(outdir, 'header.json'), JSON.stringify(header));
     for (const [key, array] of arrays) {
       const dot = key.indexOf('.');
-      const name = encodeURIComponent(key.slice(dot + 1));
+      const name = encodeURIComponent(key.slice(dot + 1)).replace(/[!'()*]/g, encodeByte);
       writeFileSync(join(outdir, `${key.slice(0, dot)}.${name}.bin`), raw(array));
     }
   } catch (error) {

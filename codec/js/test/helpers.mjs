@@ -67,7 +67,8 @@ export function forged(file, change) {
  *
  * @param {import('node:test').TestContext} test
  * @param {Uint8Array} file
- * @param {{ranges?: boolean, sent?: Uint8Array}} [options] `sent` is sent whole in place of the file
+ * @param {{ranges?: boolean | number, sent?: Uint8Array}} [options] `ranges` of a number: so many requests are answered by
+ *   ranges; `sent` is sent whole in place of the file
  * @returns {Promise<{url: string, requests: string[]}>} `requests` collects the ranges that are asked for
  */
 export async function serve(test, file, { ranges = true, sent = file } = {}) {
@@ -76,7 +77,7 @@ export async function serve(test, file, { ranges = true, sent = file } = {}) {
     const range = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '');
     requests.push(request.headers.range ?? 'all');
     if (request.url !== '/scene.csplat') return response.writeHead(404).end('no');
-    if (!ranges || !range) return response.writeHead(200).end(sent);
+    if (!range || requests.length > Number(ranges === true ? Infinity : ranges)) return response.writeHead(200).end(sent);
     const [start, end] = [Number(range[1]), Math.min(Number(range[2]) + 1, file.length)];
     if (start >= file.length) return response.writeHead(416).end();
     response.writeHead(206, { 'Content-Range': `bytes ${start}-${end - 1}/${file.length}`, ETag: '"1"' });

@@ -123,18 +123,35 @@ test('a server without ranges sends the whole file, whose digest is then checked
   const reader = await CsplatReader.open(url, { onProgress: (...progress) => received.push(progress) });
   assert.equal(hash((await reader.readTile(0)).shN), hash((await decode(seeded)).shN));
   assert.equal(requests.length, 1);
-  await reader.source.complete;
-  while (!reader.checks.digest) await new Promise((resolve) => setTimeout(resolve, 1));
+  assert.equal((await reader.finish()).digest, true);
   assert.equal(received.at(-1)[0], seeded.length);
 });
 
-test('a server without ranges and a wrong digest', async (t) => {
+test('of a file that comes whole, finish tells a wrong digest, and nothing more is read (HDR-12)', async (t) => {
   const { url } = await serve(t, vector('invalid/digest'), { ranges: false });
   const reader = await CsplatReader.open(url);
-  await reader.source.complete;
-  await new Promise((resolve) => setTimeout(resolve, 50));
+  assert.equal((await refusal(() => reader.finish())).code, 'E_DIGEST');
   assert.equal((await refusal(() => reader.readTile(0))).code, 'E_DIGEST');
   assert.equal(reader.checks.digest, false);
+});
+
+test('so does a server that honours ranges at first and then sends the whole file', async (t) => {
+  for (const [name, file] of [
+    ['E_DIGEST', vector('invalid/digest')],
+    [null, seeded],
+  ]) {
+    const { url, requests } = await serve(t, file, { ranges: 2 });
+    const reader = await CsplatReader.open(url, { firstBytes: 64 });
+    await reader.readTile(0);
+    assert.ok(requests.length > 2);
+    if (name) assert.equal((await refusal(() => reader.finish())).code, name);
+    else assert.equal((await reader.finish()).digest, true);
+  }
+});
+
+test('of a file that comes in parts finish waits for nothing', async (t) => {
+  const { url } = await serve(t, seeded);
+  assert.equal((await (await CsplatReader.open(url)).finish()).digest, false);
 });
 
 test('files cut short and files too long, with and without ranges', async (t) => {

@@ -241,6 +241,7 @@ def _tiles() -> list[Recipe]:
     full |= {SH0 + 1: sparse((1,) * n, [[5] * 9] * n, mask_how=Stream(1, _RUNS))}
     many = [tile(k, 1, k % 2, corner=(k, -k, 2 * k), exponent=k % 5 - 2) for k in range(24)]
     extras = tuple(Extra("x" * _spec.EXTRA_NAME_MAX if i == 0 else f"é{i}", _spec.EXTRA_DTYPE_U8) for i in range(9))
+    alike = tuple(Extra(name, _spec.EXTRA_DTYPE_U8) for name in ("é", "e\u0301", "a", "\ufeffa", "%61", "a ", "(a)"))
     raws = tuple(Block(_spec.CODING_RAW, [[i], [255 - i]]) for i in range(9))
     return [
         _recipe(
@@ -255,5 +256,11 @@ def _tiles() -> list[Recipe]:
             "a name of 62 bytes, names beyond ASCII, nine columns",
             "EXR-1 EXR-2",
             scene(tiles=[tile(extras=raws)], extras=extras),
+        ),
+        _recipe(
+            "extra_names_alike",
+            "names that only a decoder which normalises, strips a mark or decodes percents takes for the same",
+            "EXR-2",
+            scene(tiles=[tile(extras=raws[: len(alike)])], extras=alike),
         ),
     ]

@@ -58,9 +58,22 @@ def _codebooks() -> list[Recipe]:
         SCALES: book(9, ((2, 0, 1),), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
         QUATS: book(9, (), signed([[4, 5, 6]])),
     }
-    wild = Codebook(8, _spec.CODEBOOK_KIND_SH0, ({0: [[1, -2, 3], [2**30, 0, -(2**31)]]},), how=Stream(4))
-    far_sh = Codebook(8, _spec.CODEBOOK_KIND_SH, ({1: [[1, -2, 3] * 3, [2**30, 0, -(2**31)] * 3]},), (1, 1), Stream(4))
-    bands = {SH0 + 1: book(8, ((0, 2, 0),), signed([[5, -6, 7] * 3]))}
+    entries = ([[1, -2, 3], [2**30, 0, -(2**31)]], [[4, 5, 6], [0, 2**31 - 1, 0]])
+    wild = Codebook(8, _spec.CODEBOOK_KIND_SH0, tuple({0: stage} for stage in entries), how=Stream(4))
+    thrice = tuple({1: [entry * 3 for entry in stage]} for stage in entries)
+    far_sh = Codebook(8, _spec.CODEBOOK_KIND_SH, thrice, (1, 1), Stream(4))
+    bands = {SH0 + 1: book(8, ((0, 2, 0), (0, 0, 0)), signed([[5, -6, 7] * 3]))}
+    largest = _spec.COLUMN_MAX
+    at_bounds = (
+        Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[9], [0], [255]]},)),
+        Codebook(2, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3], [127, -127, 0], [0, 127, 127]]},)),
+        Codebook(3, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [largest, 0, -largest]]},), how=Stream(4)),
+    )
+    ids = {OPACITIES: 1, QUATS: 2, SH0: 3}
+    shifted = Codebook(
+        1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]},), how=Stream(4)
+    )
+    back = {SCALES: book(1, ((0, 0, 0),), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: book(1)}
     return [
         _recipe(
             "codebook_of_65536",
@@ -100,15 +113,32 @@ def _codebooks() -> list[Recipe]:
         ),
         _recipe(
             "codebook_unused_entries",
-            "entries beyond every limit that no splat uses",
+            "entries of two stages beyond every limit that no splat uses",
             "CBK-6 LAT-5",
-            replace(_with({SH0: book(8, ((0, 0, 0),))}, records={SH0: _lattice(2.0**100)}), codebooks=(wild,)),
+            replace(
+                _with({SH0: book(8, ((0, 0, 0), (0, 0, 0)))}, records={SH0: _lattice(2.0**100)}), codebooks=(wild,)
+            ),
         ),
         _recipe(
             "codebook_unused_entries_sh",
             "the same in an SH codebook, whose last entry stands where the escaped splat has none",
             "CBK-6 LAT-5",
             replace(_with(bands, records={SH0 + 1: _lattice(2.0**100)}), codebooks=(far_sh,), sh_degree=1),
+        ),
+        _recipe(
+            "codebook_entries_at_bounds",
+            "levels, rotations and colours that no splat uses and that are just allowed",
+            "CBK-7",
+            replace(
+                _with({a: book(id, ((0, 0, 0),)) for a, id in ids.items()}, records={SH0: _lattice(2.0**105)}),
+                codebooks=at_bounds,
+            ),
+        ),
+        _recipe(
+            "codebook_scales_before_summand",
+            "scales of shapes beyond binary32, which the summands bring back",
+            "CBK-7 CBK-6",
+            replace(_with(back, records={SCALES: _lattice(2.0**106)}), codebooks=(shifted,)),
         ),
         _recipe(
             "codebook_negative_entries",

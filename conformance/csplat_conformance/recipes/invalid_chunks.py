@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from csplat import _spec
@@ -18,6 +19,8 @@ from csplat_conformance.scene import Chunk, Scene, StatedErrors, Stream
 __all__ = ["chunk_recipes"]
 
 _NAN, _INF = float("nan"), float("inf")
+_LARGEST = 0.0048828125
+_RMS = math.nextafter(_LARGEST * math.sqrt(3.0) * (1.0 + 2.0**-20), 1.0)
 _KNOWN = _spec.CHUNK_FLAG_CRITICAL
 
 
@@ -210,12 +213,13 @@ def _texts() -> list[Recipe]:
             "E_JSON",
             scene(chunks=(Chunk(meta, text),)),
             "META/stream.width",
-            optional=True,
         )
         for name, (text, why) in bad.items()
     ]
     cameras = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"{}"),))
     numbers = scene(chunks=(Chunk(_spec.CHUNK_CAMERAS, b"[{},1]"),))
+    options = scene(chunks=(Chunk(_spec.CHUNK_OPTIONS, b"[]"),))
+    garbage = scene(chunks=(Chunk(meta, b"{}", Stream(1, coder="deflate", coded=b"\xff\xff")),))
     tail = scene(chunks=(Chunk(meta, b"{}", tail=b"\0"),))
     runs = 1024  # of 65,536 spaces: beyond the default budget, and 3 kB in the file
     values = b"{}" + b" " * runs
@@ -226,12 +230,10 @@ def _texts() -> list[Recipe]:
     record = "SERR/record[means]"
     return [
         *result,
-        whole(
-            "json_cameras_object", "an object in CAMS", "JSN-1", "E_JSON", cameras, "CAMS/stream.width", optional=True
-        ),
-        whole(
-            "json_cameras_number", "a number in CAMS", "JSN-1", "E_JSON", numbers, "CAMS/stream.width", optional=True
-        ),
+        whole("json_cameras_object", "an object in CAMS", "JSN-1", "E_JSON", cameras, "CAMS/stream.width"),
+        whole("json_cameras_number", "a number in CAMS", "JSN-1", "E_JSON", numbers, "CAMS/stream.width"),
+        whole("json_options_array", "an array in OPTS", "JSN-1", "E_JSON", options, "OPTS/stream.width"),
+        whole("json_coded_garbage", "a text of damaged bytes", "COD-2", "E_CODER", garbage, "META/stream.coded"),
         whole("json_tail", "a byte after the stream", "JSN-2", "E_STREAM", tail, "META/tail"),
         patched(
             "json_beyond_budget",
@@ -251,6 +253,15 @@ def _texts() -> list[Recipe]:
             base,
             {f"{record}.rms": 0.75},
             at="SERR/record[means].max",
+        ),
+        patched(
+            "error_rms_next_above",
+            "rms next above its bound, which two other orders of the product would let pass",
+            "SER-2 NUM-1",
+            "E_VALUE",
+            base,
+            {f"{record}.measure": _spec.MEASURE_SH0, f"{record}.max": _LARGEST, f"{record}.rms": _RMS},
+            at=f"{record}.max",
         ),
         patched(
             "error_records_missing",

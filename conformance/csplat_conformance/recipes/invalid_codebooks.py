@@ -29,7 +29,7 @@ __all__ = ["codebook_recipes"]
 
 def codebook_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_codebooks()]
+    return [*_codebooks(), *_unused_entries()]
 
 
 def _codebooks() -> list[Recipe]:
@@ -170,15 +170,15 @@ def _codebooks() -> list[Recipe]:
         whole(
             "codebook_value_beyond_float32",
             "an entry whose value leaves binary32",
-            "LAT-5 CBK-6",
+            "LAT-5 CBK-7",
             "E_RANGE",
             replace(sh0(book(1, ((0, 1),)), large), attributes=attributes() | {SH0: far}),
-            "TILE.0.0/sh0.attribute",
+            "CODB.1.0/stage[0].width",
         ),
         whole(
             "codebook_sh_value_beyond_float32",
             "the same in an SH codebook of one stage, whose values a decoder may compute once for all tiles",
-            "LAT-5 CBK-6",
+            "LAT-5 CBK-7",
             "E_RANGE",
             scene(
                 1,
@@ -186,7 +186,7 @@ def _codebooks() -> list[Recipe]:
                 codebooks=(large_sh,),
                 attributes=attributes(1) | {sh_attribute(1): far},
             ),
-            "TILE.0.1/sh1.attribute",
+            "CODB.1.1/stage[0].width",
         ),
         whole(
             "codebook_value_in_stages",
@@ -225,6 +225,62 @@ def _codebooks() -> list[Recipe]:
             "TILE.0.0/scales.attribute",
         ),
     ]
+
+
+def _unused_entries() -> list[Recipe]:
+    """CBK-7: of each kind an entry out of bounds that no splat uses; the first one all splats use."""
+    far = 2.0**107  # 2^21 steps of it are beyond binary32
+    four = Stream(4)
+    kinds = {
+        "opacity": ("a level above M", "LEV-1", _spec.CODEBOOK_KIND_OPACITIES, OPACITIES, [[3], [300]]),
+        "opacity_negative": ("a level below 0", "LEV-1", _spec.CODEBOOK_KIND_OPACITIES, OPACITIES, [[3], [-1]]),
+        "scale": ("scales", "LAT-5", _spec.CODEBOOK_KIND_SCALES, SCALES, [[-3, 2, 1], [0, 0, -(2**21)]]),
+        "quat": ("a component beyond M", "QUA-1", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [0, -128, 0]]),
+        "quat_radicand": ("R below 0", "QUA-2", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [127, 1, 127]]),
+        "sh0": ("a colour", "LAT-5", _spec.CODEBOOK_KIND_SH0, SH0, [[1, 2, 3], [0, 2**21, 0]]),
+        "sh0_integer": ("2^22 + 1", "LAT-4", _spec.CODEBOOK_KIND_SH0, SH0, [[1, 2, 3], [0, 0, 2**22 + 1]]),
+    }
+    result = []
+    for name, (why, clause, kind, attribute, entries) in kinds.items():
+        made = scene(
+            tiles=[tile(changes={attribute: book(1, ((0, 0),))})],
+            codebooks=(Codebook(1, kind, ({0: entries},), how=four),),
+        )
+        if clause == "LAT-5":
+            made = replace(made, attributes=attributes() | {attribute: Attribute(_spec.MAPPING_LATTICE, far)})
+        result.append(_unused(name, why, clause, made, "CODB.1.0"))
+    shape = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[1, 2, 3, 4, 5, 6], [1, 2, 3, 127, 127, -1]]},))
+    shapes = tile(changes={SCALES: book(1, ((0, 0),), summands=(5, 6)), QUATS: book(1)})
+    second = sh_attribute(2)
+    lifted = [2 * 10**6] * 5 + [1, 15 * 10**5, 1, 1, 1] + [0] * 5  # red is 2 750 000 in the second coefficient
+    bands = ({1: [[1] * 9, [2] * 9], 2: [[1] * 15, lifted]},)
+    colours = scene(
+        2,
+        [tile(degree=2, changes={sh_attribute(1): book(1, ((0, 0),)), second: book(1)})],
+        codebooks=(Codebook(1, _spec.CODEBOOK_KIND_SH, bands, (1, 2), four),),
+        attributes=attributes(2, ycocg=True) | {second: Attribute(_spec.MAPPING_YCOCG, far)},
+    )
+    unnamed = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[127, 127, 127]]},))
+    return [
+        *result,
+        _unused(
+            "shape", "a rotation whose R is below 0", "QUA-2", scene(tiles=[shapes], codebooks=(shape,)), "CODB.1.0"
+        ),
+        _unused("sh", "a colour that only the lifting takes there", "LAT-5", colours, "CODB.1.2"),
+        whole(
+            "codebook_unnamed_entry",
+            "an entry out of bounds of a codebook that no tile names",
+            "QUA-2 CBK-7 CHK-2",
+            "E_RANGE",
+            scene(codebooks=(unnamed,)),
+            "CODB.1.0/stage[0].width",
+        ),
+    ]
+
+
+def _unused(name: str, why: str, clause: str, made: Scene, chunk: str) -> Recipe:
+    words = f"an entry that no splat uses: {why}" + (" beyond binary32" if clause == "LAT-5" else "")
+    return whole(f"codebook_unused_{name}", words, f"{clause} CBK-7", "E_RANGE", made, f"{chunk}/stage[0].width")
 
 
 def _without_first(made: Scene) -> Scene:

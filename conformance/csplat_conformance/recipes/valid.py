@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -250,6 +251,14 @@ def _files() -> list[Recipe]:
     text = '{"title":"\\u00e9 é","comments":["a","b"],"n":[1,2.5e3,null,true,{}]}'.encode()
     camera = b'[{"K":[[9,0,4],[0,9,3],[0,0,1]],"viewmat":[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"W":8,"H":6}]'
     stated = StatedErrors(9, 7, 4, _spec.ERROR_FLAG_REFITTED, tuple((m, 0.5, 0.25) for m in _spec.MEASURE_NAMES))
+    bounds = tuple(
+        (measure, largest, largest * math.sqrt(components) * (1.0 + 2.0**-20))
+        for measure, components, largest in (
+            (_spec.MEASURE_SH0, 3, 0.1845703125),
+            (_spec.MEASURE_SH2, 15, 0.0029296875),
+            (_spec.MEASURE_SH3, 21, 0.0029296875),
+        )
+    )
     return [
         _recipe("two_tiles", "tiles with corners and exponents of their own", "TIL-7 TIL-9 IDX-7", two),
         _recipe(
@@ -294,6 +303,12 @@ def _files() -> list[Recipe]:
             "every measure, a source of degree 4, a flag",
             "SER-1 SER-2 SER-3 SER-4",
             scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=stated),)),
+        ),
+        _recipe(
+            "stated_errors_at_bound",
+            "rms as large as it may be; two other orders of the product bound it more tightly",
+            "SER-2 NUM-1",
+            scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(2, 0, 3, 0, bounds)),)),
         ),
         _recipe(
             "unknown_chunks",

@@ -6,10 +6,11 @@ import numpy as np
 
 from csplat import _spec
 from csplat_conformance.validator.chunks import Chunk
+from csplat_conformance.validator.findings import Findings
 from csplat_conformance.validator.index import CodebookAt, Index
 from csplat_conformance.validator.reading import Payload
 from csplat_conformance.validator.streams import read_stream
-from csplat_conformance.validator.values import I64
+from csplat_conformance.validator.values import I64, Place, check_integers
 
 __all__ = ["Entries", "attribute_columns", "first_attribute", "read_codebook"]
 
@@ -74,5 +75,22 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, entries: Entries
     for i, size in enumerate(book.record.sizes[: book.record.stage_count]):
         stream = read_stream(payload, f"stage[{i}]", size * columns, _WIDTH_MAX, signed=True)
         table = None if stream.elements is None else stream.elements.astype(np.int64).reshape(columns, size).T
+        if table is not None and book.record.stage_count == 1:
+            where = (stream.head.offset, f"{payload.name}/stage[{i}]")
+            if not _check_entries(findings, index, book, of_layer, table, where):
+                table = None  # what splats make of it would be told once more for each tile
         entries.append(table)
     payload.finish()
+
+
+def _check_entries(
+    findings: Findings, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
+) -> bool:
+    """CBK-7: entries of one stage, used or not; but for scales to which a summand comes."""
+    sound = True
+    for attribute in attributes:
+        columns = attribute_columns(book, attribute)
+        if columns is None or (book.record.kind, attribute) == (_spec.CODEBOOK_KIND_SHAPE, _spec.ATTRIBUTE_SCALES):
+            continue
+        sound &= check_integers(findings, index, attribute, table[:, columns].T, 0, where)
+    return sound

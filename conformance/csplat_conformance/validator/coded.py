@@ -137,7 +137,8 @@ def _read_summands(reader: TileReader, payload: Payload, name: str, attribute: i
     """The common summand of the kind SHAPE: LAT-2, LAT-3; [n]."""
     _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
     offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
-    stream = read_stream(payload, f"{name}.summand.stream", reader.tile.count, _WIDTH_MAX)
+    width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
+    stream = read_stream(payload, f"{name}.summand.stream", reader.tile.count, width_max)
     if stream.elements is None or not (sound and sane):
         return None
     summands: I64 = stream.elements.astype(np.int64) + offsets[0]
