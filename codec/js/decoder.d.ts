@@ -68,6 +68,8 @@ export interface ByteRange {
 export interface ChunkPlace extends ByteRange {
   type: string;
   flags: number;
+  /** CRC-32 of its bytes. */
+  crc: number;
   offsetField: number;
   sizeField: number;
 }
@@ -143,12 +145,11 @@ export interface Description {
   statedErrors: StatedErrors | null;
 }
 
-/** Which checks were made: CRCs of header, index and so many chunks, and the SHA-256 of the file. */
+/** Which CRCs were checked: those of header, index and so many chunks. */
 export interface Checks {
   header: boolean;
   index: boolean;
   chunks: number;
-  digest: boolean;
 }
 
 export type ExtraArray =
@@ -343,7 +344,6 @@ export type ErrorCode =
   | 'E_TRUNCATED'
   | 'E_TRAILING'
   | 'E_CRC'
-  | 'E_DIGEST'
   | 'E_RESERVED'
   | 'E_VALUE'
   | 'E_INDEX'

@@ -4,7 +4,7 @@ import { describe, emptyDescription } from './ancillary.mjs';
 import { arrayBytes, bandArray } from './arrays.mjs';
 import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
-import { checkDigest, checkFileSize, openChunk, readFileHeader } from './container.mjs';
+import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
@@ -13,7 +13,6 @@ import { packLayer } from './packed.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
-import { WholeSource } from './whole.mjs';
 
 const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
 
@@ -29,11 +28,10 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./codebooks.mjs').Table} Table
- * @typedef {import('./container.mjs').FileHeader} FileHeader
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 
-/** Reads parts of a file. Each part's CRC is checked; the digest only where the whole file comes anyway. */
+/** Reads parts of a file, and checks the CRC of each. */
 export class CsplatReader {
   /**
    * Open a file: one request for header and index of all but huge files.
@@ -58,9 +56,7 @@ export class CsplatReader {
     if (known !== Infinity) checkFileSize(known, file);
     progress.fileSize = file.fileSize;
     const header = readIndex(await source.read(spec.HEADER_SIZE, file.indexSize, signal), file, limits);
-    const reader = new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
-    if (source instanceof WholeSource) reader.checkWhole(source, file);
-    return reader;
+    return new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
   }
 
   /**
@@ -75,7 +71,7 @@ export class CsplatReader {
     this.limits = limits;
     this.inflate = inflate;
     /** What has been checked so far; `chunks` counts. */
-    this.checks = { header: true, index: true, chunks: 0, digest: false };
+    this.checks = { header: true, index: true, chunks: 0 };
     /** How long reads have waited for bytes so far, each for itself. */
     this.waitedMs = 0;
     this.codebooks = codebooksById(header.codebooks);
@@ -265,18 +261,5 @@ export class CsplatReader {
       if (codebook === undefined || codebook.bandFirst === codebook.bandLast) tile.indices.delete(id);
     }
     if (tile.indices.size === 0) this.open.delete(tile.record.index);
-  }
-
-  /**
-   * Check the digest of a file that came whole, once it is here; after a failure nothing more is read.
-   *
-   * @param {WholeSource} source
-   * @param {FileHeader} file
-   */
-  checkWhole(source, file) {
-    source.complete
-      .then(() => checkDigest(source.bytes, file))
-      .then(() => (this.checks.digest = true))
-      .catch((error) => source.fail(error));
   }
 }

@@ -12,7 +12,6 @@ __all__ = ["EXCUSES", "clause_ids", "clause_map", "replaced"]
 
 #: Clauses that no vector covers: the reason, or the test that covers them.
 EXCUSES: Final = {
-    "HDR-10": "about readers of parts; a CRC that fails is `invalid/index_crc`, `invalid/chunk_crc`",
     "CHK-5": "about editors, which change files rather than read them",
     "JSN-3": "a permission; the vectors of JSN-1 are marked optional",
     "SER-5": "about what an encoder states, which needs the source: `tests/test_proof.py`, `tests/test_validator.py`",

@@ -3,9 +3,10 @@
 import { createHash } from 'node:crypto';
 import { readFileSync } from 'node:fs';
 import { createServer } from 'node:http';
-import { crc32 } from '../checksums.mjs';
+import { CRC_SIZE, crc32 } from '../checksums.mjs';
 import { CsplatError, readHeader } from '../decoder.mjs';
 import { streamInflate } from '../inflate.mjs';
+import { DIRECTORY_RECORD_OFFSETS, HEADER_OFFSETS, HEADER_SIZE, LAYER_RECORD_OFFSETS } from '../spec.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 
@@ -53,12 +54,13 @@ export function forged(file, change) {
   const bytes = file.slice();
   const view = new DataView(bytes.buffer);
   change(bytes, view);
-  const seal = (start, end) => view.setUint32(end, crc32(bytes.subarray(start, end)), true);
-  seal(0, 28);
-  seal(64, 64 + indexSize - 4);
-  for (const { offset, size } of [...directory, ...tiles.flatMap((tile) => tile.layers)])
-    seal(offset, offset + size - 4);
-  bytes.set(createHash('sha256').update(bytes.subarray(0, 32)).update(bytes.subarray(64)).digest(), 32);
+  const seal = (start, end, at = end) => view.setUint32(at, crc32(bytes.subarray(start, end)), true);
+  seal(0, HEADER_OFFSETS.header_crc);
+  const [toCrc, layerToCrc] = [DIRECTORY_RECORD_OFFSETS, LAYER_RECORD_OFFSETS].map(({ crc, offset }) => crc - offset);
+  for (const { offset, size, offsetField } of directory) seal(offset, offset + size, offsetField + toCrc);
+  for (const { offset, size, offsetField } of tiles.flatMap((tile) => tile.layers))
+    seal(offset, offset + size, offsetField + layerToCrc);
+  seal(HEADER_SIZE, HEADER_SIZE + indexSize - CRC_SIZE);
   return bytes;
 }
 
