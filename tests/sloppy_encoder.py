@@ -10,7 +10,6 @@ bytes that are written, or in how the program ends. Checksums are made right aga
 
 import contextlib
 import dataclasses
-import hashlib
 import os
 import shlex
 import struct
@@ -130,12 +129,8 @@ def reversed_transforms(pack):
     return run
 
 
-def payload_crc(frame):
-    def run(chunk, flags):
-        framed = frame(chunk, flags)
-        return framed[:-4] + zlib.crc32(chunk.payload).to_bytes(4, "little")
-
-    return run
+def payload_crc(_crc):
+    return lambda _head, payload: zlib.crc32(payload)
 
 
 # Bytes of the file ---------------------------------------------------------------------------------
@@ -209,11 +204,10 @@ def swapped_layers(data: bytes) -> bytes:
     return dataclasses.replace(built, data=bytes(out)).patched({})
 
 
-def whole_digest(data: bytes) -> bytes:
-    """Hash the file with its digest field as zeros."""
-    start = _spec.HEADER_OFFSETS["digest"]
-    blank = data[:start] + bytes(32) + data[_spec.HEADER_SIZE :]
-    return data[:start] + hashlib.sha256(blank).digest() + data[_spec.HEADER_SIZE :]
+def crc_from_the_start(data: bytes) -> bytes:
+    """Let the CRC of the index cover the header too."""
+    at = _spec.HEADER_SIZE + _spec.unpack_header(data).index_size - 4
+    return data[:at] + zlib.crc32(data[:at]).to_bytes(4, "little") + data[at + 4 :]
 
 
 def relative_offsets(data: bytes) -> bytes:
@@ -311,7 +305,7 @@ MISTAKES = {
         stage=replaced(_spec, "pack_stream_head", reversed_transforms),
     ),
     "crc_of_payload": Mistake(
-        "a chunk's CRC is that of its payload", ("L1", "CHK-1"), stage=replaced(container, "_frame", payload_crc)
+        "a chunk's CRC is that of its payload", ("L1", "CHK-1"), stage=replaced(container, "_crc", payload_crc)
     ),
     "no_tile_limit": Mistake(
         "a tile may have any number of splats",
@@ -321,7 +315,9 @@ MISTAKES = {
         options={"means_coding": "axis"},
     ),
     # bytes
-    "digest_with_zeros": Mistake("the digest's field is hashed as zeros", ("L1", "HDR-8"), data=whole_digest),
+    "index_crc_of_header": Mistake(
+        "the CRC of the index begins with the header", ("L1", "IDX-1"), data=crc_from_the_start
+    ),
     "layers_swapped": Mistake("layers come in any order", ("L1", "TIL-2"), data=swapped_layers),
     "offsets_from_index": Mistake("offsets count from the end of the index", ("L1", "COV-1"), data=relative_offsets),
     "box_one_too_large": Mistake(

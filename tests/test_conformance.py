@@ -122,7 +122,7 @@ def test_a_file_beyond_the_byte_budget_is_refused():
 @by_name(
     [
         named(f"invalid/{name}")
-        for name in ("digest", "chunk_crc", "metadata_crc", "stated_errors_crc", "unknown_chunk_crc")
+        for name in ("index_crc", "chunk_crc", "metadata_crc", "stated_errors_crc", "unknown_chunk_crc")
     ]
 )
 def test_every_way_of_decoding_checks_the_whole_file(vector):

@@ -46,7 +46,7 @@ def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector():
     # CHK-6: frame and CRC of these chunks are looked at all the same.
     def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):
         if record := header.chunk(kind):
-            open_chunk(view, record.offset, record.size, record.type, record.flags, "CHK-6")
+            open_chunk(view, record, record.type, record.flags, "CHK-6")
 
     def apply(stack):
         for name in ("read_json", "read_serr"):

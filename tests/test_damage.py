@@ -3,9 +3,11 @@
 import pytest
 
 import csplat
+from csplat import _spec
+from csplat.decoder import read_header
 from csplat_conformance.builder import build
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.repair import repair, seal
+from csplat_conformance.repair import chunk_records, repair
 from csplat_conformance.samples import rich_scene
 
 SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
@@ -22,7 +24,7 @@ def test_every_prefix_is_refused_as_truncated(data):
 
 
 def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
-    for size in range(64, len(SMALL)):
+    for size in range(_spec.HEADER_SIZE, len(SMALL)):
         cut = bytearray(SMALL[:size])
         cut[20:28] = size.to_bytes(8, "little")
         with pytest.raises(csplat.CsplatError):
@@ -39,21 +41,34 @@ def test_every_flipped_bit_is_refused(data, stride):
             csplat.decode(bytes(damaged))
 
 
-def test_every_flipped_bit_behind_the_header_is_refused_by_a_crc_when_the_digest_is_repaired():
-    for bit in range(8 * 64, 8 * len(SMALL)):
+def test_every_flipped_bit_behind_magic_and_version_is_refused_by_a_crc():
+    # HDR-12
+    for bit in range(8 * _spec.HEADER_OFFSETS["profile"], 8 * len(SMALL)):
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
         with pytest.raises(csplat.FormatError) as caught:
-            csplat.decode(seal(damaged))
-        assert caught.value.code in ("E_CRC", "E_INDEX")
+            csplat.decode(bytes(damaged))
+        assert "E_CRC" == caught.value.code
+
+
+def test_every_flipped_bit_of_a_part_is_refused_by_who_reads_that_part_alone():
+    # HDR-12
+    layer = read_header(SMALL).tiles[0].layers[0]
+    for bit in range(8 * layer.offset, 8 * (layer.offset + layer.size)):
+        damaged = bytearray(SMALL)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(csplat.FormatError) as caught:
+            csplat.decode(damaged, tiles=[0], sh_degree=0)
+        assert ("E_CRC", layer.offset, "CHK-1") == (caught.value.code, caught.value.offset, caught.value.clause)
 
 
 def test_every_flipped_bit_with_all_checksums_repaired_is_refused_or_decoded():
+    records = chunk_records(SMALL)
     for bit in range(8 * len(SMALL)):
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
         try:
-            model = csplat.decode(repair(bytes(damaged)))
+            model = csplat.decode(repair(bytes(damaged), records))
         except csplat.CsplatError:
             continue
         assert 2 == len(model)

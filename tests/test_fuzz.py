@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from csplat import decoder
+from csplat import _spec, decoder
 from csplat.errors import FormatError, InputError
 from csplat_conformance import node, validator
 from csplat_conformance.answers import Answer
@@ -24,7 +24,7 @@ from csplat_conformance.fuzzing.ply_mutants import Ply
 from csplat_conformance.fuzzing.targets import DecoderTarget, JsTarget, compared
 from csplat_conformance.fuzzing.validating import ValidatorTarget
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.mutate import mapped, mutant
+from csplat_conformance.mutate import mapped, mutant_of
 from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 from csplat_conformance.samples import rich_scene
@@ -72,10 +72,11 @@ def test_cases_are_the_same_for_a_seed():
 
 
 def test_most_mutants_have_sound_checksums():
-    mutants = [mutant(random.Random(number), BASES) for number in range(300)]  # noqa: S311 - no secret
+    base = BASES[0]
+    mutants = [mutant_of(random.Random(number), base, BASES) for number in range(300)]  # noqa: S311 - no secret
 
-    assert sum(repaired for _, repaired in mutants) > 240
-    assert all(data == repair(data) for data, repaired in mutants if repaired)
+    assert sum(repaired for _, repaired, _ in mutants) > 240
+    assert all(data == repair(data, base.records) for data, repaired, _ in mutants if repaired)
 
 
 def test_mutants_reach_the_streams():
@@ -152,12 +153,12 @@ def test_a_finding_is_made_smaller(monkeypatch):
     damaged = bytearray(base)
     damaged[at] = 9
     damaged[at + 30] ^= 255
-    data = repair(bytes(damaged))
+    data = repair(bytes(damaged), BASES[0].records)
 
     small = fuzz.minimised(DecoderTarget(), data, attempt(data)[1], BASES)
 
     crc = BASES[0].fields["index.crc"].offset
-    sums = {*range(64), *range(crc, crc + 4)}
+    sums = {*range(_spec.HEADER_SIZE), *range(crc, crc + 4)}
     assert [at] == [i for i in range(len(base)) if small[i] != base[i] and i not in sums]
 
 

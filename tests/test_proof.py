@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from csplat import _spec
 from csplat.decoder import decode_scene, read_header
 from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.encoder.measure import measure_errors
@@ -264,11 +265,11 @@ def test_a_description_accounts_for_every_byte(make_model, options):
     sizes = sum(one["size_bytes"] for one in described["attributes"].values())
     assert sizes + sum(described["overhead"].values()) == len(data)
     header = read_header(data)
-    frames = sum(len(tile.layers) for tile in header.tiles) * (12 + 8 + 4)
+    frames = sum(len(tile.layers) for tile in header.tiles) * (_spec.CHUNK_HEADER_SIZE + _spec.TILE_HEAD_SIZE)
     assert described["overhead"]["tile_frames"] == frames
     layers = sum(one["size_bytes"] for one in described["layers"].values())
     others = sum(chunk.size for chunk in header.directory if chunk.type != b"CODB")
-    assert layers + others + 64 + header.index_size == len(data)
+    assert layers + others + _spec.HEADER_SIZE + header.index_size == len(data)
 
 
 def test_damage_is_described_or_refused_but_never_a_crash(make_model):

@@ -35,7 +35,7 @@ from csplat_tools.tradeoff.setting import read_setting
 from csplat_tools.tradeoff.tables import format_tradeoff
 
 POINT = {
-    "name", "family", "error", "settings", "size_bytes", "digest", "bytes_per_source_splat", "ratio", "splats",
+    "name", "family", "error", "settings", "size_bytes", "sha256", "bytes_per_source_splat", "ratio", "splats",
     "sh_degree", "psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "photographs", "seconds", "render",
     "attribute_bytes", "first_picture_bytes", "partial",
 }  # fmt: skip

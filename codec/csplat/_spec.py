@@ -173,7 +173,6 @@ ERROR_VERSION: Final = "E_VERSION"
 ERROR_TRUNCATED: Final = "E_TRUNCATED"
 ERROR_TRAILING: Final = "E_TRAILING"
 ERROR_CRC: Final = "E_CRC"
-ERROR_DIGEST: Final = "E_DIGEST"
 ERROR_RESERVED: Final = "E_RESERVED"
 ERROR_VALUE: Final = "E_VALUE"
 ERROR_INDEX: Final = "E_INDEX"
@@ -186,7 +185,7 @@ ERROR_BOX: Final = "E_BOX"
 ERROR_JSON: Final = "E_JSON"
 ERROR_LIMIT: Final = "E_LIMIT"
 ERROR_INPUT: Final = "E_INPUT"
-ERROR_NAMES: Final[dict[str, str]] = {"E_MAGIC": "magic", "E_VERSION": "version", "E_TRUNCATED": "truncated", "E_TRAILING": "trailing", "E_CRC": "crc", "E_DIGEST": "digest", "E_RESERVED": "reserved", "E_VALUE": "value", "E_INDEX": "index", "E_UNSUPPORTED": "unsupported", "E_STREAM": "stream", "E_CODER": "coder", "E_RANGE": "range", "E_CODEBOOK": "codebook", "E_BOX": "box", "E_JSON": "json", "E_LIMIT": "limit", "E_INPUT": "input"}
+ERROR_NAMES: Final[dict[str, str]] = {"E_MAGIC": "magic", "E_VERSION": "version", "E_TRUNCATED": "truncated", "E_TRAILING": "trailing", "E_CRC": "crc", "E_RESERVED": "reserved", "E_VALUE": "value", "E_INDEX": "index", "E_UNSUPPORTED": "unsupported", "E_STREAM": "stream", "E_CODER": "coder", "E_RANGE": "range", "E_CODEBOOK": "codebook", "E_BOX": "box", "E_JSON": "json", "E_LIMIT": "limit", "E_INPUT": "input"}
 
 
 class Header(NamedTuple):
@@ -201,23 +200,22 @@ class Header(NamedTuple):
     index_size: int
     file_size: int
     header_crc: int
-    digest: bytes
 
 
-HEADER_STRUCT: Final = struct.Struct("<8sHHBBHIQI32s")
-HEADER_SIZE: Final = 64
-HEADER_OFFSETS: Final[dict[str, int]] = {"magic": 0, "version_major": 8, "version_minor": 10, "profile": 12, "reserved_0": 13, "reserved_1": 14, "index_size": 16, "file_size": 20, "header_crc": 28, "digest": 32}
+HEADER_STRUCT: Final = struct.Struct("<8sHHBBHIQI")
+HEADER_SIZE: Final = 32
+HEADER_OFFSETS: Final[dict[str, int]] = {"magic": 0, "version_major": 8, "version_minor": 10, "profile": 12, "reserved_0": 13, "reserved_1": 14, "index_size": 16, "file_size": 20, "header_crc": 28}
 
 
 def unpack_header(data: bytes | bytearray | memoryview, offset: int = 0) -> Header:
     """Read a Header at a byte offset; struct.error where the data is too short."""
     v = HEADER_STRUCT.unpack_from(data, offset)
-    return Header(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9])
+    return Header(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
 
 def pack_header(r: Header) -> bytes:
-    """Return the 64 bytes of a Header."""
-    return HEADER_STRUCT.pack(r.magic, r.version_major, r.version_minor, r.profile, r.reserved_0, r.reserved_1, r.index_size, r.file_size, r.header_crc, r.digest)
+    """Return the 32 bytes of a Header."""
+    return HEADER_STRUCT.pack(r.magic, r.version_major, r.version_minor, r.profile, r.reserved_0, r.reserved_1, r.index_size, r.file_size, r.header_crc)
 
 
 class IndexHead(NamedTuple):
@@ -342,22 +340,23 @@ class DirectoryRecord(NamedTuple):
     reserved_1: int
     size: int
     offset: int
+    crc: int
 
 
-DIRECTORY_RECORD_STRUCT: Final = struct.Struct("<4sHHBBHIQ")
-DIRECTORY_RECORD_SIZE: Final = 24
-DIRECTORY_RECORD_OFFSETS: Final[dict[str, int]] = {"type": 0, "flags": 4, "id": 6, "layer": 8, "reserved_0": 9, "reserved_1": 10, "size": 12, "offset": 16}
+DIRECTORY_RECORD_STRUCT: Final = struct.Struct("<4sHHBBHIQI")
+DIRECTORY_RECORD_SIZE: Final = 28
+DIRECTORY_RECORD_OFFSETS: Final[dict[str, int]] = {"type": 0, "flags": 4, "id": 6, "layer": 8, "reserved_0": 9, "reserved_1": 10, "size": 12, "offset": 16, "crc": 24}
 
 
 def unpack_directory_record(data: bytes | bytearray | memoryview, offset: int = 0) -> DirectoryRecord:
     """Read a DirectoryRecord at a byte offset; struct.error where the data is too short."""
     v = DIRECTORY_RECORD_STRUCT.unpack_from(data, offset)
-    return DirectoryRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7])
+    return DirectoryRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
 
 def pack_directory_record(r: DirectoryRecord) -> bytes:
-    """Return the 24 bytes of a DirectoryRecord."""
-    return DIRECTORY_RECORD_STRUCT.pack(r.type, r.flags, r.id, r.layer, r.reserved_0, r.reserved_1, r.size, r.offset)
+    """Return the 28 bytes of a DirectoryRecord."""
+    return DIRECTORY_RECORD_STRUCT.pack(r.type, r.flags, r.id, r.layer, r.reserved_0, r.reserved_1, r.size, r.offset, r.crc)
 
 
 class TileRecord(NamedTuple):
@@ -398,22 +397,23 @@ class LayerRecord(NamedTuple):
     reserved_1: int
     size: int
     offset: int
+    crc: int
 
 
-LAYER_RECORD_STRUCT: Final = struct.Struct("<BBHIQ")
-LAYER_RECORD_SIZE: Final = 16
-LAYER_RECORD_OFFSETS: Final[dict[str, int]] = {"layer": 0, "reserved_0": 1, "reserved_1": 2, "size": 4, "offset": 8}
+LAYER_RECORD_STRUCT: Final = struct.Struct("<BBHIQI")
+LAYER_RECORD_SIZE: Final = 20
+LAYER_RECORD_OFFSETS: Final[dict[str, int]] = {"layer": 0, "reserved_0": 1, "reserved_1": 2, "size": 4, "offset": 8, "crc": 16}
 
 
 def unpack_layer_record(data: bytes | bytearray | memoryview, offset: int = 0) -> LayerRecord:
     """Read a LayerRecord at a byte offset; struct.error where the data is too short."""
     v = LAYER_RECORD_STRUCT.unpack_from(data, offset)
-    return LayerRecord(v[0], v[1], v[2], v[3], v[4])
+    return LayerRecord(v[0], v[1], v[2], v[3], v[4], v[5])
 
 
 def pack_layer_record(r: LayerRecord) -> bytes:
-    """Return the 16 bytes of a LayerRecord."""
-    return LAYER_RECORD_STRUCT.pack(r.layer, r.reserved_0, r.reserved_1, r.size, r.offset)
+    """Return the 20 bytes of a LayerRecord."""
+    return LAYER_RECORD_STRUCT.pack(r.layer, r.reserved_0, r.reserved_1, r.size, r.offset, r.crc)
 
 
 class ChunkHeader(NamedTuple):
@@ -444,26 +444,25 @@ def pack_chunk_header(r: ChunkHeader) -> bytes:
 class TileHead(NamedTuple):
     """Head of a TILE payload."""
 
-    tile_index: int
     layer: int
     block_count: int
     reserved_0: int
 
 
-TILE_HEAD_STRUCT: Final = struct.Struct("<IBBH")
-TILE_HEAD_SIZE: Final = 8
-TILE_HEAD_OFFSETS: Final[dict[str, int]] = {"tile_index": 0, "layer": 4, "block_count": 5, "reserved_0": 6}
+TILE_HEAD_STRUCT: Final = struct.Struct("<BBH")
+TILE_HEAD_SIZE: Final = 4
+TILE_HEAD_OFFSETS: Final[dict[str, int]] = {"layer": 0, "block_count": 1, "reserved_0": 2}
 
 
 def unpack_tile_head(data: bytes | bytearray | memoryview, offset: int = 0) -> TileHead:
     """Read a TileHead at a byte offset; struct.error where the data is too short."""
     v = TILE_HEAD_STRUCT.unpack_from(data, offset)
-    return TileHead(v[0], v[1], v[2], v[3])
+    return TileHead(v[0], v[1], v[2])
 
 
 def pack_tile_head(r: TileHead) -> bytes:
-    """Return the 8 bytes of a TileHead."""
-    return TILE_HEAD_STRUCT.pack(r.tile_index, r.layer, r.block_count, r.reserved_0)
+    """Return the 4 bytes of a TileHead."""
+    return TILE_HEAD_STRUCT.pack(r.layer, r.block_count, r.reserved_0)
 
 
 class CodebookHead(NamedTuple):

@@ -1,12 +1,12 @@
 // The header of a file (spec 4.2) and the frame of a chunk (5.1).
 
-import { CRC_SIZE, crc32, sha256 } from './checksums.mjs';
-import { allocate, fault } from './errors.mjs';
+import { CRC_SIZE, crc32 } from './checksums.mjs';
+import { fault } from './errors.mjs';
 import { checkReserved } from './payload.mjs';
 import * as spec from './spec.mjs';
 
 /**
- * @typedef {{profile: string, indexSize: number, fileSize: number, digest: Uint8Array, end: number}} FileHeader
+ * @typedef {{profile: string, indexSize: number, fileSize: number, end: number}} FileHeader
  * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  */
 
@@ -50,10 +50,7 @@ export function readFileHeader(bytes) {
       `the file has version ${major}.${minor}, this decoder reads ${ours}`,
     );
   }
-  const computed = crc32(bytes.subarray(0, AT.header_crc));
-  if (header.header_crc !== computed) {
-    throw fault(spec.ERROR_CRC, AT.header_crc, 'HDR-3', `found ${hex(header.header_crc)}, computed ${hex(computed)}`);
-  }
+  checkCrc(bytes.subarray(0, AT.header_crc), header.header_crc, AT.header_crc, 'HDR-3');
   checkReserved(header, 0, spec.HEADER_RESERVED, 'the header');
   if (profile !== spec.PROFILE_BASE) {
     throw fault(spec.ERROR_UNSUPPORTED, AT.profile, 'HDR-4', `profile ${profile}: this decoder reads the profile base`);
@@ -63,7 +60,7 @@ export function readFileHeader(bytes) {
   if (indexSize < spec.INDEX_HEAD_SIZE + CRC_SIZE || end > fileSize) {
     throw fault(spec.ERROR_VALUE, AT.index_size, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
   }
-  return { profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, digest: header.digest.slice(), end };
+  return { profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, end };
 }
 
 /**
@@ -77,29 +74,14 @@ export function checkFileSize(size, { fileSize }) {
 }
 
 /**
- * HDR-8: the SHA-256 of everything but the digest.
- *
- * @param {Uint8Array<ArrayBuffer>} bytes the whole file
- * @param {Uint8Array} digest of its header
- */
-export async function checkDigest(bytes, digest) {
-  const field = AT.digest; // the last of the header
-  const covered = allocate(() => new Uint8Array(bytes.length - spec.HEADER_SIZE + field));
-  covered.set(bytes.subarray(0, field));
-  covered.set(bytes.subarray(spec.HEADER_SIZE), field);
-  const computed = await sha256(covered);
-  if (computed.some((byte, i) => byte !== digest[i])) {
-    throw fault(spec.ERROR_DIGEST, field, 'HDR-8', 'the SHA-256 of the file is another');
-  }
-}
-
-/**
  * Check the CRC at the end of an index.
  *
  * @param {Uint8Array<ArrayBuffer>} index
  */
 export function checkIndexCrc(index) {
-  checkCrc(index, spec.HEADER_SIZE, 'IDX-1');
+  const at = index.length - CRC_SIZE;
+  const found = new DataView(index.buffer, index.byteOffset, index.byteLength).getUint32(at, true);
+  checkCrc(index.subarray(0, at), found, spec.HEADER_SIZE + at, 'IDX-1');
 }
 
 /**
@@ -111,7 +93,7 @@ export function checkIndexCrc(index) {
  */
 export function openChunk(chunk, place) {
   const { offset } = place;
-  checkCrc(chunk, offset, 'CHK-1');
+  checkCrc(chunk, place.crc, offset, 'CHK-1');
   const header = spec.unpackChunkHeader(new DataView(chunk.buffer, chunk.byteOffset, chunk.byteLength), 0);
   const type = typeName(header.type);
   if (type !== place.type) {
@@ -126,7 +108,7 @@ export function openChunk(chunk, place) {
     );
   }
   checkReserved(header, offset, spec.CHUNK_HEADER_RESERVED, 'a chunk header');
-  const payload = chunk.subarray(spec.CHUNK_HEADER_SIZE, chunk.length - CRC_SIZE);
+  const payload = chunk.subarray(spec.CHUNK_HEADER_SIZE);
   if (header.payload_size !== payload.length) {
     throw fault(
       spec.ERROR_INDEX,
@@ -139,14 +121,12 @@ export function openChunk(chunk, place) {
 }
 
 /**
- * @param {Uint8Array<ArrayBuffer>} bytes with their CRC at the end
- * @param {number} base
+ * @param {Uint8Array<ArrayBuffer>} bytes
+ * @param {number} found their CRC as the file has it
+ * @param {number} at byte of the file to blame
  * @param {string} clause
  */
-function checkCrc(bytes, base, clause) {
-  const at = bytes.length - CRC_SIZE;
-  const found = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength).getUint32(at, true);
-  const computed = crc32(bytes.subarray(0, at));
-  if (found !== computed)
-    throw fault(spec.ERROR_CRC, base + at, clause, `found ${hex(found)}, computed ${hex(computed)}`);
+function checkCrc(bytes, found, at, clause) {
+  const computed = crc32(bytes);
+  if (found !== computed) throw fault(spec.ERROR_CRC, at, clause, `found ${hex(found)}, computed ${hex(computed)}`);
 }

@@ -68,6 +68,8 @@ export interface ByteRange {
 export interface ChunkPlace extends ByteRange {
   type: string;
   flags: number;
+  /** CRC-32 of its bytes. */
+  crc: number;
   offsetField: number;
   sizeField: number;
 }
@@ -143,12 +145,11 @@ export interface Description {
   statedErrors: StatedErrors | null;
 }
 
-/** Which checks were made: CRCs of header, index and so many chunks, and the SHA-256 of the file. */
+/** Which CRCs were checked: those of header, index and so many chunks. */
 export interface Checks {
   header: boolean;
   index: boolean;
   chunks: number;
-  digest: boolean;
 }
 
 export type ExtraArray =
@@ -331,11 +332,6 @@ export class CsplatReader {
     options: { form: 'packed'; signal?: AbortSignal },
   ): Promise<PackedBand | null>;
   describe(options?: { signal?: AbortSignal }): Promise<Description>;
-  /**
-   * Resolves when nothing is left to check. Where a server without ranges sends the whole file, that is when its last
-   * byte is here; rejects with E_DIGEST where it is not the file that its digest names.
-   */
-  finish(): Promise<Checks>;
   /** Begin to fetch layers that will be read soon, neighbours with one request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
 }
@@ -348,7 +344,6 @@ export type ErrorCode =
   | 'E_TRUNCATED'
   | 'E_TRAILING'
   | 'E_CRC'
-  | 'E_DIGEST'
   | 'E_RESERVED'
   | 'E_VALUE'
   | 'E_INDEX'

@@ -296,7 +296,7 @@ function readDirectory(index) {
     spec.DIRECTORY_RECORD_RESERVED,
     'a directory record',
   );
-  const { flags, id, layer, size, offset } = fields;
+  const { flags, id, layer, size, offset, crc } = fields;
   const type = typeName(fields.type);
   if (type === spec.CHUNK_TILE || /[^\x20-\x7e]/.test(type)) {
     throw fault(ERROR_VALUE, at, 'DIR-1', `the type ${JSON.stringify(type)} in the directory`);
@@ -321,6 +321,7 @@ function readDirectory(index) {
     layer,
     size,
     offset: Number(offset),
+    crc,
     recordOffset: at,
     offsetField: at + places.offset,
     sizeField: at + places.size,

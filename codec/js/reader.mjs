@@ -4,16 +4,15 @@ import { describe, emptyDescription } from './ancillary.mjs';
 import { arrayBytes, bandArray } from './arrays.mjs';
 import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
-import { checkDigest, checkFileSize, openChunk, readFileHeader } from './container.mjs';
+import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed.mjs';
-import { HttpSource, openSource } from './source.mjs';
+import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
-import { WholeSource } from './whole.mjs';
 
 const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
 
@@ -32,7 +31,7 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 
-/** Reads parts of a file. Each part's CRC is checked; the digest only where the whole file comes anyway. */
+/** Reads parts of a file, and checks the CRC of each. */
 export class CsplatReader {
   /**
    * Open a file: one request for header and index of all but huge files.
@@ -57,10 +56,7 @@ export class CsplatReader {
     if (known !== Infinity) checkFileSize(known, file);
     progress.fileSize = file.fileSize;
     const header = readIndex(await source.read(spec.HEADER_SIZE, file.indexSize, signal), file, limits);
-    const reader = new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
-    reader.digest = file.digest;
-    if (source instanceof WholeSource) reader.checkWhole(source);
-    return reader;
+    return new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
   }
 
   /**
@@ -75,13 +71,9 @@ export class CsplatReader {
     this.limits = limits;
     this.inflate = inflate;
     /** What has been checked so far; `chunks` counts. */
-    this.checks = { header: true, index: true, chunks: 0, digest: false };
+    this.checks = { header: true, index: true, chunks: 0 };
     /** How long reads have waited for bytes so far, each for itself. */
     this.waitedMs = 0;
-    /** @type {Uint8Array} of the header */
-    this.digest = new Uint8Array(0);
-    /** @type {Promise<void> | undefined} the check of the digest, where the whole file comes */
-    this.whole = undefined;
     this.codebooks = codebooksById(header.codebooks);
     this.tableBytes = tableBytes(header.directory, this.codebooks);
     /** @type {Map<string, DirectoryRecord>} */
@@ -162,18 +154,6 @@ export class CsplatReader {
       await describe(description, record, await this.readChunk(record, signal), scene);
     }
     return description;
-  }
-
-  /**
-   * Wait until nothing is left to check: of a file that comes as one body the digest, of parts nothing.
-   *
-   * @returns {Promise<import('./decoder.d.ts').Checks>}
-   */
-  async finish() {
-    const { source } = this;
-    if (source instanceof HttpSource && source.whole) this.checkWhole(source.whole); // ranges were honoured at first
-    await this.whole;
-    return this.checks;
   }
 
   /**
@@ -281,19 +261,5 @@ export class CsplatReader {
       if (codebook === undefined || codebook.bandFirst === codebook.bandLast) tile.indices.delete(id);
     }
     if (tile.indices.size === 0) this.open.delete(tile.record.index);
-  }
-
-  /**
-   * HDR-12: check the digest of a file that comes whole, once it is here; after a failure nothing more is read.
-   *
-   * @param {WholeSource} source
-   */
-  checkWhole(source) {
-    this.whole ??= source.complete
-      .then(() => checkDigest(source.bytes, this.digest))
-      .then(() => {
-        this.checks.digest = true;
-      });
-    this.whole.catch((error) => source.fail(error));
   }
 }

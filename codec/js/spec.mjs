@@ -165,7 +165,6 @@ export const ERROR_VERSION = 'E_VERSION';
 export const ERROR_TRUNCATED = 'E_TRUNCATED';
 export const ERROR_TRAILING = 'E_TRAILING';
 export const ERROR_CRC = 'E_CRC';
-export const ERROR_DIGEST = 'E_DIGEST';
 export const ERROR_RESERVED = 'E_RESERVED';
 export const ERROR_VALUE = 'E_VALUE';
 export const ERROR_INDEX = 'E_INDEX';
@@ -178,10 +177,10 @@ export const ERROR_BOX = 'E_BOX';
 export const ERROR_JSON = 'E_JSON';
 export const ERROR_LIMIT = 'E_LIMIT';
 export const ERROR_INPUT = 'E_INPUT';
-export const ERROR_NAMES = Object.freeze({ 'E_MAGIC': 'magic', 'E_VERSION': 'version', 'E_TRUNCATED': 'truncated', 'E_TRAILING': 'trailing', 'E_CRC': 'crc', 'E_DIGEST': 'digest', 'E_RESERVED': 'reserved', 'E_VALUE': 'value', 'E_INDEX': 'index', 'E_UNSUPPORTED': 'unsupported', 'E_STREAM': 'stream', 'E_CODER': 'coder', 'E_RANGE': 'range', 'E_CODEBOOK': 'codebook', 'E_BOX': 'box', 'E_JSON': 'json', 'E_LIMIT': 'limit', 'E_INPUT': 'input' });
+export const ERROR_NAMES = Object.freeze({ 'E_MAGIC': 'magic', 'E_VERSION': 'version', 'E_TRUNCATED': 'truncated', 'E_TRAILING': 'trailing', 'E_CRC': 'crc', 'E_RESERVED': 'reserved', 'E_VALUE': 'value', 'E_INDEX': 'index', 'E_UNSUPPORTED': 'unsupported', 'E_STREAM': 'stream', 'E_CODER': 'coder', 'E_RANGE': 'range', 'E_CODEBOOK': 'codebook', 'E_BOX': 'box', 'E_JSON': 'json', 'E_LIMIT': 'limit', 'E_INPUT': 'input' });
 
-export const HEADER_SIZE = 64;
-export const HEADER_OFFSETS = Object.freeze({ magic: 0, version_major: 8, version_minor: 10, profile: 12, reserved_0: 13, reserved_1: 14, index_size: 16, file_size: 20, header_crc: 28, digest: 32 });
+export const HEADER_SIZE = 32;
+export const HEADER_OFFSETS = Object.freeze({ magic: 0, version_major: 8, version_minor: 10, profile: 12, reserved_0: 13, reserved_1: 14, index_size: 16, file_size: 20, header_crc: 28 });
 export const HEADER_RESERVED = Object.freeze({ reserved_0: 13, reserved_1: 14 });
 /**
  * File header. 64-bit integers are BigInt, u8[n] is a view.
@@ -199,7 +198,6 @@ export function unpackHeader(view, at) {
     index_size: view.getUint32(at + 16, true),
     file_size: view.getBigUint64(at + 20, true),
     header_crc: view.getUint32(at + 28, true),
-    digest: new Uint8Array(view.buffer, view.byteOffset + at + 32, 32),
   };
 }
 
@@ -282,8 +280,8 @@ export function unpackExtraRecord(view, at) {
   };
 }
 
-export const DIRECTORY_RECORD_SIZE = 24;
-export const DIRECTORY_RECORD_OFFSETS = Object.freeze({ type: 0, flags: 4, id: 6, layer: 8, reserved_0: 9, reserved_1: 10, size: 12, offset: 16 });
+export const DIRECTORY_RECORD_SIZE = 28;
+export const DIRECTORY_RECORD_OFFSETS = Object.freeze({ type: 0, flags: 4, id: 6, layer: 8, reserved_0: 9, reserved_1: 10, size: 12, offset: 16, crc: 24 });
 export const DIRECTORY_RECORD_RESERVED = Object.freeze({ reserved_0: 9, reserved_1: 10 });
 /**
  * Directory record. 64-bit integers are BigInt, u8[n] is a view.
@@ -300,6 +298,7 @@ export function unpackDirectoryRecord(view, at) {
     reserved_1: view.getUint16(at + 10, true),
     size: view.getUint32(at + 12, true),
     offset: view.getBigUint64(at + 16, true),
+    crc: view.getUint32(at + 24, true),
   };
 }
 
@@ -326,8 +325,8 @@ export function unpackTileRecord(view, at) {
   };
 }
 
-export const LAYER_RECORD_SIZE = 16;
-export const LAYER_RECORD_OFFSETS = Object.freeze({ layer: 0, reserved_0: 1, reserved_1: 2, size: 4, offset: 8 });
+export const LAYER_RECORD_SIZE = 20;
+export const LAYER_RECORD_OFFSETS = Object.freeze({ layer: 0, reserved_0: 1, reserved_1: 2, size: 4, offset: 8, crc: 16 });
 export const LAYER_RECORD_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2 });
 /**
  * Layer record. 64-bit integers are BigInt, u8[n] is a view.
@@ -341,6 +340,7 @@ export function unpackLayerRecord(view, at) {
     reserved_1: view.getUint16(at + 2, true),
     size: view.getUint32(at + 4, true),
     offset: view.getBigUint64(at + 8, true),
+    crc: view.getUint32(at + 16, true),
   };
 }
 
@@ -361,9 +361,9 @@ export function unpackChunkHeader(view, at) {
   };
 }
 
-export const TILE_HEAD_SIZE = 8;
-export const TILE_HEAD_OFFSETS = Object.freeze({ tile_index: 0, layer: 4, block_count: 5, reserved_0: 6 });
-export const TILE_HEAD_RESERVED = Object.freeze({ reserved_0: 6 });
+export const TILE_HEAD_SIZE = 4;
+export const TILE_HEAD_OFFSETS = Object.freeze({ layer: 0, block_count: 1, reserved_0: 2 });
+export const TILE_HEAD_RESERVED = Object.freeze({ reserved_0: 2 });
 /**
  * Head of a TILE payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -371,10 +371,9 @@ export const TILE_HEAD_RESERVED = Object.freeze({ reserved_0: 6 });
  */
 export function unpackTileHead(view, at) {
   return {
-    tile_index: view.getUint32(at + 0, true),
-    layer: view.getUint8(at + 4),
-    block_count: view.getUint8(at + 5),
-    reserved_0: view.getUint16(at + 6, true),
+    layer: view.getUint8(at + 0),
+    block_count: view.getUint8(at + 1),
+    reserved_0: view.getUint16(at + 2, true),
   };
 }
 

@@ -111,9 +111,6 @@ export class Tile {
       spec.TILE_HEAD_RESERVED,
       'the head of a tile',
     );
-    const { index } = this.record;
-    if (fields.tile_index !== index)
-      throw fault(ERROR_INDEX, at, 'TLE-1', `tile ${fields.tile_index} instead of ${index}`);
     if (fields.layer !== layer)
       throw fault(ERROR_INDEX, at + AT_HEAD.layer, 'TLE-1', `layer ${fields.layer} instead of ${layer}`);
     const attributes = this.attributesOf(layer);

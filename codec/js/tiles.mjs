@@ -1,6 +1,5 @@
 // Tile and layer records (spec 4.3.5) and the coverage of the file by chunks (4.3.6).
 
-import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
 import { ldexp } from './lattice.mjs';
 import { nameOf, registeredFlags } from './registry.mjs';
@@ -110,7 +109,7 @@ function readLayers(index, count, header) {
       spec.LAYER_RECORD_RESERVED,
       'a layer record',
     );
-    const { layer, size, offset } = fields;
+    const { layer, size, offset, crc } = fields;
     if (nameOf(spec.LAYER_NAMES, layer) === undefined) throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `layer ${layer}`);
     const before = layers.at(-1)?.layer;
     if (before === undefined ? layer !== spec.LAYER_GEOMETRY : layer <= before) {
@@ -125,6 +124,7 @@ function readLayers(index, count, header) {
       flags,
       size,
       offset: Number(offset),
+      crc,
       offsetField: at + AT_LAYER.offset,
       sizeField: at + AT_LAYER.size,
     });
@@ -165,8 +165,8 @@ export function checkTables({ tables, tablesOffset }, codebooks) {
 export function checkCoverage(header, start) {
   const places = [...header.directory, ...header.tiles.flatMap((tile) => tile.layers)];
   for (const { size, sizeField } of places) {
-    const least = spec.CHUNK_HEADER_SIZE + CRC_SIZE;
-    if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its frame has ${least}`);
+    const least = spec.CHUNK_HEADER_SIZE;
+    if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its header has ${least}`);
   }
   // Offsets of 2^53 and more are rounded. They lie behind the end of the file, or `end` misses it: either is refused.
   places.sort((a, b) => a.offset - b.offset);

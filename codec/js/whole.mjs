@@ -89,12 +89,6 @@ export class WholeSource {
     this.error = null;
     /** @type {{end: number, resolve: (value?: unknown) => void, reject: (error: unknown) => void}[]} */
     this.waiting = [];
-    /** @type {Promise<void>} fulfilled when the whole file is here */
-    this.complete = new Promise((resolve, reject) => {
-      this.finish = resolve;
-      this.giveUp = reject;
-    });
-    this.complete.catch(() => {});
   }
 
   /**
@@ -124,7 +118,6 @@ export class WholeSource {
       this.take([part]);
     }
     if (this.filled < this.bytes.length) throw shortData(this.filled, this.bytes.length);
-    this.finish?.();
   }
 
   /** @param {Uint8Array[]} arrived */
@@ -144,7 +137,6 @@ export class WholeSource {
   fail(error) {
     this.error = error;
     for (const waiter of this.waiting) waiter.reject(error);
-    this.giveUp?.(error);
   }
 }
 

@@ -8,14 +8,14 @@ overwrite it afterwards.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from csplat import _spec
 from csplat_conformance import coders
 from csplat_conformance.fields import Field, Writer
 from csplat_conformance.reference import max_scale
-from csplat_conformance.repair import digest_of, repair
+from csplat_conformance.repair import CHUNK_RECORDS, repair, seal
 from csplat_conformance.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
 
 __all__ = ["Built", "build", "chunk_names"]
@@ -42,25 +42,27 @@ class Built:
 
         The CRCs that the changes name stay as they are given.
         """
-        writer = Writer(bytearray(self.data), self.fields)
+        data = self._with(self.data, changes)
+        if not repaired:
+            return data
+        kept = {name: value for name, value in changes.items() if name.endswith("crc")}
+        data = self._with(repair(data, self.records), kept)
+        return self._with(seal(data), kept)  # the CRC of the index covers those of the chunks
+
+    def _with(self, data: bytes, changes: dict[str, Any]) -> bytes:
+        writer = Writer(bytearray(data), self.fields)
         for name, value in changes.items():
             writer.patch(name, value)
-        if not repaired:
-            return bytes(writer.data)
-        data = repair(bytes(writer.data), list(self.spans.values()))
-        kept = {name: value for name, value in changes.items() if name.endswith(("crc", ".digest"))}
-        if not kept:
-            return data
-        writer = Writer(bytearray(data), self.fields)
-        for name, value in kept.items():
-            writer.patch(name, value)
-        data = bytes(writer.data)
-        return data if "header.digest" in kept else _resealed(data)
+        return bytes(writer.data)
 
-
-def _resealed(data: bytes) -> bytes:
-    start = _spec.HEADER_OFFSETS["digest"]
-    return data[:start] + digest_of(data) + data[_spec.HEADER_SIZE :]
+    @property
+    def records(self) -> list[tuple[str, int]]:
+        """Structure and place of the records that name chunks."""
+        return [
+            (entry.structure, entry.offset - CHUNK_RECORDS[entry.structure])
+            for name, entry in self.fields.items()
+            if entry.structure in CHUNK_RECORDS and name.endswith(".crc")
+        ]
 
 
 def build(scene: Scene) -> Built:
@@ -84,7 +86,8 @@ def build(scene: Scene) -> Built:
         file.append(chunks[name], name + "/")
     file.data += scene.trailing
     spans = {name: (offsets[name], len(chunks[name].data)) for name in order}
-    return Built(repair(bytes(file.data), list(spans.values())), file.fields, spans)
+    unsealed = Built(bytes(file.data), file.fields, spans)
+    return replace(unsealed, data=unsealed.patched({}))
 
 
 def chunk_names(scene: Scene) -> list[str]:
@@ -94,7 +97,7 @@ def chunk_names(scene: Scene) -> list[str]:
 
 def _header(index_size: int, file_size: int) -> list[Any]:
     version = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
-    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0, bytes(32)]
+    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
 
 
 # Index ---------------------------------------------------------------------------------------------
@@ -134,7 +137,7 @@ def _directory(scene: Scene, name: str, chunk: Writer, offset: int) -> list[Any]
         declared = dict(zip(_ancillary_names(scene), scene.chunks, strict=True))[name]
         kind, ids = declared.type, (declared.id, declared.layer)
     flags = _spec.unpack_chunk_header(chunk.data).flags
-    return [kind, flags, *ids, 0, 0, len(chunk.data), offset]
+    return [kind, flags, *ids, 0, 0, len(chunk.data), offset, 0]
 
 
 def _tile_record(
@@ -149,7 +152,8 @@ def _tile_record(
     out.structure(f"tile[{i}]", "tile_record", [*head, tile.corner, extent, scale])
     for layer in tile.layers:
         name = f"TILE.{i}.{layer}"
-        out.structure(f"tile[{i}].layer[{layer}]", "layer_record", [layer, 0, 0, len(chunks[name].data), offsets[name]])
+        where = [len(chunks[name].data), offsets[name], 0]
+        out.structure(f"tile[{i}].layer[{layer}]", "layer_record", [layer, 0, 0, *where])
     for k, table in enumerate(tables):
         out.value(f"tile[{i}].table[{k}]", "H", table)
 
@@ -171,7 +175,7 @@ def _chunks(scene: Scene) -> dict[str, Writer]:
                 )
         for i, tile in enumerate(scene.tiles):
             if layer in tile.layers:
-                payload = _tile(scene, i, tile, layer)
+                payload = _tile(scene, tile, layer)
                 out[f"TILE.{i}.{layer}"] = _framed(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
     return out
 
@@ -193,7 +197,6 @@ def _framed(kind: bytes, flags: int, payload: Writer) -> Writer:
     out = Writer()
     out.structure("header", "chunk_header", [kind, flags, 0, len(payload.data)])
     out.append(payload)
-    out.value("crc", "I", 0)
     return out
 
 
@@ -223,7 +226,7 @@ def _codebook(book: Codebook, layer: int) -> Writer:
     return out
 
 
-def _tile(scene: Scene, i: int, tile: Tile, layer: int) -> Writer:
+def _tile(scene: Scene, tile: Tile, layer: int) -> Writer:
     out = Writer()
     blocks: list[tuple[str, int, Block]] = []
     if layer == _spec.LAYER_EXTRA:
@@ -233,7 +236,7 @@ def _tile(scene: Scene, i: int, tile: Tile, layer: int) -> Writer:
         if layer == _spec.LAYER_GEOMETRY:
             attributes = [a for a in tile.order if a in attributes]
         blocks = [(_spec.ATTRIBUTE_NAMES[a], a, tile.blocks[a]) for a in attributes]
-    out.structure("head", "tile_head", [i, layer, len(blocks), 0])
+    out.structure("head", "tile_head", [layer, len(blocks), 0])
     for k, (name, attribute, block) in enumerate(blocks):
         _block(out, name, scene, attribute, block, k)
     _tail(out, dict(tile.tails).get(layer, b""))

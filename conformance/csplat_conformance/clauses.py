@@ -12,8 +12,6 @@ __all__ = ["EXCUSES", "clause_ids", "clause_map", "replaced"]
 
 #: Clauses that no vector covers: the reason, or the test that covers them.
 EXCUSES: Final = {
-    "HDR-10": "about readers of parts; a CRC that fails is `invalid/index_crc`, `invalid/chunk_crc`",
-    "HDR-12": "about readers of what is still coming: `codec/js/test/reader.test.mjs`",
     "CHK-5": "about editors, which change files rather than read them",
     "CHK-6": "a permission; vectors whose only defect lies in such a payload are marked optional",
     "CHK-7": "the vectors that are marked optional, for decoders that read the payload",

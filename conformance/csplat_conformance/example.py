@@ -6,7 +6,7 @@ import struct
 from typing import Final
 
 from csplat import _spec
-from csplat_conformance.builder import build
+from csplat_conformance.builder import Built, build
 from csplat_conformance.fields import Field
 from csplat_conformance.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, axis, levels, offset, signed
 from csplat_conformance.scene import Attribute, Chunk, Scene, Stream, Tile
@@ -71,9 +71,8 @@ _SECTIONS: Final = {
 _NOTES: Final = {
     "header.version_minor": "version 0.2",
     "header.profile": "BASE",
-    "header.index_size": "so the chunks begin at 64 + 264 = 328",
+    "header.index_size": "so the chunks begin at 32 + 276 = 308",
     "header.header_crc": "of the bytes 0 to 27",
-    "header.digest": "of the bytes 0 to 31 and 64 to the end",
     "index.splat_count": "N",
     "index.sh_degree": "so six attribute records follow",
     "index.axes": "RIGHT, DOWN, FORWARD",
@@ -142,11 +141,20 @@ def annex() -> str:
         note = f"; {_NOTES[name]}" if name in _NOTES else ""
         label = name.removeprefix(f"{heading}.").removeprefix(f"{prefix}/")
         value = _value(entry, raw)
-        if label.endswith("crc") and not entry.structure:
-            start = built.spans[prefix][0] if prefix in built.spans else _spec.HEADER_SIZE
-            value = f"of the bytes {start} to {entry.offset - 1}"
+        if name.endswith(".crc"):
+            start, end = _covered(built, name)
+            value = f"of the bytes {start} to {end - 1}"
         parts.append(f"| {entry.offset} | {raw.hex(' ').upper()} | `{label}` | {(value + note).removeprefix('; ')} |\n")
     return "".join(parts) + "\n" + _OUTRO
+
+
+def _covered(built: Built, name: str) -> tuple[int, int]:
+    """Return the bytes that a CRC covers: the index's those before it, a record's the chunk that it names."""
+    if name == "index.crc":
+        return _spec.HEADER_SIZE, built.fields[name].offset
+    fields = [built.fields[name.removesuffix("crc") + key] for key in ("offset", "size")]
+    offset, size = (int(struct.unpack_from(one.format, built.data, one.offset)[0]) for one in fields)
+    return offset, offset + size
 
 
 def _value(entry: Field, raw: bytes) -> str:

@@ -56,7 +56,7 @@ def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[
         result, in_place = result + rng.randbytes(rng.randrange(1, 9)), False
     if rng.random() < _UNREPAIRED_SHARE:
         return result, False, in_place
-    return repair(result), True, in_place
+    return repair(result, base.records), True, in_place
 
 
 def mapped(data: bytes) -> Built:
@@ -228,12 +228,12 @@ def _laid_out(rng: random.Random, base: Built, data: bytearray, bases: Sequence[
 
 
 def _payload(chunk: bytes) -> bytes:
-    return chunk[_spec.CHUNK_HEADER_SIZE : len(chunk) - _CRC_SIZE]
+    return chunk[_spec.CHUNK_HEADER_SIZE :]
 
 
 def _with_payload(chunk: bytes, payload: bytes) -> bytes:
     at = _spec.CHUNK_HEADER_OFFSETS["payload_size"]
-    return chunk[:at] + struct.pack("<I", len(payload)) + payload + bytes(_CRC_SIZE)
+    return chunk[:at] + struct.pack("<I", len(payload)) + payload
 
 
 def _edited(rng: random.Random, payload: bytes) -> bytes:
@@ -265,7 +265,7 @@ def _recoded(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
     transforms = head.transforms if rng.random() < 0.7 else bytes(sorted(rng.sample(range(1, 5), 2))).ljust(4, b"\0")
     new = head._replace(width=width, coder=coder, transforms=transforms, packed_size=packed, coded_size=len(coded))
     payload = chunk[:at] + _spec.pack_stream_head(new) + coded + chunk[begin + head.coded_size :]
-    return _with_payload(payload[: _spec.CHUNK_HEADER_SIZE], payload[_spec.CHUNK_HEADER_SIZE : -_CRC_SIZE])
+    return _with_payload(payload[: _spec.CHUNK_HEADER_SIZE], payload[_spec.CHUNK_HEADER_SIZE :])
 
 
 def _assembled(base: Built, data: bytearray, chunks: dict[str, bytes]) -> bytes:

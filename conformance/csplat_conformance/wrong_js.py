@@ -39,7 +39,23 @@ class Edit:
 
 
 EDITS: Final = (
-    Edit("CRC ignored", "of chunks", "CHK-1", "container.mjs", "checkCrc(chunk, offset, 'CHK-1');", ""),
+    Edit("CRCs of chunks", "ignored", "CHK-1", "container.mjs", "checkCrc(chunk, place.crc, offset, 'CHK-1');", ""),
+    Edit(
+        "CRC of the index",
+        "ignored",
+        "IDX-1",
+        "container.mjs",
+        "checkCrc(index.subarray(0, at), found, spec.HEADER_SIZE + at, 'IDX-1');",
+        "",
+    ),
+    Edit(
+        "chunks unused",
+        "chunks of the directory are opened where they are read",
+        "CHK-2",
+        "decoder.mjs",
+        "for (const place of places) {",
+        "for (const place of places.filter(({ type }) => type in spec.CHUNK_NAMES)) {",
+    ),
     Edit(
         "tails of payloads", "a payload may go on", "TLE-3", "payload.mjs", "if (this.left) throw", "if (false) throw"
     ),

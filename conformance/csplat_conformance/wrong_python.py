@@ -71,6 +71,18 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
     return view[: max(_spec.HEADER_SIZE, _spec.unpack_header(view).file_size)]
 
 
+def _crc_but(unchecked: str) -> Wrong:
+    def wrong(right: Wrong, covered: memoryview, stored: int, at: int, clause: str) -> None:
+        if clause != unchecked:
+            right(covered, stored, at, clause)
+
+    return wrong
+
+
+def _no_side_chunks(_right: Wrong, _job: Any) -> tuple[None, None]:
+    return None, None
+
+
 def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - as the right one
     return zlib.decompressobj(-zlib.MAX_WBITS).decompress(coded, size).ljust(size, b"\0")
 
@@ -212,7 +224,9 @@ def _sorted_codes(right: Wrong, codes: Any) -> Any:
 
 MISTAKES: Final = (
     Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", _replaced("_check_crc", _nothing)),
-    Mistake("digest ignored", "the SHA-256 is not compared", "HDR-8", _replaced("check_digest", _nothing)),
+    Mistake("CRC of the index", "the chunks have theirs", "IDX-1", _replaced("_check_crc", _crc_but("IDX-1"))),
+    Mistake("CRCs of chunks", "the index has its own", "CHK-1", _replaced("_check_crc", _crc_but("CHK-1"))),
+    Mistake("chunks unused", "what is not used is not read", "CHK-2", _replaced("_read_side_chunks", _no_side_chunks)),
     Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", _replaced("view_of", _cut_to_size)),
     Mistake("tails of payloads", "a payload may go on", "TLE-3", _method(container.Cursor, "finish", _nothing)),
     Mistake("lenient inflate", "as most libraries do by default", "COD-2", _replaced("_inflate", _tail_of_inflate)),

@@ -72,7 +72,6 @@ export async function load(source, sink, signal) {
       tell(layer);
     }
   }
-  await reader.finish();
   if (isLocal) {
     state.received = header.fileSize;
     tell(header.shDegree);

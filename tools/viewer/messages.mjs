@@ -20,7 +20,6 @@ const WORDS = {
   E_TRUNCATED: { title: 'This file ends too early: a part of it is missing.', advice: AGAIN },
   E_TRAILING: { title: 'Something follows the end of this file.', advice: AGAIN },
   E_CRC: DAMAGED,
-  E_DIGEST: DAMAGED,
   E_CODER: DAMAGED,
   E_RESERVED: BROKEN,
   E_VALUE: BROKEN,

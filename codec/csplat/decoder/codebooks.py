@@ -102,7 +102,7 @@ def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_sp
 def _read_chunk(
     view: memoryview, header: SceneHeader, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
 ) -> tuple[Ints, ...]:
-    cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "CDB-2")
+    cursor = open_chunk(view, record, record.type, record.flags, "CDB-2")
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)
     for name, found, wanted in (

@@ -1,4 +1,4 @@
-"""The outermost layer: the file's header, its chunks' frames, its digest (spec 4.2, 5.1).
+"""The outermost layer: the file's header, its chunks' frames, their CRCs (spec 4.2, 5.1).
 
 Everything below reads from one `memoryview` of the whole file, so that every offset in an error
 is an offset in the file.
@@ -6,7 +6,6 @@ is an offset in the file.
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Cursor",
-    "check_digest",
     "check_index_crc",
     "check_length",
     "check_reserved",
@@ -32,7 +30,6 @@ __all__ = [
 ]
 
 _CRC_SIZE = 4
-_FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + _CRC_SIZE
 
 
 class Cursor:
@@ -104,7 +101,7 @@ def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:
 
 
 def read_file_header(view: memoryview) -> _spec.Header:
-    """Read and check the 64 bytes of the header (HDR-1 to HDR-4, HDR-7, HDR-11), not the digest."""
+    """Read and check the header (HDR-1 to HDR-4, HDR-7, HDR-11)."""
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
@@ -129,7 +126,8 @@ def read_file_header(view: memoryview) -> _spec.Header:
             places["version_major"],
             "HDR-2",
         )
-    _check_crc(view, 0, places["header_crc"], header.header_crc, "HDR-3")
+    crc_at = places["header_crc"]
+    _check_crc(view[:crc_at], header.header_crc, crc_at, "HDR-3")
     if header.profile not in _spec.PROFILE_NAMES:
         raise UnsupportedError(f"profile {header.profile}", offset=places["profile"], clause="HDR-4")
     check_reserved(header, 0, places)
@@ -168,50 +166,40 @@ def check_length(view: memoryview, file_size: int) -> None:
         )
 
 
-def check_digest(view: memoryview, digest: bytes) -> None:
-    """HDR-8: the SHA-256 of all bytes but the digest's own. Releases the GIL while it hashes."""
-    place = _spec.HEADER_OFFSETS["digest"]
-    computed = hashlib.sha256(view[:place])
-    computed.update(view[_spec.HEADER_SIZE :])
-    if computed.digest() != digest:
-        raise FormatError(
-            _spec.ERROR_DIGEST, place, "HDR-8", found=digest.hex(), wanted=f"{computed.hexdigest()} (computed)"
-        )
-
-
 def check_index_crc(view: memoryview, start: int, size: int) -> None:
     """IDX-1; the caller has checked that the data holds the index."""
     end = start + size - _CRC_SIZE
-    _check_crc(view, start, end, int.from_bytes(view[end : end + _CRC_SIZE], "little"), "IDX-1")
+    _check_crc(view[start:end], int.from_bytes(view[end : end + _CRC_SIZE], "little"), end, "IDX-1")
 
 
-def open_chunk(view: memoryview, offset: int, size: int, kind: bytes, flags: int, clause: str) -> Cursor:
-    """Check a chunk's frame (CHK-1, CHK-3) and stand at the beginning of its payload.
+def open_chunk(
+    view: memoryview, record: _spec.DirectoryRecord | _spec.LayerRecord, kind: bytes, flags: int, clause: str
+) -> Cursor:
+    """Check CRC and header of a chunk (CHK-1, CHK-3) and stand at the beginning of its payload.
 
     Args:
         view: the whole file; COV-1 has shown that the chunk lies within.
-        offset: where the record says that the chunk begins.
-        size: how many bytes the record says it has, at least those of a frame.
+        record: the one that names the chunk; its size is at least that of a chunk header.
         kind: type of the record, or TILE.
         flags: flags of the record, or those registered for TILE.
         clause: what the cursor names when the payload is too long or too short.
     """
-    end = offset + size - _CRC_SIZE
-    _check_crc(view, offset, end, int.from_bytes(view[end : end + _CRC_SIZE], "little"), "CHK-1")
+    offset, end = record.offset, record.offset + record.size
+    _check_crc(view[offset:end], record.crc, offset, "CHK-1")
     head = _spec.unpack_chunk_header(view, offset)
     places = _spec.CHUNK_HEADER_OFFSETS
     check_reserved(head, offset, places)
     for name, found, wanted in (
         ("type", head.type, kind),
         ("flags", head.flags, flags),
-        ("payload_size", head.payload_size, size - _FRAME_SIZE),
+        ("payload_size", head.payload_size, record.size - _spec.CHUNK_HEADER_SIZE),
     ):
         if found != wanted:
             raise FormatError(_spec.ERROR_INDEX, offset + places[name], "CHK-3", name, found=found, wanted=wanted)
     return Cursor(view, offset + _spec.CHUNK_HEADER_SIZE, end, clause)
 
 
-def _check_crc(view: memoryview, start: int, end: int, stored: int, clause: str) -> None:
-    computed = zlib.crc32(view[start:end])
+def _check_crc(covered: memoryview, stored: int, at: int, clause: str) -> None:
+    computed = zlib.crc32(covered)
     if computed != stored:
-        raise FormatError(_spec.ERROR_CRC, end, clause, f"found {stored:#010x}, computed {computed:#010x}")
+        raise FormatError(_spec.ERROR_CRC, at, clause, f"found {stored:#010x}, computed {computed:#010x}")

@@ -60,7 +60,6 @@ class SceneHeader:
         profile: name in the registry of profiles, `base`.
         file_size: bytes of the file.
         index_size: bytes of the index.
-        digest: SHA-256 that the file states; checked by a whole decode only.
         splat_count: N.
         sh_degree: 0 to 3.
         antialiased: trained with the mip-splatting low-pass filter.
@@ -79,7 +78,6 @@ class SceneHeader:
     profile: str
     file_size: int
     index_size: int
-    digest: bytes
     splat_count: int
     sh_degree: int
     antialiased: bool

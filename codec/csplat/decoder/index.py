@@ -71,7 +71,6 @@ def read_header(data: Buffer) -> SceneHeader:
         profile=_spec.PROFILE_NAMES[file.profile],
         file_size=file.file_size,
         index_size=file.index_size,
-        digest=file.digest,
         splat_count=head.splat_count,
         sh_degree=head.sh_degree,
         antialiased=bool(head.scene_flags & _spec.SCENE_FLAG_ANTIALIASED),

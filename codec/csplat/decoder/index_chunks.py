@@ -11,7 +11,6 @@ __all__ = ["check_codebook_chunks", "read_codebook_records", "read_directory", "
 
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
-_FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + 4
 
 
 def read_codebook_records(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[_spec.CodebookRecord, ...]:
@@ -118,14 +117,14 @@ def read_directory(view: memoryview, at: int, count: int) -> tuple[_spec.Directo
         record = _spec.unpack_directory_record(view, place)
         check_reserved(record, place, places)
         _check_chunk_type(record, place)
-        if record.size < _FRAME_SIZE:
+        if record.size < _spec.CHUNK_HEADER_SIZE:
             raise FormatError(
                 _spec.ERROR_INDEX,
                 place + places["size"],
                 "CHK-3",
                 "size",
                 found=record.size,
-                wanted=f"{_FRAME_SIZE} or more",
+                wanted=f"{_spec.CHUNK_HEADER_SIZE} or more",
             )
         if record.type in _SINGLE_CHUNKS:
             if record.type in seen or record.id or record.layer:

@@ -12,8 +12,6 @@ from csplat.errors import FormatError, UnsupportedError
 
 __all__ = ["check_coverage", "read_tiles", "scaled_step"]
 
-_FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + 4
-
 
 def scaled_step(step: float, exponent: int, least: float = 2.0**-1022) -> float | None:
     """Return step × 2^exponent (exact), or `None` where it is not finite or below `least` (TIL-9, LAT-1)."""
@@ -169,14 +167,14 @@ def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -
             raise FormatError(
                 _spec.ERROR_INDEX, place, "TIL-3", "layer", found=record.layer, wanted=f"{head.sh_degree} at most"
             )
-        if record.size < _FRAME_SIZE:
+        if record.size < _spec.CHUNK_HEADER_SIZE:
             raise FormatError(
                 _spec.ERROR_INDEX,
                 place + _spec.LAYER_RECORD_OFFSETS["size"],
                 "CHK-3",
                 "size",
                 found=record.size,
-                wanted=f"{_FRAME_SIZE} or more",
+                wanted=f"{_spec.CHUNK_HEADER_SIZE} or more",
             )
         last = record.layer
         layers[last] = record

@@ -38,7 +38,7 @@ def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: in
     record = header.chunk(kind)
     if record is None:
         return None
-    cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "JSN-2")
+    cursor = open_chunk(view, record, record.type, record.flags, "JSN-2")
     at = cursor.at
     text = read_stream(cursor, None, 1, count_max=json_bytes).tobytes()
     cursor.finish()

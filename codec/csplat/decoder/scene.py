@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder.blocks import Codebook
 from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
-from csplat.decoder.container import check_digest, check_length, open_chunk, read_file_header, view_of
+from csplat.decoder.container import check_length, open_chunk, read_file_header, view_of
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.index import read_header
 from csplat.decoder.integers import empty_integers, integer_part, write_integers
@@ -52,7 +52,7 @@ class Scene:
         options: what the encoder was asked (`None`: not stated, or a part was decoded).
         stated_errors: errors that the file states (`None`: likewise).
         checks: which checks were made: `header_crc`, `index_crc`, `chunk_crc` (of all that was
-            used), `all_chunk_crcs`, `digest`.
+            used), `all_chunk_crcs`.
     """
 
     header: SceneHeader
@@ -120,8 +120,8 @@ def decode(
         The splats. What is returned of a part equals the same part of a whole decode.
 
     Raises:
-        FormatError: the file breaks a clause. A whole decode checks all of them, the digest
-            and every chunk's CRC included; a part checks what it reads.
+        FormatError: the file breaks a clause. A whole decode checks all of them, every chunk's
+            CRC included; a part checks what it reads.
         UnsupportedError: the file asks for what this version does not have.
         LimitError: the file asks for more than `limits`.
         InputError: an argument is at fault.
@@ -155,7 +155,7 @@ def decode_scene(
     _run(job, work, threads)
     model = _model(header, arrays, metadata or {}, cameras)
     checks = ("header_crc", "index_crc", "chunk_crc")
-    return Scene(header, model, options, stated, (*checks, "all_chunk_crcs", "digest") if job.whole else checks)
+    return Scene(header, model, options, stated, (*checks, "all_chunk_crcs") if job.whole else checks)
 
 
 def decode_integers(
@@ -194,8 +194,8 @@ def iter_tiles(
 ) -> Iterator[DecodedTile]:
     """Decode tile by tile, in memory for one tile and the codebooks.
 
-    An iteration over all tiles checks the digest, and the CRC of every chunk but the tiles' own,
-    before it gives the first. `limits.splats` does not apply, `limits.bytes` to one tile at a time.
+    An iteration over all tiles checks every chunk but the tiles' own before it gives the first; damage of a tile
+    shows when it is its turn. `limits.splats` does not apply, `limits.bytes` to one tile at a time.
 
     Args:
         data: the whole file; an `mmap` need not fit the memory.
@@ -244,7 +244,7 @@ def _read_side_chunks(job: _Job) -> tuple[dict[str, Any] | None, StatedErrors | 
         return None, None
     for record in job.header.directory:
         if record.type not in _spec.CHUNK_NAMES:
-            open_chunk(job.view, record.offset, record.size, record.type, record.flags, "CHK-2")
+            open_chunk(job.view, record, record.type, record.flags, "CHK-2")
     with np.errstate(all="ignore"):
         check_unnamed_codebooks(job.view, job.header)
     options = read_json(job.view, job.header, _spec.CHUNK_OPTIONS, job.limits.json_bytes)
@@ -258,9 +258,9 @@ def _check_json(job: _Job) -> None:
 
 
 def _run(job: _Job, work: Callable[[int, Tile, int, dict[int, Codebook]], None], threads: int | None) -> None:
-    """Decode the tiles, in threads: NumPy, zlib and hashlib release the GIL on large data.
+    """Decode the tiles, in threads: NumPy and zlib release the GIL on large data.
 
-    The error of the first tile at fault is raised, whatever the threads; the digest's comes last.
+    The error of the first tile at fault is raised, whatever the threads.
 
     Args:
         job: what to decode.
@@ -279,20 +279,15 @@ def _run(job: _Job, work: Callable[[int, Tile, int, dict[int, Codebook]], None],
             work(place, job.tiles[place], starts[place], books)
 
     places = range(len(job.tiles))
-    count = _thread_count(threads, len(places) + job.whole)
+    count = _thread_count(threads, len(places))
     if count == 1:
         for place in places:
             quiet(place)
-        if job.whole:
-            check_digest(job.view, job.header.digest)
         return
     with ThreadPoolExecutor(count, "csplat") as pool:
-        digest: list[Future[None]] = []
-        if job.whole:
-            digest.append(pool.submit(check_digest, job.view, job.header.digest))
         futures = [pool.submit(quiet, place) for place in places]
         try:
-            for future in (*futures, *digest):
+            for future in futures:
                 future.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -309,7 +304,6 @@ def _thread_count(threads: int | None, task_count: int) -> int:
 def _iterate(job: _Job) -> Iterator[DecodedTile]:
     header = job.header
     if job.whole:
-        check_digest(job.view, header.digest)
         _read_side_chunks(job)
         _check_json(job)
     with np.errstate(all="ignore"):

@@ -63,7 +63,7 @@ def read_serr(view: memoryview, header: SceneHeader) -> StatedErrors | None:
     record = header.chunk(_spec.CHUNK_STATED_ERRORS)
     if record is None:
         return None
-    cursor = open_chunk(view, record.offset, record.size, record.type, record.flags, "SER-3")
+    cursor = open_chunk(view, record, record.type, record.flags, "SER-3")
     at = cursor.take(_spec.STATED_ERRORS_HEAD_SIZE)
     head = _spec.unpack_stated_errors_head(view, at)
     if head.error_flags & ~sum(_spec.ERROR_FLAG_NAMES):

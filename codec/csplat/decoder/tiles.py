@@ -104,7 +104,7 @@ def read_tile(
     for layer in tile.layers.values():
         if degree < layer.layer <= _spec.SH_DEGREE_MAX:
             continue
-        cursor = open_chunk(view, layer.offset, layer.size, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
+        cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
         if layer.layer == _spec.LAYER_EXTRA:
             wanted = [_spec.ATTRIBUTE_EXTRA] * len(header.extras)
         else:
@@ -113,7 +113,7 @@ def read_tile(
                 for record in header.attributes
                 if _spec.ATTRIBUTE_LAYER[record.attribute] == layer.layer
             ]
-        _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), tile, layer.layer, len(wanted))
+        _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), layer.layer, len(wanted))
         for place, attribute in enumerate(wanted):
             if attribute == _spec.ATTRIBUTE_EXTRA:
                 result.extra.append(read_raw(cursor, context, place))
@@ -123,12 +123,11 @@ def read_tile(
     return result
 
 
-def _read_tile_head(view: memoryview, at: int, tile: Tile, layer: int, block_count: int) -> None:
+def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> None:
     head = _spec.unpack_tile_head(view, at)
     places = _spec.TILE_HEAD_OFFSETS
     check_reserved(head, at, places)
     for name, found, wanted, code, clause in (
-        ("tile_index", head.tile_index, tile.index, _spec.ERROR_INDEX, "TLE-1"),
         ("layer", head.layer, layer, _spec.ERROR_INDEX, "TLE-1"),
         # A layer of more than 255 extra columns cannot be counted and is refused here.
         ("block_count", head.block_count, block_count, _spec.ERROR_STREAM, "TLE-2"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,16 +79,17 @@ def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
     layers: dict[tuple[int, int], _spec.LayerRecord] = {}
     for place, chunk in _in_order(scene, tiles):
         flags = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[chunk.type])
-        framed = _frame(chunk, flags)
+        head = _spec.pack_chunk_header(_spec.ChunkHeader(chunk.type, flags, 0, len(chunk.payload)))
+        where = (len(head) + len(chunk.payload), offset, _crc(head, chunk.payload))
         if place is None:
-            directory.append(_spec.DirectoryRecord(chunk.type, flags, chunk.id, chunk.layer, 0, 0, len(framed), offset))
+            directory.append(_spec.DirectoryRecord(chunk.type, flags, chunk.id, chunk.layer, 0, 0, *where))
         else:
-            layers[place] = _spec.LayerRecord(chunk.layer, 0, 0, len(framed), offset)
-        parts.append(framed)
-        offset += len(framed)
+            layers[place] = _spec.LayerRecord(chunk.layer, 0, 0, *where)
+        parts += [head, chunk.payload]
+        offset += where[0]
     index = _index(scene, tiles, directory, layers)
     assert len(index) == index_size
-    return _with_header(index, parts, offset)
+    return b"".join([_header(len(index), offset), index, *parts])
 
 
 def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
@@ -102,14 +102,13 @@ def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[t
         for number, tile in enumerate(tiles):
             if layer in tile.layers:
                 blocks = tile.layers[layer]
-                head = _spec.pack_tile_head(_spec.TileHead(number, layer, len(blocks), 0))
+                head = _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0))
                 yield (number, layer), FileChunk(_spec.CHUNK_TILE, head + b"".join(blocks), layer=layer)
 
 
-def _frame(chunk: FileChunk, flags: int) -> bytes:
-    head = _spec.pack_chunk_header(_spec.ChunkHeader(chunk.type, flags, 0, len(chunk.payload)))
-    crc = zlib.crc32(chunk.payload, zlib.crc32(head))
-    return head + chunk.payload + crc.to_bytes(4, "little")
+def _crc(head: bytes, payload: bytes) -> int:
+    """CHK-1: of a chunk's header and payload."""
+    return zlib.crc32(payload, zlib.crc32(head))
 
 
 def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
@@ -177,7 +176,7 @@ def _index(
     return index + zlib.crc32(index).to_bytes(4, "little")
 
 
-def _with_header(index: bytes, parts: Sequence[bytes], file_size: int) -> bytes:
+def _header(index_size: int, file_size: int) -> bytes:
     header = _spec.Header(
         magic=_spec.MAGIC,
         version_major=_spec.VERSION_MAJOR,
@@ -185,14 +184,9 @@ def _with_header(index: bytes, parts: Sequence[bytes], file_size: int) -> bytes:
         profile=_spec.PROFILE_BASE,
         reserved_0=0,
         reserved_1=0,
-        index_size=len(index),
+        index_size=index_size,
         file_size=file_size,
         header_crc=0,
-        digest=b"",
     )
     fixed = _spec.pack_header(header)[: _spec.HEADER_OFFSETS["header_crc"]]
-    fixed += zlib.crc32(fixed).to_bytes(4, "little")
-    digest = hashlib.sha256(fixed)
-    for part in (index, *parts):
-        digest.update(part)
-    return b"".join([fixed, digest.digest(), index, *parts])
+    return fixed + zlib.crc32(fixed).to_bytes(4, "little")

@@ -8,6 +8,12 @@ import { forged, hash, refusal, serve, vector } from './helpers.mjs';
 const rich = vector('valid/rich');
 const seeded = vector('extreme/seeded');
 
+/** Read every part of a file. */
+async function readAll(reader) {
+  await reader.describe();
+  for (const { index } of reader.header.tiles) await reader.readTile(index, { extra: true });
+}
+
 test('one request for header and index of a small file, none for what came with it', async (t) => {
   const { url, requests } = await serve(t, seeded);
   const reader = await CsplatReader.open(url);
@@ -16,7 +22,7 @@ test('one request for header and index of a small file, none for what came with 
   assert.equal(hash(tile.shN), hash((await decode(seeded)).shN));
   assert.deepEqual(
     { ...reader.checks, chunks: reader.checks.chunks > 0 },
-    { header: true, index: true, chunks: true, digest: false },
+    { header: true, index: true, chunks: true },
   );
 });
 
@@ -117,41 +123,14 @@ test('of a part that begins in the first request only the rest is fetched', asyn
   }
 });
 
-test('a server without ranges sends the whole file, whose digest is then checked', async (t) => {
+test('a server without ranges sends the whole file', async (t) => {
   const { url, requests } = await serve(t, seeded, { ranges: false });
   const received = [];
   const reader = await CsplatReader.open(url, { onProgress: (...progress) => received.push(progress) });
   assert.equal(hash((await reader.readTile(0)).shN), hash((await decode(seeded)).shN));
   assert.equal(requests.length, 1);
-  assert.equal((await reader.finish()).digest, true);
+  await readAll(reader);
   assert.equal(received.at(-1)[0], seeded.length);
-});
-
-test('of a file that comes whole, finish tells a wrong digest, and nothing more is read (HDR-12)', async (t) => {
-  const { url } = await serve(t, vector('invalid/digest'), { ranges: false });
-  const reader = await CsplatReader.open(url);
-  assert.equal((await refusal(() => reader.finish())).code, 'E_DIGEST');
-  assert.equal((await refusal(() => reader.readTile(0))).code, 'E_DIGEST');
-  assert.equal(reader.checks.digest, false);
-});
-
-test('so does a server that honours ranges at first and then sends the whole file', async (t) => {
-  for (const [name, file] of [
-    ['E_DIGEST', vector('invalid/digest')],
-    [null, seeded],
-  ]) {
-    const { url, requests } = await serve(t, file, { ranges: 2 });
-    const reader = await CsplatReader.open(url, { firstBytes: 64 });
-    await reader.readTile(0);
-    assert.ok(requests.length > 2);
-    if (name) assert.equal((await refusal(() => reader.finish())).code, name);
-    else assert.equal((await reader.finish()).digest, true);
-  }
-});
-
-test('of a file that comes in parts finish waits for nothing', async (t) => {
-  const { url } = await serve(t, seeded);
-  assert.equal((await (await CsplatReader.open(url)).finish()).digest, false);
 });
 
 test('files cut short and files too long, with and without ranges', async (t) => {
@@ -161,16 +140,12 @@ test('files cut short and files too long, with and without ranges', async (t) =>
     for (const size of [0, 10, 64, 300, rich.length - 1]) {
       const { url } = await serve(t, rich.subarray(0, size), { ranges });
       const error = await refusal(async () => {
-        const reader = await CsplatReader.open(url); // with ranges the server says how long the file is
-        await reader.source.complete; // without, the end of the body does
+        await readAll(await CsplatReader.open(url)); // with ranges the server says how long the file is
       });
       assert.equal(error.code, 'E_TRUNCATED', `${size} bytes, ranges ${ranges}`);
     }
     const { url } = await serve(t, longer, { ranges });
-    const error = await refusal(async () => {
-      const reader = await CsplatReader.open(url);
-      await reader.source.complete;
-    });
+    const error = await refusal(async () => readAll(await CsplatReader.open(url)));
     assert.equal(error.code, 'E_TRAILING');
   }
 });

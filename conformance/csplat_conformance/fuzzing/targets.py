@@ -30,7 +30,6 @@ LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
 _JS_LIMITS = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
 _LARGEST_SEED = 3000  # bytes: small files make many cases a second
-_FRAME = _spec.CHUNK_HEADER_SIZE + 4
 _JS_MEMORY = 700_000_000  # bytes; a heap of 512 MiB, and Node
 
 
@@ -128,12 +127,12 @@ class DecoderTarget:
 
     def smaller(self, data: bytes, corpus: Sequence[Built]) -> Generator[bytes, bytes | None, None]:
         """Undo one changed byte after the other, where the length is that of a seed."""
-        same = [base.data for base in corpus if len(base.data) == len(data)]
+        same = [base for base in corpus if len(base.data) == len(data)]
         if not same:
             return
-        base = min(same, key=lambda other: sum(a != b for a, b in zip(other, data, strict=True)))
-        for at in [i for i in range(len(data)) if data[i] != base[i]]:
-            kept = yield repair(data[:at] + base[at : at + 1] + data[at + 1 :])
+        base = min(same, key=lambda other: sum(a != b for a, b in zip(other.data, data, strict=True)))
+        for at in [i for i in range(len(data)) if data[i] != base.data[i]]:
+            kept = yield repair(data[:at] + base.data[at : at + 1] + data[at + 1 :], base.records)
             data = data if kept is None else kept
 
     def memory(self) -> str:
@@ -192,7 +191,9 @@ def _mapped(data: bytes) -> Built | None:
         found = mapped(data)
     except (ValueError, LookupError, struct.error):
         return None
-    inside = all(offset + size <= len(data) and size >= _FRAME for offset, size in found.spans.values())
+    inside = all(
+        offset + size <= len(data) and size >= _spec.CHUNK_HEADER_SIZE for offset, size in found.spans.values()
+    )
     return found if inside else None
 
 

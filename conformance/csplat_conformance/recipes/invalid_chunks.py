@@ -6,10 +6,12 @@ import math
 from dataclasses import replace
 
 from csplat import _spec
-from csplat_conformance.broken import patched, rich, small, swapped, whole
-from csplat_conformance.builder import build
+from csplat_conformance.broken import patched, rich, small, whole
+from csplat_conformance.builder import Built, build
 from csplat_conformance.samples import (
+    OPACITIES,
     Recipe,
+    levels,
     rich_scene,
     scene,
     tile,
@@ -31,7 +33,8 @@ def chunk_recipes() -> list[Recipe]:
 
 def _chunks() -> list[Recipe]:
     base, one = rich(), small()
-    twins = build(scene(tiles=[tile(1), tile(1, corner=(0, 0, 0))]))
+    faint = tile(1, changes={OPACITIES: levels([3, 1])})
+    twins = build(scene(tiles=[tile(1), faint]))
     first, second = (f"tile[{i}].layer[0]" for i in (0, 1))
     tail = "TILE.0.0/"
     return [
@@ -63,16 +66,33 @@ def _chunks() -> list[Recipe]:
         ),
         patched("chunk_size_zero", "a size of 0", "CHK-3", "E_INDEX", one, {f"{first}.size": 0}),
         patched(
-            "directory_size_15",
+            "directory_size_11",
             "a directory record's size, a byte below that of an empty chunk",
             "CHK-3",
             "E_INDEX",
             base,
-            {"directory[META].size": 15},
+            {"directory[META].size": 11},
         ),
-        patched("chunk_crc", "a tile's CRC alone is wrong", "CHK-1", "E_CRC", one, {f"{tail}crc": 7}),
         patched(
-            "metadata_crc", "the CRC of the metadata alone is wrong", "CHK-1 CHK-2", "E_CRC", base, {"META/crc": 7}
+            "chunk_crc",
+            "the CRC of a tile alone is wrong",
+            "CHK-1 HDR-12",
+            "E_CRC",
+            one,
+            {f"{first}.crc": 7},
+            at=f"{tail}header.type",
+        ),
+        _misplaced(
+            "chunk_of_another_file", "a tile's chunk, sound in itself, of another file", one, ("TILE.1.0",), twins
+        ),
+        patched(
+            "metadata_crc",
+            "the CRC of the metadata alone is wrong",
+            "CHK-1 CHK-2",
+            "E_CRC",
+            base,
+            {"directory[META].crc": 7},
+            at="META/header.type",
         ),
         patched(
             "stated_errors_crc",
@@ -80,7 +100,8 @@ def _chunks() -> list[Recipe]:
             "CHK-1 CHK-2",
             "E_CRC",
             base,
-            {"SERR/crc": 7},
+            {"directory[SERR].crc": 7},
+            at="SERR/header.type",
         ),
         whole("codebook_tail", "a byte after the last stage", "CDB-2", "E_STREAM", _codebook_tail(), "CODB.2.0/tail"),
         _unknown_crc(),
@@ -142,15 +163,7 @@ def _chunks() -> list[Recipe]:
             base,
             {"directory[META].flags": _KNOWN, "META/header.flags": _KNOWN},
         ),
-        patched(
-            "tiles_swapped",
-            "each tile's record names the other's chunk",
-            "TLE-1",
-            "E_INDEX",
-            twins,
-            swapped(twins, first, second),
-            at="TILE.1.0/head.tile_index",
-        ),
+        _misplaced("tiles_swapped", "the chunks of two tiles have changed places", twins, ("TILE.1.0", "TILE.0.0")),
         patched("tile_layer", "the chunk says another layer", "TLE-1", "E_INDEX", one, {f"{tail}head.layer": 1}),
         patched(
             "codebook_chunk_other_id",
@@ -181,7 +194,24 @@ def _chunks() -> list[Recipe]:
 
 def _unknown_crc() -> Recipe:
     base = build(scene(chunks=(Chunk(b"priv", payload=b"x", flags=0),)))
-    return patched("unknown_chunk_crc", "the CRC of an unknown chunk", "CHK-1 CHK-2", "E_CRC", base, {"priv/crc": 7})
+    return patched(
+        "unknown_chunk_crc",
+        "the CRC of an unknown chunk",
+        "CHK-1 CHK-2",
+        "E_CRC",
+        base,
+        {"directory[priv].crc": 7},
+        at="priv/header.type",
+    )
+
+
+def _misplaced(name: str, why: str, base: Built, chunks: tuple[str, ...], source: Built | None = None) -> Recipe:
+    """Return a file whose first chunks are replaced by equally long ones, its own or another file's."""
+    spans = [(source or base).spans[chunk] for chunk in chunks]
+    new = b"".join((source or base).data[offset : offset + size] for offset, size in spans)
+    at = base.spans["TILE.0.0"][0]
+    data = base.data[:at] + new + base.data[at + len(new) :]
+    return Recipe(f"invalid/{name}", why, ("CHK-1",), lambda: data, None, "E_CRC", at)
 
 
 def _texts() -> list[Recipe]:
@@ -270,7 +300,7 @@ def _texts() -> list[Recipe]:
             "E_STREAM",
             base,
             {"SERR/head.record_count": 2},
-            at="SERR/crc",
+            at="CODB.2.0/header.type",
         ),
         patched(
             "error_records_left",

@@ -27,7 +27,7 @@ def _index() -> list[Recipe]:
     index_size = _spec.unpack_header(base.data).index_size
     padded = build(scene(gap=bytes(4)))
     return [
-        patched("index_crc", "the index's CRC alone is wrong", "IDX-1", "E_CRC", base, {"index.crc": 1}),
+        patched("index_crc", "the index's CRC alone is wrong", "IDX-1 HDR-12", "E_CRC", base, {"index.crc": 1}),
         patched(
             "index_rest",
             "four bytes of the index belong to no record",

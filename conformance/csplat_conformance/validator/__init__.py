@@ -3,7 +3,7 @@
     >>> from csplat_conformance.validator import validate
     >>> for violation in validate(open("scene.csplat", "rb").read()).violations:     # doctest: +SKIP
     ...     print(violation)
-    CHK-1 E_CRC at byte 498, TILE.0.0/crc: 0x00000007, computed 0x2a0c6f1e
+    CHK-1 E_CRC at byte 244, TILE.0.0: tile[0].layer[0].crc is 0x00000007, computed 0x15ca0d03
 
 It is written from the spec and shares nothing with the decoder but the numbers of the registry. Where a decoder stops
 it goes on: a chunk whose CRC is wrong is still read, a stream that is damaged is stepped over by the size in its head.

@@ -1,8 +1,7 @@
-"""From the first byte to the last: header, index, chunks, digest."""
+"""From the first byte to the last: header, index, chunks."""
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
@@ -90,7 +89,7 @@ def _check(
     if header is None:
         findings.skip("everything behind the magic and the version", "this is no file of this version")
         return
-    _check_digest(view, header, findings)
+    _check_length(view, header.record.file_size, findings)
     end = _index_end(view, header, findings)
     if end is None:
         findings.skip("index and chunks", "the index is not whole")
@@ -153,22 +152,12 @@ def _read_header(view: memoryview, findings: Findings) -> Header | None:
     return header
 
 
-def _check_digest(view: memoryview, header: Header, findings: Findings) -> None:
-    """HDR-5, HDR-6, HDR-8. The digest of a file that is cut is not known."""
-    size = header.record.file_size
+def _check_length(view: memoryview, size: int, findings: Findings) -> None:
+    """HDR-5, HDR-6."""
     if len(view) < size:
         findings.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
-        findings.skip("the digest", "the data ends early")
-        return
-    if len(view) > size:
+    elif len(view) > size:
         findings.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
-    start = _spec.HEADER_OFFSETS["digest"]
-    hashed = hashlib.sha256(view[:start])
-    hashed.update(view[_spec.HEADER_SIZE : max(size, _spec.HEADER_SIZE)])
-    if hashed.digest() != header.record.digest:
-        stored = header.record.digest.hex()
-        findings.of("HDR-8", header, "digest", f"{stored[:16]}..., computed {hashed.hexdigest()[:16]}...")
-    findings.checks.append("digest")
 
 
 def _index_end(view: memoryview, header: Header, findings: Findings) -> int | None:

@@ -14,8 +14,6 @@ from csplat_conformance.validator.reading import Payload, place
 
 __all__ = ["Chunk", "check_coverage", "check_frame", "chunk_record", "read_directory", "registered_flags"]
 
-_CRC_SIZE = 4
-_FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + _CRC_SIZE
 _SINGLE = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 #: Where a chunk of the whole file, or one of a layer, belongs among others (4.3.6).
 _LAST = max(_spec.LAYER_NAMES) + 1
@@ -50,7 +48,7 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Bytes, header and CRC included."""
+        """Bytes, header included."""
         return int(self.record.record.size)
 
     @property
@@ -67,9 +65,10 @@ def registered_flags(kind: bytes) -> int:
 
 
 def chunk_record(findings: Findings, chunk: Chunk) -> Chunk:
-    """CHK-3, as far as a record alone shows it: a chunk has a frame."""
-    if chunk.size < _FRAME_SIZE:
-        findings.of("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {_FRAME_SIZE} at least")
+    """CHK-3, as far as a record alone shows it: a chunk has a header."""
+    least = _spec.CHUNK_HEADER_SIZE
+    if chunk.size < least:
+        findings.of("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
     return chunk
 
 
@@ -170,7 +169,7 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
             findings.of("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
         end = chunk.offset + chunk.size
         # A chunk that begins within another is not read: a file could name the same bytes a million times.
-        chunk.whole = chunk.size >= _FRAME_SIZE and chunk.offset >= covered and end <= min(data_size, file_size)
+        chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
         if not chunk.whole:
             findings.skip(chunk.name, "its bytes are not there, or another chunk's")
         expected = end
@@ -196,13 +195,15 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
         clause: the one that wants the payload to end with its last structure.
         findings: what is told.
     """
-    at, end = chunk.offset, chunk.offset + chunk.size - _CRC_SIZE
-    stored, computed = int.from_bytes(view[end : end + _CRC_SIZE], "little"), zlib.crc32(view[at:end])
+    at, end = chunk.offset, chunk.offset + chunk.size
+    stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])
     if stored != computed:
-        findings.add("CHK-1", end, f"{chunk.name}/crc", f"{stored:#010x}, computed {computed:#010x}")
+        findings.add(
+            "CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}"
+        )
     header = place(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
     findings.reserved(header)
-    payload_size = chunk.size - _FRAME_SIZE
+    payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
     for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
         found = getattr(header.record, key)
         if found != wanted:

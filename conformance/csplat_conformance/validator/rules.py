@@ -23,7 +23,6 @@ CODES: Final[dict[str, str]] = {
     "HDR-5": _spec.ERROR_TRUNCATED,
     "HDR-6": _spec.ERROR_TRAILING,
     "HDR-7": _spec.ERROR_VALUE,
-    "HDR-8": _spec.ERROR_DIGEST,
     "HDR-11": _spec.ERROR_TRUNCATED,
     "IDX-1": _spec.ERROR_CRC,
     "IDX-2": _spec.ERROR_INDEX,

@@ -73,10 +73,8 @@ class TileReader:
         """
         findings = self.findings
         head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
-        for key, wanted in (("tile_index", self.tile.place), ("layer", chunk.layer)):
-            found = getattr(head.record, key)
-            if found != wanted:
-                findings.of("TLE-1", head, key, f"{found}, its record says {wanted}")
+        if head.record.layer != chunk.layer:
+            findings.of("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
         if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
             findings.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
             return

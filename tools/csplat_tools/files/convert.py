@@ -251,7 +251,7 @@ def decode_file(
     report = progress or (lambda _stage, _done: None)
     report("decoding", 0.0)
     with mapped_csplat(source) as data:
-        # All bands, even if not all are wanted: the digest is that of the whole file.
+        # All bands, even if not all are wanted: damage anywhere gives no PLY.
         model = decode(data, limits=limits_for(max_splats))
     if sh_degree is not None:
         model = without_bands(model, sh_degree)

@@ -83,7 +83,7 @@ class _Cursor:
     def __init__(self, data: bytes | mmap, offset: int, size: int) -> None:
         self.data = data
         self.at = offset + _spec.CHUNK_HEADER_SIZE
-        self.end = offset + size - 4  # the CRC
+        self.end = offset + size
 
     def take(self, size: int) -> bytes:
         data = self.data[self.at : self.at + size]

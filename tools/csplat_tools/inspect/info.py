@@ -134,7 +134,6 @@ class FileFacts:
             "origin": list(header.origin),
             "antialiased": header.antialiased,
             "flat": header.flat,
-            "digest": header.digest.hex(),
             "attributes": {
                 name: {key: value for key, value in asdict(one).items() if value is not None or key in _ALWAYS}
                 for name, one in self.attributes.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import statistics
 import threading
 import time
@@ -101,7 +102,7 @@ class Measurer:
             family=candidate.family,
             settings=made.settings,
             size_bytes=len(made.data),
-            digest=header.digest.hex(),
+            sha256=hashlib.sha256(made.data).hexdigest(),
             splats=header.splat_count,
             sh_degree=header.sh_degree,
             source_splats=len(setting.source),

@@ -122,7 +122,7 @@ class Point:
         name: unique among the points.
         family: which group it belongs to.
         settings: how the file was made, JSON-compatible.
-        size_bytes: of the file. digest: SHA-256 that it states, in hexadecimal digits.
+        size_bytes: of the file. sha256: of its bytes, in hexadecimal digits.
         splats, sh_degree: of the file.
         source_splats, source_bytes: of the scene, and of its PLY.
         quality: against the source's renders.
@@ -140,7 +140,7 @@ class Point:
     family: str
     settings: Mapping[str, Any]
     size_bytes: int
-    digest: str
+    sha256: str
     splats: int
     sh_degree: int
     source_splats: int
@@ -184,7 +184,7 @@ class Point:
             "error": None,
             "settings": dict(self.settings),
             "size_bytes": self.size_bytes,
-            "digest": self.digest,
+            "sha256": self.sha256,
             "bytes_per_source_splat": self.bytes_per_source_splat,
             "ratio": self.ratio,
             "splats": self.splats,
