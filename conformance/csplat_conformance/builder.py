@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from csplat import _spec
-from csplat_conformance import coders
+from csplat_conformance import coders, deflate
 from csplat_conformance.fields import Field, Writer
 from csplat_conformance.reference import max_scale
 from csplat_conformance.repair import digest_of, repair
@@ -310,9 +310,9 @@ def _coded(packed: bytes, how: Stream) -> bytes:
     if how.coder == "zstd_rle":
         return coders.zstd_rle(packed[0], len(packed))
     coder = {
-        "deflate_stored": coders.deflate_stored,
-        "deflate_fixed": coders.deflate_fixed,
-        "deflate_dynamic": coders.deflate_dynamic,
+        "deflate_stored": deflate.deflate_stored,
+        "deflate_fixed": deflate.deflate_fixed,
+        "deflate_dynamic": deflate.deflate_dynamic,
         "zstd_raw": coders.zstd_raw,
     }[how.coder]
     return coder(packed)

@@ -5,27 +5,13 @@ from __future__ import annotations
 import zlib
 
 from csplat import _spec
+from csplat_conformance.validator.inflate import CodedError, Inflater
 
 __all__ = ["CodedError", "uncoded"]
 
 _FRAME_MAGIC = 0xFD2FB528  # RFC 8878, 3.1.1
 _CHECKSUM_SIZE = 4
 _RAW_DEFLATE = -15
-
-
-class CodedError(Exception):
-    """The coded bytes break a clause.
-
-    Args:
-        clause: COD-1 to COD-3.
-        message: how.
-        within: byte of the coded bytes that is to blame.
-    """
-
-    def __init__(self, clause: str, message: str, within: int = 0) -> None:
-        super().__init__(message)
-        self.clause = clause
-        self.within = within
 
 
 def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
@@ -40,7 +26,7 @@ def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
         `size` bytes, and whether the unused bits behind a DEFLATE stream are not 0.
 
     Raises:
-        CodedError: by COD-1, COD-2 or COD-3.
+        CodedError: by COD-1 to COD-3 or COD-5 to COD-8.
     """
     if coder == _spec.CODER_STORED:
         if len(coded) != size:
@@ -52,7 +38,7 @@ def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
 
 
 def _inflated(coded: memoryview, size: int) -> tuple[bytes, bool]:
-    """COD-2. The last byte is held back, so that its unused bits can be told from the others."""
+    """COD-2, COD-5 to COD-8. The last byte is held back, so that its unused bits can be told from the others."""
     body, last = coded[:-1], bytes(coded[-1:])
     inflater = zlib.decompressobj(_RAW_DEFLATE)
     try:
@@ -65,6 +51,7 @@ def _inflated(coded: memoryview, size: int) -> tuple[bytes, bool]:
         before = inflater.copy()
         rest = inflater.decompress(last, size + 1 - len(packed))
     except zlib.error as error:
+        Inflater(bytes(coded)).inflate(size)  # names the clause
         raise CodedError("COD-2", f"not a DEFLATE stream: {error}") from None
     packed += rest
     if len(packed) != size:
