@@ -2,6 +2,7 @@
 
 import math
 import re
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from csplat.decoder.blocks import Columns
 from csplat.decoder.morton import morton_axes
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
 from csplat.decoder.streams import _undo_run_length, undo_transforms
+from csplat_conformance.deflate import Deflate
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
@@ -172,3 +174,39 @@ def test_quats(spec, levels):
     write_quats(columns(rows), record(3, _spec.MAPPING_UNIT_W, levels=levels, step=0.0), out)
     expected = np.array([spec.quat(*row, levels) for row in rows], np.float32)
     assert expected.tobytes() == out.tobytes()
+
+
+def lengths_of_codes(count):
+    """Yield all code lengths of 0 to 4 bits for so many symbols."""
+    for number in range(5**count):
+        yield [number // 5**i % 5 for i in range(count)]
+
+
+def reads(stream) -> bool:
+    try:
+        return zlib.decompressobj(-15).decompress(stream.literals(256).end()) == b"\7"
+    except zlib.error:
+        return False
+
+
+def test_codes_of_distances_are_allowed_where_zlib_reads_them(spec):
+    for lengths in lengths_of_codes(4):
+        distances = dict(enumerate(lengths))
+        stream = Deflate().dynamic({7: 1, 256: 1}, distances, counts=(257, 4)).literals(7)
+        assert spec.is_allowed(lengths, "distance") == reads(stream), lengths
+
+
+def test_codes_of_literals_are_allowed_where_zlib_reads_them(spec):
+    for lengths in lengths_of_codes(4):
+        literals = dict(zip((7, 8, 255, 256), lengths, strict=True))
+        if literals[256]:  # COD-7
+            stream = Deflate().dynamic(literals, {}, 0).literals(256).fixed().literals(7)
+            assert spec.is_allowed(lengths, "literal/length") == reads(stream), lengths
+
+
+def test_codes_of_code_lengths_are_allowed_where_zlib_reads_them(spec):
+    for lengths in lengths_of_codes(4):
+        meta = dict(enumerate(lengths))
+        if lengths[0] and lengths[1]:  # else there is no block to write with them
+            stream = Deflate().dynamic({7: 1, 256: 1}, {}, meta=meta).literals(7)
+            assert spec.is_allowed(lengths, "code length") == reads(stream), lengths

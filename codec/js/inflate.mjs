@@ -1,5 +1,6 @@
 // Raw DEFLATE (RFC 1951) by the platform, held to COD-2 and COD-4: the stream ends within the last byte, gives exactly
-// the declared size, and no more than that is ever produced.
+// the declared size, and no more than that is ever produced. COD-5 to COD-8 are what zlib, and with it the platforms,
+// refuse of themselves.
 
 import { UnsupportedError } from './errors.mjs';
 import { ERROR_UNSUPPORTED } from './spec.mjs';
@@ -9,16 +10,34 @@ import { ERROR_UNSUPPORTED } from './spec.mjs';
 const CHUNK_BYTES = 1 << 20; // output of one step of zlib at most
 const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream: at most 16 MiB come out of it unasked
 
+/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2. Browsers do not say it. */
+const CLAUSES = new Map([
+  ['symbols', 'COD-5'], // too many length or distance symbols
+  ['set', 'COD-6'], // invalid code lengths set, invalid literal/lengths set, invalid distances set
+  ['repeat', 'COD-7'], // invalid bit length repeat
+  ['end-of-block', 'COD-7'], // invalid code -- missing end-of-block
+  ['code', 'COD-8'], // invalid literal/length code, invalid distance code
+  ['back', 'COD-8'], // invalid distance too far back
+]);
+
 /** Why coded bytes are not the stream that they have to be. The caller knows where in the file they lie. */
 export class InflateError extends Error {
   /**
    * @param {string} message
    * @param {number} [at] byte of the coded bytes
+   * @param {string} [clause]
    */
-  constructor(message, at = 0) {
+  constructor(message, at = 0, clause = 'COD-2') {
     super(message);
     this.at = at;
+    this.clause = clause;
   }
+}
+
+/** @param {unknown} error of the platform */
+function refused(error) {
+  const message = error instanceof Error ? error.message : String(error);
+  return new InflateError(message, 0, CLAUSES.get(message.split(' ').at(-1) ?? ''));
 }
 
 /** @type {Promise<Inflate> | null} */
@@ -47,7 +66,7 @@ export async function zlibInflate() {
       const chunkSize = Math.max(64, Math.min(size + 1, CHUNK_BYTES));
       result = zlib.inflateRawSync(coded, { info: true, maxOutputLength: size, chunkSize });
     } catch (error) {
-      throw new InflateError(error instanceof Error ? error.message : String(error));
+      throw refused(error);
     }
     const { buffer, engine } = result;
     if (buffer.length !== size) throw new InflateError(`${buffer.length} bytes came out instead of ${size}`);
@@ -105,9 +124,7 @@ async function drain(coded, size) {
     await feeding;
   } catch (error) {
     reader.cancel().catch(() => {});
-    throw error instanceof InflateError
-      ? error
-      : new InflateError(error instanceof Error ? error.message : String(error));
+    throw error instanceof InflateError ? error : refused(error);
   }
   if (filled !== size) throw new InflateError(`${filled} bytes came out instead of ${size}`);
   return bytes;

@@ -159,7 +159,7 @@ async function unpack(payload, head, offset, inflate) {
       packed = await inflate(coded, size);
     } catch (error) {
       if (!(error instanceof InflateError)) throw error;
-      throw fault(spec.ERROR_CODER, start + error.at, 'COD-2', error.message, error);
+      throw fault(spec.ERROR_CODER, start + error.at, error.clause, error.message, error);
     }
   }
   if (packed.length !== size) throw new InputError(`options.inflate gave ${packed.length} bytes instead of ${size}`);

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from csplat import _spec
-from csplat_conformance import coders
+from csplat_conformance import coders, deflate
 from csplat_conformance.fields import Field, Writer
 from csplat_conformance.reference import max_scale
 from csplat_conformance.repair import CHUNK_RECORDS, repair, seal
@@ -316,8 +316,8 @@ def _coded(packed: bytes, how: Stream) -> bytes:
     if how.coder == "stored":
         return packed
     coder = {
-        "deflate_stored": coders.deflate_stored,
-        "deflate_fixed": coders.deflate_fixed,
-        "deflate_dynamic": coders.deflate_dynamic,
+        "deflate_stored": deflate.deflate_stored,
+        "deflate_fixed": deflate.deflate_fixed,
+        "deflate_dynamic": deflate.deflate_dynamic,
     }[how.coder]
     return coder(packed)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from csplat import _spec
 from csplat_conformance.builder import Built
-from csplat_conformance.coders import deflate_fixed, deflate_stored
+from csplat_conformance.deflate import deflate_fixed, deflate_stored
 from csplat_conformance.fields import Field, Writer
 from csplat_conformance.repair import repair
 

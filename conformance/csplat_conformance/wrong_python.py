@@ -16,8 +16,9 @@ import numpy as np
 
 from csplat import _spec, decoder
 from csplat.decoder import blocks, container, reconstruct, streams
-from csplat.errors import UnsupportedError
+from csplat.errors import FormatError, UnsupportedError
 from csplat_conformance.mistakes import Mistake
+from csplat_conformance.validator.inflate import CodedError, Inflater
 
 __all__ = ["MISTAKES"]
 
@@ -85,6 +86,32 @@ def _no_side_chunks(_right: Wrong, _job: Any) -> tuple[None, None]:
 
 def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - as the right one
     return zlib.decompressobj(-zlib.MAX_WBITS).decompress(coded, size).ljust(size, b"\0")
+
+
+class _CarelessInflater(Inflater):
+    """Inflates without looking at one clause."""
+
+    def __init__(self, coded: bytes, ignored: str) -> None:
+        super().__init__(coded)
+        self._ignored = ignored
+
+    def refuse(self, clause: str, message: str) -> None:
+        if clause != self._ignored:
+            super().refuse(clause, message)
+
+
+def _inflate_without(clause: str) -> Wrong:
+    def inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:
+        inflater = _CarelessInflater(bytes(coded), clause)
+        try:
+            packed = inflater.inflate(size)
+        except CodedError as error:
+            raise FormatError(_spec.ERROR_CODER, at, error.clause, str(error)) from None
+        if len(packed) != size or inflater.used != len(coded):
+            raise FormatError(_spec.ERROR_CODER, at, "COD-2", "another size")
+        return packed
+
+    return inflate
 
 
 def _skip_critical(right: Wrong, record: _spec.DirectoryRecord, at: int) -> None:
@@ -230,6 +257,12 @@ MISTAKES: Final = (
     Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", _replaced("view_of", _cut_to_size)),
     Mistake("tails of payloads", "a payload may go on", "TLE-3", _method(container.Cursor, "finish", _nothing)),
     Mistake("lenient inflate", "as most libraries do by default", "COD-2", _replaced("_inflate", _tail_of_inflate)),
+    Mistake(
+        "DEFLATE, counts", "any number of 5 bits is a count", "COD-5", _replaced("_inflate", _inflate_without("COD-5"))
+    ),
+    Mistake("DEFLATE, codes", "complete or not", "COD-6", _replaced("_inflate", _inflate_without("COD-6"))),
+    Mistake("DEFLATE, lengths", "repetitions as they come", "COD-7", _replaced("_inflate", _inflate_without("COD-7"))),
+    Mistake("DEFLATE, symbols", "each means something", "COD-8", _replaced("_inflate", _inflate_without("COD-8"))),
     Mistake("reserved bits", "reserved fields are not looked at", "RES-1", _replaced("check_reserved", _nothing)),
     Mistake(
         "critical chunks", "whatever is unknown is skipped", "DIR-2", _replaced("_check_chunk_type", _skip_critical)

@@ -19,6 +19,15 @@ __all__ = ["Ints", "read_stream", "undo_transforms"]
 Ints = NDArray[Any]
 
 _PLACES = _spec.STREAM_HEAD_OFFSETS
+#: What zlib says of a stream that it refuses, by its last word, where that is not COD-2.
+_ZLIB_CLAUSES = {
+    "symbols": "COD-5",  # too many length or distance symbols
+    "set": "COD-6",  # invalid code lengths set, invalid literal/lengths set, invalid distances set
+    "repeat": "COD-7",  # invalid bit length repeat
+    "end-of-block": "COD-7",  # invalid code -- missing end-of-block
+    "code": "COD-8",  # invalid literal/length code, invalid distance code
+    "back": "COD-8",  # invalid distance too far back
+}
 
 
 def read_stream(
@@ -111,7 +120,8 @@ def _inflate(coded: memoryview, size: int, at: int) -> bytes:
         # see the end of one that does not.
         packed = inflater.decompress(coded, size + 1)
     except zlib.error as error:
-        raise FormatError(_spec.ERROR_CODER, at, "COD-2", str(error)) from None
+        clause = _ZLIB_CLAUSES.get(str(error).split()[-1], "COD-2")
+        raise FormatError(_spec.ERROR_CODER, at, clause, str(error)) from None
     if len(packed) != size:
         found = f"more than {size} bytes" if len(packed) > size else f"{len(packed)} bytes"
         raise FormatError(_spec.ERROR_CODER, at, "COD-2", found=found, wanted=f"{size} bytes")

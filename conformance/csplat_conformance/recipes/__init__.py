@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from csplat_conformance.boundaries import boundary_recipes
+from csplat_conformance.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
 from csplat_conformance.recipes.extreme import extreme_recipes
 from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
 from csplat_conformance.recipes.invalid_blocks import block_recipes
@@ -30,6 +31,7 @@ def all_recipes() -> list[Recipe]:
         combined_recipes,
         extreme_recipes,
         extreme_stream_recipes,
+        valid_deflate_recipes,
         rendered_recipes,
     )
     invalid = (
@@ -40,6 +42,7 @@ def all_recipes() -> list[Recipe]:
         tile_recipes,
         chunk_recipes,
         stream_recipes,
+        invalid_deflate_recipes,
         block_recipes,
         codebook_recipes,
     )

@@ -7,7 +7,7 @@ from dataclasses import replace
 from csplat import _spec
 from csplat_conformance.broken import patched, small, whole
 from csplat_conformance.builder import build
-from csplat_conformance.coders import deflate_fixed, deflate_stored
+from csplat_conformance.deflate import deflate_fixed, deflate_stored
 from csplat_conformance.samples import (
     MEANS,
     OPACITIES,

@@ -5,25 +5,11 @@ from __future__ import annotations
 import zlib
 
 from csplat import _spec
+from csplat_conformance.validator.inflate import CodedError, Inflater
 
 __all__ = ["CodedError", "uncoded"]
 
 _RAW_DEFLATE = -15
-
-
-class CodedError(Exception):
-    """The coded bytes break a clause.
-
-    Args:
-        clause: COD-1 or COD-2.
-        message: how.
-        within: byte of the coded bytes that is to blame.
-    """
-
-    def __init__(self, clause: str, message: str, within: int = 0) -> None:
-        super().__init__(message)
-        self.clause = clause
-        self.within = within
 
 
 def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
@@ -38,7 +24,7 @@ def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
         `size` bytes, and whether the unused bits behind a DEFLATE stream are not 0.
 
     Raises:
-        CodedError: by COD-1 or COD-2.
+        CodedError: by COD-1, COD-2 or COD-5 to COD-8.
     """
     if coder == _spec.CODER_STORED:
         if len(coded) != size:
@@ -48,7 +34,7 @@ def uncoded(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
 
 
 def _inflated(coded: memoryview, size: int) -> tuple[bytes, bool]:
-    """COD-2. The last byte is held back, so that its unused bits can be told from the others."""
+    """COD-2, COD-5 to COD-8. The last byte is held back, so that its unused bits can be told from the others."""
     body, last = coded[:-1], bytes(coded[-1:])
     inflater = zlib.decompressobj(_RAW_DEFLATE)
     try:
@@ -61,6 +47,7 @@ def _inflated(coded: memoryview, size: int) -> tuple[bytes, bool]:
         before = inflater.copy()
         rest = inflater.decompress(last, size + 1 - len(packed))
     except zlib.error as error:
+        Inflater(bytes(coded)).inflate(size)  # names the clause
         raise CodedError("COD-2", f"not a DEFLATE stream: {error}") from None
     packed += rest
     if len(packed) != size:

@@ -1,0 +1,82 @@
+"""DEFLATE streams of the suite and the validator's own inflate, against zlib."""
+
+import random
+import zlib
+
+import pytest
+
+from csplat_conformance.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
+from csplat_conformance.recipes.deflate_streams import broken_streams, sound_streams
+from csplat_conformance.validator.coders import CodedError, uncoded
+from csplat_conformance.validator.inflate import Inflater
+
+DEFLATE = 1
+SIZE = 2000
+
+
+def by_zlib(coded, size=SIZE):
+    """Output and bytes read, or what is wrong, or that there is more output than `size`."""
+    inflater = zlib.decompressobj(-15)
+    try:
+        out = inflater.decompress(coded, size + 1)
+    except zlib.error:
+        return "refused"
+    if len(out) > size:
+        return "long"
+    return (out, len(coded) - len(inflater.unused_data)) if inflater.eof else "refused"
+
+
+def by_validator(coded, size=SIZE):
+    inflater = Inflater(coded)
+    try:
+        out = inflater.inflate(size)
+    except CodedError:
+        return "refused"
+    return "long" if len(out) > size else (out, inflater.used)
+
+
+@pytest.mark.parametrize("case", sound_streams(), ids=lambda case: case.name)
+def test_sound_streams_give_their_output(case):
+    size = len(case.output)
+
+    assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
+    assert (case.output, len(case.coded)) == by_validator(case.coded, size)
+
+
+@pytest.mark.parametrize("case", broken_streams(), ids=lambda case: case.name)
+def test_broken_streams_are_refused_for_their_clause(case):
+    assert "refused" == by_zlib(case.coded, len(case.output))
+    with pytest.raises(CodedError) as caught:
+        uncoded(memoryview(case.coded), DEFLATE, len(case.output))
+
+    assert case.clause == caught.value.clause
+
+
+def damaged(count):
+    """Yield streams with a few bits flipped, most of them in the header of the first block."""
+    rng = random.Random(1)  # noqa: S311 - damage is no secret
+    cases = [case.coded for case in sound_streams() + broken_streams() if len(case.output) < SIZE]
+    text = bytes(rng.choice(b"aaaabbcdefgh") for _ in range(300))
+    packers = [zlib.compressobj(9, zlib.DEFLATED, -15, 9, way) for way in (0, 2, 3, 4)]
+    texts = [packer.compress(text) + packer.flush() for packer in packers]
+    texts += [deflate_dynamic(text), deflate_fixed(text), deflate_stored(text, 90)]
+    for _ in range(count):
+        coded = bytearray(rng.choice(rng.choice((cases, texts))))
+        for _ in range(rng.choice((1, 1, 2, 3))):
+            bit = rng.randrange(min(8 * len(coded), rng.choice((40, 120, 3000))))
+            coded[bit >> 3] ^= 1 << (bit & 7)
+        yield bytes(coded)
+
+
+def test_the_slow_inflate_reads_what_zlib_reads_and_refuses_the_rest():
+    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(4000)]
+
+    assert [] == [pair for pair in verdicts if pair[0] != pair[1]]
+    refused = sum(zlib_says == "refused" for zlib_says, _ in verdicts)
+    assert 1000 < refused < 3500
+
+
+def test_a_code_of_code_lengths_without_codewords_is_refused():
+    nothing = Deflate().number(1, 1).number(2, 2).number(0, 14 + 4 * 3 + 258 + 3).end()
+
+    assert "refused" == by_zlib(nothing) == by_validator(nothing)
