@@ -16,7 +16,7 @@ from csplat import _spec
 from csplat_conformance._rules import CHOICES, MASKS, RANGES, Choice, Mask, Range
 from csplat_conformance.broken import patched
 from csplat_conformance.builder import Built, build
-from csplat_conformance.samples import MEANS, Recipe, attributes, morton, rich_scene, scene
+from csplat_conformance.samples import MEANS, SH0, Recipe, attributes, morton, rich_scene, scene
 
 __all__ = ["Case", "Rule", "boundary_recipes", "cases", "held"]
 
@@ -197,14 +197,15 @@ def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
 
 @cache
 def _bases() -> tuple[Built, ...]:
-    """Return a small file, and one with every structure."""
+    """Return a file without tiles, so that nothing uses what records say, a small one, one with every structure."""
     known = (_spec.DIRECTION_RIGHT, _spec.DIRECTION_DOWN, _spec.DIRECTION_FORWARD)
     rich = rich_scene()
     second = replace(rich.tiles[1], blocks=rich.tiles[1].blocks | {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)})
     every = replace(
         rich, tiles=(rich.tiles[0], second), sh_degree=3, attributes=attributes(3, ycocg=True, chroma_shift=1)
     )
-    return build(scene(axes=known)), build(every)
+    mixed = attributes(1) | {SH0 + 1: attributes(1, ycocg=True)[SH0 + 1]}
+    return build(scene(1, [], axes=known, attributes=mixed)), build(scene()), build(every)
 
 
 def _words(built: Built, structure: str, prefix: str) -> set[str]:

@@ -6,11 +6,15 @@ import struct
 from functools import cache
 from typing import Any
 
+from csplat import _spec
 from csplat_conformance.builder import Built, build
+from csplat_conformance.repair import repair
 from csplat_conformance.samples import Recipe, rich_scene, scene
 from csplat_conformance.scene import Scene
 
-__all__ = ["patched", "rich", "small", "swapped", "whole"]
+__all__ = ["cut", "patched", "rich", "small", "swapped", "whole"]
+
+_FRAME = _spec.CHUNK_HEADER_SIZE + 4
 
 
 @cache
@@ -62,6 +66,43 @@ def whole(
     place = built.fields[at].offset + within
     ids = tuple(clauses.split())
     return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=optional)
+
+
+def cut(
+    name: str,
+    why: str,
+    clauses: str,
+    code: str,
+    base: Built,
+    size: int,
+    at: str,
+    changes: dict[str, Any] | None = None,
+    within: int = 0,
+) -> Recipe:
+    """Return a recipe that shortens the payload of a file's last chunk; all sizes of the container are right.
+
+    Args:
+        name, why, clauses, code: as of `patched`.
+        base: the valid file.
+        size: bytes that are missing at the end.
+        at: field that is to blame.
+        changes: field to value, beside the sizes.
+        within: byte within that field.
+    """
+    chunk, (offset, length) = max(base.spans.items(), key=lambda item: item[1])
+    kind, *numbers = chunk.split(".")
+    record = "tile[{}].layer[{}]".format(*numbers) if kind == "TILE" else f"directory[{chunk}]"
+    sizes = {
+        f"{record}.size": length - size,
+        f"{chunk}/header.payload_size": length - _FRAME - size,
+        "header.file_size": offset + length - size,
+    }
+
+    def data() -> bytes:
+        return repair(base.patched((changes or {}) | sizes, repaired=False)[:-size])
+
+    place = base.fields[at].offset + within
+    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, place)
 
 
 def swapped(base: Built, one: str, other: str) -> dict[str, Any]:
