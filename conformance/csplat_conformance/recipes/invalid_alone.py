@@ -81,6 +81,14 @@ def _records() -> list[Recipe]:
         ),
         patched("extra_dtype_zero", "type 0 of no splats", "RES-2", "E_UNSUPPORTED", longest, {"extra[0].dtype": 0}),
         patched("extra_dtype_high", "type 9 of no splats", "RES-2", "E_UNSUPPORTED", longest, {"extra[0].dtype": 9}),
+        whole(
+            "attributes_beyond_degree",
+            "a record of band 1 in a scene of degree 0",
+            "ATT-1",
+            "E_INDEX",
+            replace(scene(1, []), sh_degree=0),
+            "index.attribute_count",
+        ),
         whole("extra_name_empty", "a name of no bytes", "EXR-1", "E_VALUE", unnamed, "extra[0].name_size"),
         patched(
             "extra_name_long",

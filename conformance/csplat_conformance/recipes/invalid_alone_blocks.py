@@ -191,6 +191,12 @@ def _coded() -> list[Recipe]:
 
     alphas = Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[0], [1]]}, {0: [[1]]}))
     turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3]]},))
+    shades = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3]]},))
+    elsewhere = (
+        (OPACITIES, alphas, book(1, ((0, 2), (0, 0)), signed([[3]]))),
+        (QUATS, turns, book(1, ((0, 1),), offset([[4, 5, 6]]))),
+        (SH0, shades, book(1, ((0, 1),), Block(_spec.CODING_LEVELS, [[4, 5, 6]]))),
+    )
     two = scene(tiles=[tile(changes={OPACITIES: book(1, ((0, 1), (0, 0)))})], codebooks=(alphas,))
     two = replace(two, attributes=two.attributes | {OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=1)})
     alpha = tile(changes={OPACITIES: book(1, ((0, 2), (0, 0)), levels([3]))})
@@ -218,6 +224,17 @@ def _coded() -> list[Recipe]:
         escaped("band_1", rich(), "TILE.0.1/sh1"),
         escaped("opacities", build(scene(tiles=[alpha], codebooks=(alphas,))), "TILE.0.0/opacities"),
         escaped("quats", build(scene(tiles=[turn], codebooks=(turns,))), "TILE.0.0/quats"),
+        *(
+            whole(
+                f"escape_of_{_spec.ATTRIBUTE_NAMES[attribute]}_by_another",
+                f"an escape block of {_spec.ATTRIBUTE_NAMES[attribute]} in a coding of other attributes",
+                "CBK-5",
+                "E_STREAM",
+                scene(tiles=[tile(changes={attribute: block})], codebooks=(table,)),
+                f"TILE.0.0/{_spec.ATTRIBUTE_NAMES[attribute]}.escape.coding",
+            )
+            for attribute, table, block in elsewhere
+        ),
         whole(
             "codebook_level_of_two", "a sum of 2 where M is 1", "LEV-1", "E_RANGE", two, "TILE.0.0/opacities.attribute"
         ),
