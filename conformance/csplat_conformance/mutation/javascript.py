@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -43,22 +42,25 @@ class JavaScriptDecoder:
 
     def __init__(self, files: Sequence[bytes]) -> None:
         self._files = files
+        self._mutants: list[Mutant] = []
         paths = sorted(js_folder().glob("*.mjs"))
         self.texts = {path.name: path.read_text(encoding="utf-8") for path in paths}
         with JsDecoder(limits=JS_LIMITS) as right:
             self._wanted = [verdict(right.ask(data)) for data in files]
 
-    @cached_property
-    def mutants(self) -> list[Mutant]:
+    @property
+    def mutants(self) -> Sequence[Mutant]:
         """All of them.
 
         Raises:
             InputError: the parser cannot be had.
         """
-        paths = [str(js_folder() / name) for name in self.texts if name not in _OTHERS]
-        words = ["node", str(js_folder() / _OPERATORS), str(_typescript()), *paths]
-        done = subprocess.run(words, capture_output=True, check=True)  # noqa: S603 - our own script
-        return [Mutant(*one) for one in json.loads(done.stdout)]
+        if not self._mutants:
+            paths = [str(js_folder() / name) for name in self.texts if name not in _OTHERS]
+            words = ["node", str(js_folder() / _OPERATORS), str(_typescript()), *paths]
+            done = subprocess.run(words, capture_output=True, check=True)  # noqa: S603 - our own script
+            self._mutants = [Mutant(*one) for one in json.loads(done.stdout)]
+        return self._mutants
 
     def valid(self, mutant: Mutant) -> bool:  # noqa: ARG002 - as of Python
         """Whether it is a program: the parser's expressions change as a whole, and so they all are."""

@@ -10,7 +10,6 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -47,15 +46,18 @@ class PythonDecoder:
 
     def __init__(self, files: Sequence[bytes]) -> None:
         self._files = files
+        self._mutants: list[Mutant] = []
         self._folder = Path(decoder.__file__).parent
         self.texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(self._folder.glob("*.py"))}
         self._codes = {file: self._compiled(file, text) for file, text in self.texts.items()}
         self._wanted = [verdict(_fuzzed_answer(data)) for data in files]
 
-    @cached_property
-    def mutants(self) -> list[Mutant]:
+    @property
+    def mutants(self) -> Sequence[Mutant]:
         """All of them."""
-        return [mutant for name, text in self.texts.items() for mutant in python_mutants(name, text)]
+        if not self._mutants:
+            self._mutants = [mutant for name, text in self.texts.items() for mutant in python_mutants(name, text)]
+        return self._mutants
 
     def valid(self, mutant: Mutant) -> bool:
         """Whether it is a program."""
