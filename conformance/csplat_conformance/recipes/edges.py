@@ -71,7 +71,7 @@ def edge_recipes() -> list[Recipe]:
         ),
         _recipe(
             "morton_each_width",
-            "codes of one to seven bytes, without byte planes and with differences",
+            "codes of one to seven bytes, as they are and as differences in byte planes",
             "MOR-2 STR-2",
             _codes(),
         ),
@@ -111,6 +111,10 @@ def _widths() -> Scene:
         tile(2, 3, 1, {SH0: signed(small, Stream(2)), SCALES: signed(small, Stream(2))}),
         tile(3, 3, 1, {SH0: signed([[-(2**31), 2**31 - 1, 0]] * 3, Stream(4)), SCALES: offset(small, Stream(2))}),
         tile(4, 2, 1, {SH0: offset([[40000, 50000, 65535], [0, 32767, 32768]], Stream(2), offsets=(0, 0, 0))}),
+        *(
+            tile(5, 2, 1, {SH0: offset([[0, 1, 2**bits]] * 2, Stream(width), offsets=(0, 0, 0))})
+            for bits, width in ((15, 2), (16, 3), (31, 4))
+        ),
     )
     return scene(1, tiles, attributes=attributes(1) | {SH0: fine, SCALES: fine})
 
@@ -163,7 +167,8 @@ def _bounds() -> Scene:
     )
     lifted = Attribute(_spec.MAPPING_YCOCG, 1e-9, chroma_shift=16)
     records = attributes() | {SCALES: fine, SH0: lifted}
-    return scene(tiles=tiles, codebooks=(colours, shapes), attributes=records)
+    text = Chunk(_spec.CHUNK_METADATA, b"{}")  # whose id is 0, too
+    return scene(tiles=tiles, codebooks=(colours, shapes), attributes=records, chunks=(text,))
 
 
 def _many() -> Scene:
@@ -198,7 +203,10 @@ def _many() -> Scene:
 
 
 def _codes() -> Scene:
-    ways: tuple[tuple[int, ...], ...] = ((), (_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG))
+    ways: tuple[tuple[int, ...], ...] = (
+        (),
+        (_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG, _spec.TRANSFORM_BYTE_PLANES),
+    )
     tiles = []
     for width in range(1, 8):
         bits = min(_spec.MORTON_BITS_MAX, 8 * width // 3)

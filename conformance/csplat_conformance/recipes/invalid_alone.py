@@ -10,10 +10,11 @@ import math
 from dataclasses import replace
 
 from csplat import _spec
-from csplat_conformance.broken import cut, patched, whole
+from csplat_conformance.broken import cut, patched, small, whole
 from csplat_conformance.builder import Built, build
 from csplat_conformance.repair import seal
 from csplat_conformance.samples import (
+    MEANS,
     Recipe,
     attributes,
     rows_of,
@@ -57,6 +58,14 @@ def _records() -> list[Recipe]:
         for name, step in steps.items()
     ]
     fourth = scene(tiles=[], sh_degree=4, attributes=attributes(3) | {_spec.ATTRIBUTE_SH4: Attribute(0, 0.25)})
+    whole_file = small()
+    last = whole_file.spans["TILE.0.0"][0]
+    sums = (
+        ("header_crc", "header.header_crc", 4, "HDR-3", "E_CRC"),
+        ("index_crc", "index.crc", 4, "IDX-1", "E_CRC"),
+        ("chunk_crc", "TILE.0.0/crc", 4, "CHK-1", "E_CRC"),
+        ("digest", "header.digest", 32, "HDR-8", "E_DIGEST"),
+    )
     rest = build(scene(trailing=bytes(3)))
     sealed = build(scene(trailing=b"\0"))
     return [
@@ -78,6 +87,49 @@ def _records() -> list[Recipe]:
             None,
             "E_TRAILING",
             len(sealed.data) - 1,
+        ),
+        Recipe(
+            "invalid/truncated_between_chunks",
+            "the last chunk is missing as a whole",
+            ("HDR-5",),
+            lambda: whole_file.data[:last],
+            None,
+            "E_TRUNCATED",
+            last,
+        ),
+        Recipe(
+            "invalid/magic_high",
+            "another last byte, above the right one",
+            ("HDR-1",),
+            lambda: seal(whole_file.data[:7] + b"\xff" + whole_file.data[8:]),
+            None,
+            "E_MAGIC",
+            0,
+        ),
+        *(
+            patched(f"{name}_high", f"{field} with all bits set", clause, code, whole_file, {field: b"\xff" * size})
+            for name, field, size, clause, code in sums
+        ),
+        *(
+            patched(f"axes_{name}", f"{name} as two axes", "IDX-4", "E_VALUE", whole_file, {"index.axes": bytes(axes)})
+            for name, axes in {"up_and_down": (1, 3, 4), "forward_and_back": (5, 3, 6)}.items()
+        ),
+        patched("splat_count_low", "N is below the sum", "IDX-7", "E_INDEX", whole_file, {"index.splat_count": 1}),
+        patched(
+            "attribute_scales_twice",
+            "the record of means names scales",
+            "ATT-1",
+            "E_INDEX",
+            whole_file,
+            {"attribute[means].attribute": _spec.ATTRIBUTE_SCALES},
+        ),
+        patched(
+            "attribute_means_twice",
+            "the record of scales names means",
+            "ATT-1",
+            "E_INDEX",
+            whole_file,
+            {"attribute[scales].attribute": MEANS},
         ),
         patched("extra_dtype_zero", "type 0 of no splats", "RES-2", "E_UNSUPPORTED", longest, {"extra[0].dtype": 0}),
         patched("extra_dtype_high", "type 9 of no splats", "RES-2", "E_UNSUPPORTED", longest, {"extra[0].dtype": 9}),
@@ -241,6 +293,7 @@ def _directory() -> list[Recipe]:
         made = scene(tiles=[], codebooks=(table,), chunks=(chunk,), order=("CODB.3.0", "CODB"))
         return whole(name, why, "DIR-5", "E_INDEX", made, "directory[CODB].type")
 
+    described = build(scene(tiles=[], chunks=(_META,)))
     reserved = scene(tiles=[], chunks=(Chunk(_spec.CHUNK_TREE, payload=b"x", flags=0),))
     return [
         *result,
@@ -251,6 +304,14 @@ def _directory() -> list[Recipe]:
             "E_UNSUPPORTED",
             reserved,
             "directory[TREE].type",
+        ),
+        patched(
+            "known_flags_high",
+            "META as critical too, in record and chunk",
+            "CHK-4",
+            "E_VALUE",
+            described,
+            {"directory[META].flags": 3, "META/header.flags": 3},
         ),
         surplus("codebook_chunk_unasked", "a chunk of a codebook that has no record, beside all that are due", 4),
         surplus("codebook_chunk_again", "the same chunk of a codebook twice", 3),

@@ -61,6 +61,9 @@ def _codings() -> list[Recipe]:
         for name, block in blocks.items()
     ]
     why = "an extra column coded LEVELS, and so it is"
+    named = build(scene(tiles=[tile(extras=(Block(_spec.CODING_RAW, [[1], [2]]),))], extras=column.extras))
+    extra = {"TILE.0.8/extra[0].coding": _spec.CODING_LEVELS}
+    result.append(patched("extra_called_levels", "RAW, called LEVELS", "BLK-1", "E_VALUE", named, extra))
     return [*result, whole("coding_levels_of_extra", why, "BLK-1", "E_VALUE", column, "TILE.0.8/extra[0].coding")]
 
 
@@ -88,6 +91,12 @@ def _integers() -> list[Recipe]:
         code = "E_VALUE" if clause == "LAT-3" else "E_RANGE"
         return whole(name, why, clause, code, made, f"TILE.0.{number}/sh{number}.{at}", within=within)
 
+    def first(name: str, why: str, clause: str, blocks: dict[int, Block]) -> Recipe:
+        made = scene(tiles=[tile(changes=blocks)])
+        attribute = _spec.ATTRIBUTE_NAMES[next(iter(blocks))]
+        why = f"{why} in the first splat"
+        return whole(f"{name}_at_first", why, clause, "E_RANGE", made, f"TILE.0.0/{attribute}.stream.width")
+
     def lone(place: int, value: int, columns: int) -> tuple[int, ...]:
         return tuple(value if i == place else 0 for i in range(columns))
 
@@ -111,6 +120,9 @@ def _integers() -> list[Recipe]:
             steep,
             width=4,
         ),
+        first("opacity_above_levels", "a level of M + 1", "LEV-1", {OPACITIES: levels([256, 0], Stream(2))}),
+        first("quat_component", "a component of M + 1", "QUA-1", {QUATS: signed([[128, 0, 0], [0, 0, 0]], Stream(2))}),
+        first("quat_radicand", "R below 0", "QUA-2", {QUATS: signed([[127, 127, 1], [0, 0, 0]], Stream(2))}),
         band(
             "integer_too_large_at_first",
             "2^50 + 1 in the first splat's first column",
@@ -201,6 +213,9 @@ def _coded() -> list[Recipe]:
     two = replace(two, attributes=two.attributes | {OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=1)})
     alpha = tile(changes={OPACITIES: book(1, ((0, 2), (0, 0)), levels([3]))})
     turn = tile(changes={QUATS: book(1, ((0, 1),), signed([[4, 5, 6]]))})
+    both = Codebook(4, _spec.CODEBOOK_KIND_SH, ({b: rows_of(b, 2, 6 * b + 3, -9, 9) for b in (1, 2)},), (1, 2))
+    first = book(4, ((0, 2),), signed(rows_of(7, 1, 9, -9, 9)))
+    fewer = scene(2, [tile(degree=2, changes={sh_attribute(1): first, sh_attribute(2): book(4)})], codebooks=(both,))
     bands = Codebook(4, _spec.CODEBOOK_KIND_SH, ({2: rows_of(2, 2, 15, -9, 9)},), (2, 2))
     other = scene(2, [tile(degree=2, changes={sh_attribute(1): book(4, ((0, 1),))})], codebooks=(bands,))
     return [
@@ -234,6 +249,22 @@ def _coded() -> list[Recipe]:
                 f"TILE.0.0/{_spec.ATTRIBUTE_NAMES[attribute]}.escape.coding",
             )
             for attribute, table, block in elsewhere
+        ),
+        patched(
+            "escape_of_higher",
+            "an escape block of band 1 that names band 2",
+            "CBK-5",
+            "E_STREAM",
+            rich(),
+            {"TILE.0.1/sh1.escape.attribute": sh_attribute(2)},
+        ),
+        whole(
+            "codebook_fewer_escapes",
+            "band 2 without escapes, where band 1 has one",
+            "CBK-4",
+            "E_CODEBOOK",
+            fewer,
+            "TILE.0.2/sh2.params.codebook_id",
         ),
         whole(
             "codebook_level_of_two", "a sum of 2 where M is 1", "LEV-1", "E_RANGE", two, "TILE.0.0/opacities.attribute"

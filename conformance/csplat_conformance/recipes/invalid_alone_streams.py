@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from csplat import _spec
 from csplat_conformance.broken import patched, whole
 from csplat_conformance.builder import build
@@ -46,6 +48,9 @@ def alone_stream_recipes() -> list[Recipe]:
         )
 
     deflated = build(scene(tiles=[tile(changes={OPACITIES: levels([7, 8], Stream(coder="deflate_fixed"))})]))
+    one = tile(extras=(Block(_spec.CODING_RAW, [[1], [2]]),))
+    columns = tuple(Extra(name, _spec.EXTRA_DTYPE_U8) for name in "ab")
+    two = build(scene(tiles=[replace(one, extras=one.extras * 2)], extras=columns))
     nine = tile(extras=(Block(_spec.CODING_RAW, [[1], [2]], Stream(9)),))
     column = scene(tiles=[nine], extras=(Extra("a", _spec.EXTRA_DTYPE_F64),))
     return [
@@ -100,6 +105,30 @@ def alone_stream_recipes() -> list[Recipe]:
         entries("width_5_of_entries", "entries of five bytes", "STR-2", "width", 2, Stream(5)),
         whole(
             "width_9_of_raw", "a column of nine bytes", "STR-2", "E_STREAM", column, "TILE.0.8/extra[0].stream.width"
+        ),
+        whole(
+            "width_2_of_one",
+            "a text of one element of two bytes, which are a text",
+            "STR-2",
+            "E_STREAM",
+            scene(tiles=[], chunks=(Chunk(_spec.CHUNK_METADATA, b"x", Stream(2, packed=b"{}")),)),
+            "META/stream.width",
+        ),
+        whole(
+            "extra_width_low",
+            "one byte for a column of two",
+            "RAW-2",
+            "E_STREAM",
+            scene(tiles=[one], extras=(Extra("a", _spec.EXTRA_DTYPE_U16),)),
+            "TILE.0.8/extra[0].stream.width",
+        ),
+        patched(
+            "extra_column_low",
+            "the second column says 0",
+            "RAW-1",
+            "E_STREAM",
+            two,
+            {"TILE.0.8/extra[1].params.column": 0},
         ),
         whole(
             "width_2_of_json",

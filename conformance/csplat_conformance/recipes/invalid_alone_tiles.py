@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from csplat import _spec
@@ -16,6 +16,7 @@ from csplat_conformance.samples import (
     rows_of,
     scene,
     sh_attribute,
+    signed,
     tile,
 )
 from csplat_conformance.scene import Attribute, Block, Chunk, Codebook, Tile
@@ -32,19 +33,28 @@ def alone_tile_recipes() -> list[Recipe]:
     return [*_tiles(), *_cut()]
 
 
-class _Bare(Tile):
-    """A tile without layers."""
+@dataclass(frozen=True)
+class _Partial(Tile):
+    """A tile of which some layers are in the file."""
+
+    there: tuple[int, ...] = ()
 
     @property
     def layers(self) -> list[int]:
-        return []
+        return list(self.there)
 
 
 def _tiles() -> list[Recipe]:
     text = build(scene(tiles=[], chunks=(_META,)))
-    bare = scene(tiles=[_Bare(**vars(tile()))])
+    bare = scene(tiles=[_Partial(**vars(tile()))])
+    upper = scene(1, [_Partial(**vars(tile(degree=1)), there=(1,))])
+    surplus = build(scene(tiles=[tile(extras=(Block(_spec.CODING_RAW, [[1], [2]]),))]))
+    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(0, 2, 3, -9, 9)},))
+    tables = [scene(tiles=[tile(tables=ids)], codebooks=(replace(table, id=2), table)) for ids in ((3, 3), (3, 2))]
     twins = build(scene(1, [tile(1, degree=1), tile(2, degree=1)]))
     three = build(scene(3, [tile(degree=3)]))
+    nine = {sh_attribute(2): signed(rows_of(9, 2, 9, -9, 9))}  # as band 1 has columns
+    double = build(scene(2, [tile(degree=2, changes=nine)]))
     turned = swapped(three, "tile[0].layer[1]", "tile[0].layer[2]")
     again = {"tile[0].layer[2].layer": 1, "TILE.0.2/head.layer": 1, "TILE.0.2/sh2.attribute": sh_attribute(1)}
     n = _spec.TILE_SPLATS_MAX + 1
@@ -91,8 +101,37 @@ def _tiles() -> list[Recipe]:
             {"tile[0].layer[1].layer": 5, "TILE.0.1/head.layer": 5, "TILE.0.1/head.block_count": 0},
         ),
         patched("layers_turned", "layers 0, 2, 1, 3", "TIL-2", "E_INDEX", three, turned, at="tile[0].layer[2].layer"),
-        patched("layer_twice", "layers 0, 1, 1, 3", "TIL-2", "E_INDEX", three, again),
+        patched("layer_twice", "layers 0, 1, 1", "TIL-2", "E_INDEX", double, again),
         whole("layers_none_at_all", "a tile without layers and chunks", "TIL-2", "E_INDEX", bare, "index.crc"),
+        whole(
+            "layer_1_alone", "a tile of layer 1, without layer 0", "TIL-2", "E_INDEX", upper, "tile[0].layer[1].layer"
+        ),
+        cut(
+            "extra_layer_empty",
+            "an extra layer without blocks, and no extra columns",
+            "TIL-5",
+            "E_INDEX",
+            surplus,
+            surplus.spans["TILE.0.8"][1] - _FRAME - _spec.TILE_HEAD_SIZE,
+            "tile[0].layer[0].layer",
+            {"TILE.0.8/head.block_count": 0},
+        ),
+        whole(
+            "tables_equal_unused",
+            "a table id twice, and no use of it",
+            "TIL-6",
+            "E_INDEX",
+            tables[0],
+            "tile[0].table[1]",
+        ),
+        whole(
+            "tables_fall_unused",
+            "table ids that fall, and no use of them",
+            "TIL-6",
+            "E_INDEX",
+            tables[1],
+            "tile[0].table[1]",
+        ),
         differs("tile_index_low", "the chunk of tile 1 says 0", "TLE-1", twins, {"TILE.1.0/head.tile_index": 0}),
         differs("tile_layer_low", "the chunk of layer 1 says 0", "TLE-1", twins, {"TILE.0.1/head.layer": 0}),
         differs("chunk_type_low", "a type below that of the directory", "CHK-3", text, {"META/header.type": b"MESA"}),
