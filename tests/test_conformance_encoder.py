@@ -338,7 +338,8 @@ def test_failures_are_shown_with_their_clause():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--filter", "nothing"), "no input has such a name"),
+        (("--filter", "nothing"), "no input matches 'nothing'"),
+        (("--filter", "*/degree_0", "--filter", "nothing"), "no input matches 'nothing'"),
         (("--cmd", "true {ply}"), "lacks {out}"),
         (("--cmd", "true '{ply} {out}"), "cannot be used"),
         (("--cmd", "true {ply} {out} {what}"), "cannot be used"),

@@ -1,6 +1,7 @@
 """The runner against decoders that behave, and against some that do not."""
 
 import json
+import re
 import sys
 import xml.etree.ElementTree as ET  # what is parsed is our own
 from pathlib import Path
@@ -11,6 +12,8 @@ from typer.testing import CliRunner
 from csplat.errors import InputError
 from csplat_conformance import node
 from csplat_conformance.answers import PARTS, judge
+from csplat_conformance.choosing import matching
+from csplat_conformance.encoders.inputs import all_inputs
 from csplat_conformance.manifest import load
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice, parse_levels, run_builtin, run_command
@@ -242,6 +245,27 @@ def test_vectors_are_chosen_by_clause():
     assert {vector.name for vector in load() if any(clause.startswith("MOR-") for clause in vector.clauses)} == names
 
 
+def test_a_pattern_may_name_a_chapter_of_clauses():
+    def names(clause):
+        return [outcome.name for outcome in run_builtin(Choice(clause=clause, levels=(1,))).outcomes]
+
+    assert names("MOR") == names("MOR-*")
+    assert len(names("MOR, COV")) == len({*names("MOR-*"), *names("COV-*")})
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (Choice(pattern="valid/*,nothing"), "no vector matches 'nothing'"),
+        (Choice(pattern="valid/*,"), "no vector matches ''"),
+        (Choice(clause="M"), "no clause of a vector matches 'M'"),
+    ],
+)
+def test_a_pattern_that_matches_nothing_is_named(choice, message):
+    with pytest.raises(InputError, match=message):
+        run_builtin(choice)
+
+
 # The command ---------------------------------------------------------------------------------------
 
 
@@ -271,6 +295,42 @@ def test_one_report_may_go_to_standard_output():
 
 def test_the_command_lists_every_check_when_asked():
     assert "L2  ok  valid/quats" in invoke("--filter", "valid/quats", "--verbose").stdout
+
+
+def test_a_filter_may_repeat_and_hold_several_patterns():
+    result = invoke("--filter", "valid/quats,valid/one_*", "--filter", "valid/rich", "--level", "1", "--json")
+
+    names = [outcome["name"] for outcome in json.loads(result.stdout)["outcomes"]]
+    assert ["valid/one_splat", "valid/quats", "valid/rich"] == names
+
+
+def test_of_filter_and_clause_a_vector_matches_both():
+    report = invoke("--filter", "valid/*", "--clause", "MOR-1", "--clause", "LIM", "--level", "1", "--json").stdout
+    names = {outcome["name"] for outcome in json.loads(report)["outcomes"]}
+
+    assert {vector.name for vector in load() if "MOR-1" in vector.clauses and vector.name.startswith("valid/")} == names
+    assert "no vector is chosen" in invoke("--filter", "valid/empty", "--clause", "MOR-*").stderr
+
+
+def _recommended():
+    """Options as the guides write them, in a shell's words."""
+    guides = ("conformance/IMPLEMENTERS.md", "conformance/README.md", "CONTRIBUTING.md")
+    text = "\n".join((ROOT / guide).read_text(encoding="utf-8") for guide in guides)
+    return sorted(set(re.findall(r"--(filter|clause) ('[^']+'|[\w/,*-]+)", text)))
+
+
+@pytest.mark.parametrize(("option", "word"), _recommended(), ids=" ".join)
+def test_what_the_guides_recommend_matches(option, word):
+    """A word without quotes must mean the same to a shell."""
+    names = [vector.name for vector in load()] + [one.name for one in all_inputs()]
+    of = names if option == "filter" else [clause for vector in load() for clause in vector.clauses]
+
+    assert word.startswith("'") or "*" not in word
+    assert matching(word.strip("'"), of, option)
+
+
+def test_the_guides_recommend_patterns():
+    assert len(_recommended()) > 15
 
 
 def test_a_level_that_is_none_is_one_line():

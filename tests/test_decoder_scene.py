@@ -227,6 +227,30 @@ def test_limits(limits, name):
     decode(RICH, limits=Limits(splats=5, json_bytes=16))
 
 
+@pytest.mark.parametrize(
+    ("kind", "bands", "columns"),
+    [
+        (_spec.CODEBOOK_KIND_OPACITIES, (0, 0), {0: 1}),
+        (_spec.CODEBOOK_KIND_SCALES, (0, 0), {0: 3}),
+        (_spec.CODEBOOK_KIND_QUATS, (0, 0), {0: 3}),
+        (_spec.CODEBOOK_KIND_SH0, (0, 0), {0: 3}),
+        (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
+        (_spec.CODEBOOK_KIND_SH, (1, 3), {1: 9, 2: 15, 3: 21}),
+        (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),
+    ],
+)
+def test_a_budget_counts_four_bytes_for_each_entry_and_column_of_a_codebook(kind, bands, columns):
+    sizes = (5, 7)
+    stages = tuple({layer: [[0] * c] * size for layer, c in columns.items()} for size in sizes)
+    built = build(replace(scene(3), codebooks=(Codebook(4, kind, stages, bands),)))
+    arrays = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 16)
+    limit = arrays + 4 * sum(sizes) * sum(columns.values())
+
+    decode(built.data, limits=Limits(bytes=limit))
+    with pytest.raises(LimitError, match=f"{limit}"):
+        decode(built.data, limits=Limits(bytes=limit - 1))
+
+
 def test_limits_bind_the_chosen_tiles_and_tiles_one_by_one():
     assert 2 == len(decode(RICH, limits=Limits(splats=2), tiles=[1]))
     assert 2 == len(list(iter_tiles(RICH, limits=Limits(splats=0))))
@@ -246,8 +270,8 @@ def test_codebooks_that_no_tile_names_are_checked_and_counted():
     built = build(described)
     assert 2 == len(decode(built.data))
     with pytest.raises(LimitError):
-        decode(built.data, limits=Limits(bytes=2000))
-    decode(built.data, limits=Limits(bytes=2000), tiles=[0])
+        decode(built.data, limits=Limits(bytes=1600))
+    decode(built.data, limits=Limits(bytes=1600), tiles=[0])
     name = next(name for name in built.fields if name.startswith("CODB") and name.endswith("count"))
     with pytest.raises(FormatError):
         decode(built.patched({name: 7}))

@@ -33,8 +33,13 @@ SMALL = build(scene())
 
 #: Vectors whose defect the validator finds at a better place than the manifest's: rms itself, not the max beside it.
 ELSEWHERE = {
-    f"invalid/stated_error_record_rms_{end}": ("SERR/record[means].rms", "SERR/record[means].max")
-    for end in ("below", "above")
+    f"invalid/{name}": ("SERR/record[means].rms", "SERR/record[means].max")
+    for name in (
+        "stated_error_record_rms_below",
+        "stated_error_record_rms_above",
+        "error_rms_nan",
+        "error_rms_infinite",
+    )
 }
 
 #: Clauses that no file can break, and why.

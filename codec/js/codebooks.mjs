@@ -1,7 +1,6 @@
 // Codebooks: their chunks (spec 5.3) and the blocks that refer to them (6.4.5).
 
 import {
-  checkCoding,
   checkFinite,
   checkIntegers,
   columnCount,
@@ -21,6 +20,11 @@ import { signed } from './transforms.mjs';
 const { ERROR_CODEBOOK, ERROR_INDEX, ERROR_STREAM } = spec;
 const { CODEBOOK_HEAD_OFFSETS: AT_HEAD, CODEBOOK_PARAMS_OFFSETS: AT_PARAMS } = spec;
 const ENTRY_WIDTH_MAX = 4; // STR-2
+/** CBK-5: codings of escape blocks; of other attributes they are OFFSET and SIGNED. @type {Record<number, number[]>} */
+const ESCAPE_CODINGS = {
+  [spec.ATTRIBUTE_OPACITIES]: [spec.CODING_LEVELS],
+  [spec.ATTRIBUTE_QUATS]: [spec.CODING_SIGNED],
+};
 const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
 
 /**
@@ -61,7 +65,7 @@ function tableColumns({ attributes, bandFirst }, layer) {
 }
 
 /**
- * Bytes that the tables of some CODB chunks take, for the budget.
+ * What LIM-1 counts of the tables of some CODB chunks: four bytes for each entry and column.
  *
  * @param {DirectoryRecord[]} directory
  * @param {Map<number, CodebookRecord>} codebooks by id
@@ -70,7 +74,7 @@ export function tableBytes(directory, codebooks) {
   let bytes = 0;
   for (const { type, id, layer } of directory) {
     const codebook = type === spec.CHUNK_CODEBOOK ? codebooks.get(id) : undefined;
-    if (codebook) for (const size of codebook.sizes) bytes += 4 * (size + 1) * tableColumns(codebook, layer);
+    if (codebook) for (const size of codebook.sizes) bytes += 4 * size * tableColumns(codebook, layer);
   }
   return bytes;
 }
@@ -354,9 +358,10 @@ async function readEscapes(tile, payload, attribute, count) {
       `escapes of attribute ${head.attribute} in a block of ${attribute.name}`,
     );
   }
-  if (head.coding === spec.CODING_CODEBOOK || head.coding === spec.CODING_SPARSE)
-    throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', `escapes coded ${head.name}`);
-  checkCoding(head); // all other codings that it allows are those of CBK-5
+  if (!(ESCAPE_CODINGS[attribute.id] ?? [spec.CODING_OFFSET, spec.CODING_SIGNED]).includes(head.coding)) {
+    const what = `escapes of ${attribute.name} coded ${head.name}`;
+    throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', what);
+  }
   return readValues(tile, payload, attribute, head.coding, count, true);
 }
 

@@ -197,15 +197,16 @@ def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
 
 @cache
 def _bases() -> tuple[Built, ...]:
-    """Return a small file, one with every structure but one, and one with that."""
+    """Return a file without tiles, so that nothing uses what records say, a small one, and two that have the rest."""
     known = (_spec.DIRECTION_RIGHT, _spec.DIRECTION_DOWN, _spec.DIRECTION_FORWARD)
     rich = rich_scene()
     second = replace(rich.tiles[1], blocks=rich.tiles[1].blocks | {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)})
     every = replace(
         rich, tiles=(rich.tiles[0], second), sh_degree=3, attributes=attributes(3, ycocg=True, chroma_shift=1)
     )
+    mixed = attributes(1) | {SH0 + 1: attributes(1, ycocg=True)[SH0 + 1]}
     some = tile(9, 3, 0, {SH0 + 1: sparse((1, 0, 1), rows_of(1, 2, 9, -9, 9))})
-    return build(scene(axes=known)), build(every), build(scene(1, [some]))
+    return build(scene(1, [], axes=known, attributes=mixed)), build(scene()), build(every), build(scene(1, [some]))
 
 
 def _words(built: Built, structure: str, prefix: str) -> set[str]:

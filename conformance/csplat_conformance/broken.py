@@ -8,10 +8,12 @@ from typing import Any
 
 from csplat import _spec
 from csplat_conformance.builder import Built, build
+from csplat_conformance.repair import repair
 from csplat_conformance.samples import Recipe, rich_scene, scene
 from csplat_conformance.scene import Scene
 
-__all__ = ["patched", "rich", "small", "swapped", "whole"]
+__all__ = ["cut", "patched", "rich", "small", "swapped", "whole"]
+
 
 #: CHK-6: chunks whose payload a decoder may leave unread.
 _ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
@@ -71,6 +73,43 @@ def _may_be_unread(field: str) -> bool:
     """Whether a field lies in the payload of an ancillary chunk: neither in its frame nor in its CRC."""
     chunk, _, part = field.partition("/")
     return chunk.encode() in _ANCILLARY and part != "crc" and not part.startswith("header.")
+
+
+def cut(
+    name: str,
+    why: str,
+    clauses: str,
+    code: str,
+    base: Built,
+    size: int,
+    at: str,
+    changes: dict[str, Any] | None = None,
+    within: int = 0,
+) -> Recipe:
+    """Return a recipe that shortens the payload of a file's last chunk; all sizes of the container are right.
+
+    Args:
+        name, why, clauses, code: as of `patched`.
+        base: the valid file.
+        size: bytes that are missing at the end.
+        at: field that is to blame.
+        changes: field to value, beside the sizes.
+        within: byte within that field.
+    """
+    chunk, (offset, length) = max(base.spans.items(), key=lambda item: item[1])
+    kind, *numbers = chunk.split(".")
+    record = "tile[{}].layer[{}]".format(*numbers) if kind == "TILE" else f"directory[{chunk}]"
+    sizes = {
+        f"{record}.size": length - size,
+        f"{chunk}/header.payload_size": length - _spec.CHUNK_HEADER_SIZE - size,
+        "header.file_size": offset + length - size,
+    }
+
+    def data() -> bytes:
+        return repair(base.patched((changes or {}) | sizes, repaired=False)[:-size])
+
+    place = base.fields[at].offset + within
+    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, place, optional=_may_be_unread(at))
 
 
 def swapped(base: Built, one: str, other: str) -> dict[str, Any]:

@@ -10,7 +10,6 @@ protocol of `protocol`. What the levels ask for is told in `answers` and `views`
 
 from __future__ import annotations
 
-import fnmatch
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from csplat.errors import InputError
 from csplat_conformance import adapter, views
 from csplat_conformance.answers import LEVELS, PARTS, judge
+from csplat_conformance.choosing import matching
 from csplat_conformance.manifest import VECTORS, Vector, load
 from csplat_conformance.process import split_command
 from csplat_conformance.protocol import ask
@@ -38,8 +38,8 @@ class Choice:
     """What is run, and how strictly.
 
     Attributes:
-        pattern: shell pattern of the vectors' names, `invalid/*`; None for all.
-        clause: shell pattern of clauses, `HDR-*`: vectors that cover one of them; None for all.
+        pattern: shell patterns of the vectors' names, `valid/sh*,valid/rich`; None for all.
+        clause: shell patterns of clauses, `HDR-*,LIM-1`: vectors that cover one of them; None for all.
         levels: of 1 to 4.
         exact: of refusals demand code, clause and offset, and optional refusals too: for csplat's own decoders.
         timeout: seconds for one process.
@@ -83,6 +83,9 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
     Args:
         choice: what is run; `exact`, `timeout` and `jobs` do not apply.
         progress: is told how many vectors are done.
+
+    Raises:
+        InputError: a pattern of `choice` matches nothing.
     """
     choice = choice or Choice()
 
@@ -118,7 +121,7 @@ def run_command(
         progress: is told how many vectors are done.
 
     Raises:
-        InputError: a command line that cannot be run.
+        InputError: a command line that cannot be run; a pattern of `choice` matches nothing.
     """
     choice = choice or Choice()
     if command is not None:
@@ -151,12 +154,10 @@ def run_command(
 
 
 def _chosen(choice: Choice) -> list[Vector]:
-    return [
-        vector
-        for vector in load()
-        if (choice.pattern is None or fnmatch.fnmatchcase(vector.name, choice.pattern))
-        and (choice.clause is None or fnmatch.filter(vector.clauses, choice.clause))
-    ]
+    vectors = load()
+    names = matching(choice.pattern, [vector.name for vector in vectors], "vector")
+    clauses = matching(choice.clause, {clause for vector in vectors for clause in vector.clauses}, "clause of a vector")
+    return [vector for vector in vectors if vector.name in names and clauses & {*vector.clauses}]
 
 
 def _report(subject: str, results: Sequence[list[Outcome]]) -> Report:

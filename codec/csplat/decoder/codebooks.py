@@ -51,7 +51,7 @@ def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | N
 
 
 def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whole: bool) -> int:
-    """Return a bound of the memory that codebooks take, from the index alone.
+    """Return what LIM-1 counts of codebooks, four bytes for each entry and column, from the index alone.
 
     Args:
         header: the scene.
@@ -64,7 +64,7 @@ def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whol
     for record in _codebook_chunks(header) if whole else _wanted(header, tiles, degree):
         book = books[record.id]
         elements += sum(book.sizes) * layer_columns(book, record.layer)
-    return elements * (_ENTRY_WIDTH_MAX + 4)  # an integer, and a float32 in `values`
+    return 4 * elements
 
 
 def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile], degree: int) -> dict[int, Codebook]:

@@ -135,31 +135,24 @@ def _check_room(head: _spec.IndexHead, index_size: int) -> None:
 
 
 def _read_attributes(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[_spec.AttributeRecord, ...]:
-    wanted = [*range(_spec.ATTRIBUTE_OPACITIES, _spec.ATTRIBUTE_SH0 + 1 + head.sh_degree)]
-    records = []
-    for i in range(head.attribute_count):
-        place = at + i * _spec.ATTRIBUTE_RECORD_SIZE
-        record = _spec.unpack_attribute_record(view, place)
-        if i >= len(wanted) or record.attribute != wanted[i]:
-            raise FormatError(
-                _spec.ERROR_INDEX,
-                place,
-                "ATT-1",
-                "attribute",
-                found=record.attribute,
-                wanted=wanted[i] if i < len(wanted) else f"{len(wanted)} records",
-            )
-        _check_attribute(record, place, bytes(view[place + 8 : place + 16]))
-        records.append(record)
-    if len(records) != len(wanted):
+    wanted = range(_spec.ATTRIBUTE_OPACITIES, _spec.ATTRIBUTE_SH0 + 1 + head.sh_degree)
+    if head.attribute_count != len(wanted):
         raise FormatError(
             _spec.ERROR_INDEX,
             _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["attribute_count"],
             "ATT-1",
             "attribute_count",
-            found=len(records),
+            found=head.attribute_count,
             wanted=len(wanted),
         )
+    records = []
+    for i, attribute in enumerate(wanted):
+        place = at + i * _spec.ATTRIBUTE_RECORD_SIZE
+        record = _spec.unpack_attribute_record(view, place)
+        if record.attribute != attribute:
+            raise FormatError(_spec.ERROR_INDEX, place, "ATT-1", "attribute", found=record.attribute, wanted=attribute)
+        _check_attribute(record, place, bytes(view[place + 8 : place + 16]))
+        records.append(record)
     return tuple(records)
 
 

@@ -2,8 +2,9 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
+import { tableBytes } from '../codebooks.mjs';
 import { CsplatReader, LimitError, decode, readHeader } from '../decoder.mjs';
-import { hash, refusal, vector } from './helpers.mjs';
+import { hash, manifest, refusal, vector } from './helpers.mjs';
 
 const rich = vector('valid/rich');
 
@@ -23,6 +24,22 @@ test('a budget of bytes counts arrays and tables, before they are made', async (
   await decode(file, { limits: { bytes } });
   assert.equal((await refusal(() => decode(file, { limits: { bytes: bytes - 1 } }))).code, 'E_LIMIT');
   assert.equal((await refusal(() => decode(file, { form: 'integers', limits: { bytes } }))).code, 'E_LIMIT');
+});
+
+test('a budget of bytes counts four for each entry and column of a codebook', () => {
+  const columns = { opacities: 1, scales: 3, quats: 3, sh0: 3, shape: 6 };
+  const kinds = new Set();
+  for (const { name } of manifest.filter(({ name }) => name.startsWith('valid/codebook_'))) {
+    const { codebooks, directory } = readHeader(vector(name));
+    let bytes = 0;
+    for (const { kind, bandFirst, bandLast, sizes } of codebooks) {
+      kinds.add(kind);
+      const entries = sizes.reduce((sum, size) => sum + size);
+      for (let l = bandFirst; l <= bandLast; l++) bytes += 4 * entries * (columns[kind] ?? 3 * (2 * l + 1));
+    }
+    assert.equal(tableBytes(directory, new Map(codebooks.map((codebook) => [codebook.id, codebook]))), bytes, name);
+  }
+  assert.deepEqual([...kinds].sort(), [...Object.keys(columns), 'sh'].sort());
 });
 
 test('a budget of JSON counts the text', async () => {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from csplat.errors import InputError
+from csplat_conformance.choosing import matching
 from csplat_conformance.encoders.inputs import Input, all_inputs
 from csplat_conformance.encoders.judge import (
     PictureJudge,
@@ -44,7 +44,7 @@ class EncoderChoice:
     """What to run.
 
     Attributes:
-        pattern: shell pattern of the inputs' names; `None` for all.
+        pattern: shell patterns of the inputs' names, `ordinary/*,nasty/empty`; `None` for all.
         levels: those wanted; each needs the ones before it, which are run and not reported.
         timeout_seconds: for one input.
         psnr_min: dB, of L4.
@@ -84,14 +84,16 @@ def run_encoder(
             On threads, as many as `choice.jobs` says.
 
     Raises:
-        InputError: the command line is not one, there is no such program, or no such level.
+        InputError: the command line is not one, there is no such program, or no such level, or a pattern matches no
+            input.
     """
     choice = choice or EncoderChoice()
     split_command(command, _NAMES)
     unknown = [level for level in choice.levels if level not in LEVELS]
     if unknown:
         raise InputError(f"there is no level {', '.join(unknown)}, wanted {', '.join(LEVELS)}")
-    inputs = [one for one in all_inputs() if choice.pattern is None or fnmatch.fnmatchcase(one.name, choice.pattern)]
+    names = matching(choice.pattern, [one.name for one in all_inputs()], "input")
+    inputs = [one for one in all_inputs() if one.name in names]
     outcomes: list[Outcome] = []
     with _folder(choice.keep) as folder, ThreadPoolExecutor(choice.jobs or os.cpu_count() or 1) as pool:
         started = [pool.submit(_run, run, command, one, folder, choice.timeout_seconds) for one in inputs]

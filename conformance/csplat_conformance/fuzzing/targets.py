@@ -24,11 +24,13 @@ from csplat_conformance.recipes import all_recipes
 from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 
-__all__ = ["LIMITS", "Case", "DecoderTarget", "JsTarget", "Target"]
+__all__ = ["JS_LIMITS", "LIMITS", "Case", "DecoderTarget", "JsTarget", "Target"]
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
-_JS_LIMITS = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
+_SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
+#: The same by their names in JavaScript.
+JS_LIMITS = {"splats": _SMALL.splats, "bytes": _SMALL.bytes, "jsonBytes": _SMALL.json_bytes}
 _LARGEST_SEED = 3000  # bytes: small files make many cases a second
 _JS_MEMORY = 700_000_000  # bytes; a heap of 512 MiB, and Node
 
@@ -158,15 +160,14 @@ class JsTarget(DecoderTarget):
 
     def __init__(self, scratch: Path | None = None) -> None:
         self._scratch = scratch
-        limits = {"splats": _JS_LIMITS.splats, "bytes": _JS_LIMITS.bytes, "jsonBytes": _JS_LIMITS.json_bytes}
-        self._node = node.JsDecoder(limits=limits, coverage=scratch)
+        self._node = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
 
     def attempt(self, data: bytes) -> tuple[str, str]:
         """Decode with both and compare."""
         theirs = self._node.ask(data)
         if theirs.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"JavaScript, {theirs.status}: {theirs.message}"
-        ours = adapter.answer(data, _JS_LIMITS, threads=1)  # one thread: so it is traced, and quicker
+        ours = adapter.answer(data, _SMALL, threads=1)  # one thread: so it is traced, and quicker
         if ours.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"Python, {ours.status}: {ours.message}"
         return compared(ours, theirs)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from csplat_conformance.boundaries import boundary_recipes
 from csplat_conformance.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
+from csplat_conformance.recipes.edges import edge_recipes
 from csplat_conformance.recipes.extreme import extreme_recipes
 from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
+from csplat_conformance.recipes.invalid_alone import alone_recipes
+from csplat_conformance.recipes.invalid_alone_blocks import alone_block_recipes
+from csplat_conformance.recipes.invalid_alone_streams import alone_stream_recipes
+from csplat_conformance.recipes.invalid_alone_tiles import alone_tile_recipes
 from csplat_conformance.recipes.invalid_blocks import block_recipes
 from csplat_conformance.recipes.invalid_chunks import chunk_recipes
 from csplat_conformance.recipes.invalid_codebooks import codebook_recipes
@@ -15,6 +20,7 @@ from csplat_conformance.recipes.invalid_records import record_recipes
 from csplat_conformance.recipes.invalid_streams import stream_recipes
 from csplat_conformance.recipes.invalid_tiles import tile_recipes
 from csplat_conformance.recipes.rendered import rendered_recipes
+from csplat_conformance.recipes.texts import bad_text_recipes, good_text_recipes
 from csplat_conformance.recipes.valid import valid_recipes
 from csplat_conformance.recipes.valid_combined import combined_recipes
 from csplat_conformance.recipes.valid_streams import valid_stream_recipes
@@ -32,6 +38,8 @@ def all_recipes() -> list[Recipe]:
         extreme_recipes,
         extreme_stream_recipes,
         valid_deflate_recipes,
+        edge_recipes,
+        good_text_recipes,
         rendered_recipes,
     )
     invalid = (
@@ -45,5 +53,10 @@ def all_recipes() -> list[Recipe]:
         invalid_deflate_recipes,
         block_recipes,
         codebook_recipes,
+        alone_recipes,
+        alone_tile_recipes,
+        alone_stream_recipes,
+        alone_block_recipes,
+        bad_text_recipes,
     )
     return [recipe for make in (*valid, *invalid) for recipe in make()]

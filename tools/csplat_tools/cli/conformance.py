@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -36,8 +36,9 @@ conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 class Run(Group):
     """How a suite is run, and reported beside the JSON."""
 
-    pattern: Annotated[
-        str | None, typer.Option("--filter", metavar="PATTERN", help="Only checks of this name: 'invalid/*'.")
+    filters: Annotated[
+        list[str] | None,
+        typer.Option("--filter", metavar="PATTERN,...", help="Only checks of these names: 'invalid/*'. May repeat."),
     ] = None
     timeout: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.1, help="For each file.")] = None
     jobs: Annotated[
@@ -47,6 +48,11 @@ class Run(Group):
         str | None, typer.Option(metavar="FILE", help="Every result as JUnit XML, for CI; - for standard output.")
     ] = None
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for each check.")] = False
+
+    @property
+    def pattern(self) -> str | None:
+        """The names that are wanted, as the library has them."""
+        return _joined(self.filters)
 
     def check(self, out: Output) -> None:
         """Refuse the places of reports before anything is run; XML may go to a terminal."""
@@ -107,7 +113,8 @@ def decoder(
         typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3. 3, and 4 with --render-cmd."),
     ] = None,
     clause: Annotated[
-        str | None, typer.Option(metavar="PATTERN", help="Only vectors that cover such a clause of the spec: 'HDR-*'.")
+        list[str] | None,
+        typer.Option(metavar="PATTERN,...", help="Only vectors of such clauses of the spec: 'HDR-*'. May repeat."),
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Of refusals demand code, clause and offset too: for our decoders.")
@@ -123,6 +130,7 @@ def decoder(
     Examples:
       csplat conformance decoder --filter 'invalid/*'
       csplat conformance decoder --cmd 'dec {input} {outdir}' --clause 'HDR-*'
+      csplat conformance decoder --filter 'valid/sh*,valid/absent_*' --level 2
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
@@ -130,7 +138,8 @@ def decoder(
     with out.bar() as bar:
         # A renderer alone is tested at L4 alone.
         levels = parse_levels(level or ("3" if render_program is None else "4"))
-        choice = Choice(run.pattern, clause, levels, exact, run.timeout or TIMEOUT_SECONDS, run.jobs)
+        timeout = run.timeout or TIMEOUT_SECONDS
+        choice = Choice(run.pattern, _joined(clause), levels, exact, timeout, run.jobs)
         if program is None and render_program is None:
             report = run_builtin(choice, _moved(bar))
         else:
@@ -175,7 +184,11 @@ def encoder(
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
         report = run_encoder(program or ours, choice, pictures=pictures, no_pictures=reason, progress=_moved(bar))
-    run.publish(report, out, "no input has such a name")
+    run.publish(report, out, "no input is chosen")
+
+
+def _joined(patterns: Sequence[str] | None) -> str | None:
+    return ",".join(patterns) if patterns else None
 
 
 def _moved(bar: Progress | None) -> Callable[[int, int], None] | None:

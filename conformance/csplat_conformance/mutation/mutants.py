@@ -1,0 +1,130 @@
+"""One change of a decoder's text, and what became of it."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+__all__ = ["Decoder", "Fate", "Mutant", "Result", "sample", "score", "table"]
+
+_SHOWN = 100  # characters of a piece of text
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change.
+
+    Attributes:
+        file: name of the module's file.
+        line: of the change, from 1.
+        start: character at which the old text begins.
+        old: a piece of the file's text: the smallest expression or statement that changes.
+        new: what stands in its place.
+    """
+
+    file: str
+    line: int
+    start: int
+    old: str
+    new: str
+
+    def apply(self, text: str) -> str:
+        """Return the file's text with the change in it."""
+        end = self.start + len(self.old)
+        assert text[self.start : end] == self.old, f"{self.file} is another"
+        return text[: self.start] + self.new + text[end:]
+
+    def lines(self, text: str) -> tuple[str, str]:
+        """Return the lines of the file's text that change, as they were and as they are."""
+        start, end = text.rfind("\n", 0, self.start) + 1, text.find("\n", self.start + len(self.old))
+        return text[start:end], self.apply(text)[start : end - len(self.old) + len(self.new)]
+
+
+class Fate(StrEnum):
+    """What became of a mutant."""
+
+    CAUGHT = "caught"  #: a vector fails
+    MISSED = "missed"  #: all vectors pass, and a fuzzed file shows a difference
+    SAME = "same"  #: no file shows a difference: equivalent, or out of the reach of vectors, or only rarely seen
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a mutant.
+
+    Attributes:
+        mutant: which.
+        fate: what became of it.
+        by: the vector, or the fuzzed file and how the answers differ.
+    """
+
+    mutant: Mutant
+    fate: Fate
+    by: str = ""
+
+
+class Decoder(Protocol):
+    """A decoder and its mutants."""
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """The decoder's modules by the names of their files."""
+        ...
+
+    @property
+    def mutants(self) -> Sequence[Mutant]:
+        """All of them."""
+        ...
+
+    def valid(self, mutant: Mutant) -> bool:
+        """Whether it is a program."""
+        ...
+
+    def attempt(self, mutant: Mutant) -> Result:
+        """Run the vectors, and where all pass the fuzzed files."""
+        ...
+
+
+def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
+    """Choose mutants by chance, in the order of the files; none that is no program."""
+    mixed = list(decoder.mutants)
+    random.Random(seed).shuffle(mixed)  # noqa: S311 - repeatable, no secret
+    chosen: list[Mutant] = []
+    for mutant in mixed:
+        if len(chosen) == count:
+            break
+        if decoder.valid(mutant):
+            chosen.append(mutant)
+    return sorted(chosen, key=lambda mutant: (mutant.file, mutant.start, mutant.new))
+
+
+def score(results: Sequence[Result]) -> float:
+    """Return the share, in per cent, of those caught among those that show a difference at all."""
+    counts = [sum(result.fate is fate for result in results) for fate in (Fate.CAUGHT, Fate.MISSED)]
+    return 100.0 * counts[0] / max(1, sum(counts))
+
+
+def table(results: Sequence[Result], texts: Mapping[str, str]) -> str:
+    """Return the survivors in Markdown, those that the vectors miss first.
+
+    Args:
+        results: all of a run.
+        texts: the decoder's modules by the names of their files.
+    """
+    lines = ["| fate | where | was | is | seen in |", "|---|---|---|---|---|"]
+    for fate in (Fate.MISSED, Fate.SAME):
+        for result in results:
+            if result.fate is fate:
+                one = result.mutant
+                was, now = (f"`{_short(line)}`" for line in one.lines(texts[one.file]))
+                cells = (fate, f"{one.file}:{one.line}", was, now, result.by)
+                lines.append(f"| {' | '.join(cell.replace('|', chr(0xA6)) for cell in cells)} |")
+    return "\n".join(lines)
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _SHOWN else f"{line[: _SHOWN - 4]} ..."

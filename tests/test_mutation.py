@@ -1,0 +1,174 @@
+"""Mutants of decoders: what is changed, and what becomes of it."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+
+from csplat.errors import InputError
+from csplat_conformance.manifest import load
+from csplat_conformance.mutation import __main__ as command
+from csplat_conformance.mutation import judging, python
+from csplat_conformance.mutation.javascript import JavaScriptDecoder
+from csplat_conformance.mutation.mutants import Fate, Mutant, Result, sample, score, table
+from csplat_conformance.mutation.operators import python_mutants
+from csplat_conformance.mutation.python import PythonDecoder
+from csplat_conformance.node import missing_javascript
+
+BY_NAME = {vector.name: vector for vector in load()}
+needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Let these vectors be all there are."""
+
+    def chosen(*names):
+        monkeypatch.setattr(judging, "vectors", lambda: [(BY_NAME[name], BY_NAME[name].data) for name in names])
+
+    return chosen
+
+
+def mutant(decoder, file, old, new):
+    """The first mutant of a file that makes this change."""
+    return next(one for one in decoder.mutants if (one.file, one.old, one.new) == (file, old, new))
+
+
+# What is changed -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "changed"),
+    [
+        ("a < b", {"(a <= b)", "(a >= b)"}),
+        ("é != b", {"(é == b)", "(é < b)", "(é > b)"}),
+        ("a not in b", {"(a in b)"}),
+        ("a is None", {"(a is not None)"}),
+        ("a <= b <= c", {"(a < b <= c)", "(a > b <= c)", "(a <= b < c)", "(a <= b > c)"}),
+        ("a and b and c", {"(a or b and c)", "(a and b or c)"}),
+        ("not a", {"(a)"}),
+        ("(a) - (b)", {"((a) + (b))"}),
+        ("a //\\\nb", {"(a *\\\nb)"}),
+        ("a << b", {"(a >> b)"}),
+        ("a &= b", {"a |= b"}),
+        ("x = True", {"x = False"}),
+        ("x = 7", {"x = (7 + 1)", "x = (7 - 1)"}),
+        ("a[b:]", {"a[(b) + 1:]", "a[(b) - 1:]"}),
+        ("max(a)", {"min(a)", "pass"}),
+        ("x = a.min()", {"x = a.max()"}),
+        ("raise A(1 + 2)", {"pass"}),
+        ("def f():\n  if a: return b\n  return c", {"def f():\n  if a: pass\n  return c"}),
+        ("def f(a: A[1]) -> B[2]: g(f'{1}')", {"def f(a: A[1]) -> B[2]: pass"}),
+        ("if TYPE_CHECKING: import a\nelse: b = 1 < 2", set()),
+    ],
+)
+def test_each_operator_is_changed_alone(text, changed):
+    assert changed == {one.apply(text) for one in python_mutants("a.py", text)}
+
+
+def test_a_mutant_knows_its_line():
+    (one, _) = python_mutants("a.py", "x = y\n\nz = (a\n     < b)\n")
+
+    assert ("a.py", 3, "a\n     < b", "(a\n     <= b)") == (one.file, one.line, one.old, one.new)
+
+
+def test_a_sample_is_repeatable_and_holds_programs_alone():
+    decoder = PythonDecoder([])
+    first, again, other = (sample(decoder, 40, seed) for seed in (0, 0, 1))
+
+    assert first == again != other
+    assert 40 == len({(one.file, one.start, one.new) for one in first})
+    assert all(decoder.valid(one) for one in first)
+    assert not decoder.valid(Mutant("morton.py", 1, 0, "", "def"))
+
+
+# What becomes of it --------------------------------------------------------------------------------
+
+
+def test_a_mutant_that_fails_a_vector_is_caught(few):
+    few("valid/one_splat", "valid/means_morton")
+    decoder = PythonDecoder([])
+
+    result = decoder.attempt(mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted"))
+    assert (Fate.CAUGHT, "valid/means_morton") == (result.fate, result.by)
+
+
+def test_a_mutant_that_only_a_fuzzed_file_shows_is_missed(few):
+    few("valid/one_splat")
+    decoder = PythonDecoder([BY_NAME[name].data for name in ("valid/quats", "valid/means_morton")])
+
+    result = decoder.attempt(mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted"))
+    assert Fate.MISSED is result.fate
+    assert result.by.startswith("file 1: ")
+
+
+def test_a_mutant_that_changes_nothing_is_the_same(few):
+    few("valid/means_morton", "invalid/chunk_crc")
+    decoder = PythonDecoder([BY_NAME["valid/rich"].data])
+
+    result = decoder.attempt(mutant(decoder, "scene.py", "8", "(8 - 1)"))
+    assert (Fate.SAME, "") == (result.fate, result.by)
+
+
+def test_a_mutant_that_hangs_is_caught(few, monkeypatch):
+    few("valid/means_morton")
+    monkeypatch.setattr(python, "_PROCESSOR_SECONDS", 1)
+    decoder = PythonDecoder([])
+    one = mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted")
+
+    result = decoder.attempt(replace(one, new="while True: pass"))
+    assert (Fate.CAUGHT, "hangs, or ends the process") == (result.fate, result.by)
+
+
+def test_what_another_decoder_may_leave_unread_must_be_refused():
+    judging.vectors.cache_clear()
+
+    assert any(vector.error["optional"] for vector in load() if vector.error)
+    assert not any(vector.error["optional"] for vector, _ in judging.vectors() if vector.error)
+
+
+def test_the_command_prints_survivors_and_score(few, monkeypatch, capsys):
+    few("valid/one_splat")
+    monkeypatch.setattr(command, "fuzzed", lambda _count, _seed: [])
+    monkeypatch.setattr(sys, "argv", ["mutation", "--count", "3", "--seed", "5"])
+
+    assert 0 == command.main()
+    out = capsys.readouterr()
+    assert "python: 3 of " in out.out
+    assert "3 of 3, " in out.err
+
+
+def test_survivors_stand_in_a_table_and_the_score_counts_what_can_be_seen():
+    text = "x = a |\\\n b; y\nz\n"
+    results = [
+        Result(Mutant("a.py", 1, 4, "a |\\\n b", "(a &\\\n b)"), Fate.SAME),
+        Result(Mutant("a.py", 3, 15, "z", "0"), Fate.MISSED, "file 7: refused"),
+        *[Result(Mutant("a.py", 3, 15, "z", "1"), Fate.CAUGHT, "valid/rich")] * 3,
+    ]
+
+    assert 75.0 == score(results)
+    assert [
+        "| missed | a.py:3 | `z` | `0` | file 7: refused |",
+        "| same | a.py:1 | `x = a ¦\\ b; y` | `x = (a &\\ b); y` |  |",
+    ] == table(results, {"a.py": text}).splitlines()[2:]
+
+
+# JavaScript ----------------------------------------------------------------------------------------
+
+
+@needs_node
+def test_javascript_is_changed_by_its_syntax(few, monkeypatch):
+    monkeypatch.setenv("npm_config_offline", "true")  # the parser is used where the type check has brought it
+    decoder = JavaScriptDecoder([])
+    try:
+        changes = {(one.file, one.old, one.new) for one in decoder.mutants}
+    except InputError as error:
+        pytest.skip(f"skipped: {error}")
+
+    assert ("lattice.mjs", "co / 2", "(co * 2)") in changes
+    assert not {file for file, _, _ in changes} & {"spec.mjs", "reader.mjs"}
+    few("valid/one_splat", "invalid/tile_tail")
+    (tail,) = (one for one in decoder.mutants if one.old.startswith("throw") and "bytes too many" in one.old)
+    assert Result(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)
+    few("valid/one_splat")
+    assert Fate.SAME is decoder.attempt(tail).fate
