@@ -191,8 +191,10 @@ def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path,
     words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-loss", "1dB", "--data", folder)
     done = run(*words, "--keep-all", "--json")
     assert 0 == done.exit_code, done.output
-    scores = json.loads(done.stdout)["target"]["photographs"]
-    assert scores["source"] - 1.6 <= scores["file"] < scores["source"]  # other photographs decided
+    target = json.loads(done.stdout)["target"]
+    scores = target["photographs"]
+    # Other photographs decided, and at 62 dB, where 8 bits end, the two that judge differ by more than is allowed.
+    assert scores["source"] - 1.0 - target["spread"] <= scores["file"] < scores["source"]
 
 
 def test_a_long_search_says_beforehand_how_long_it_takes(tmp_path, ply, monkeypatch):

@@ -36,6 +36,7 @@ class Plan:
         lattice: of the means.
         morton: means are coded MORTON and splats are sorted; otherwise AXIS, in the model's order.
         sh_degree: bands that are kept.
+        scale_step, sh0_step, sh_step: lattice steps, rounded to float32.
         sh_coding: "auto", "codebook", "scalar" or "none"; the SH stage settles "auto".
         codebook_step: lattice step of the bands 1 to 3 if they get a codebook, whose entries are worth more precision.
         codebook_share: entries per splat.
@@ -64,6 +65,10 @@ class Plan:
     tile_splats: int
     coding: Coding
     gauged: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("scale_step", "sh0_step", "sh_step", "codebook_step"):  # ATT-10: "a binary32 value"
+            object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
     def attribute_records(self) -> list[_spec.AttributeRecord]:
         """Return the file's attribute records (spec 4.3.1)."""
@@ -99,12 +104,12 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
     return Plan(
         lattice=_lattice(model, options, steps.means),
         morton=options.means_coding != "axis",
-        scale_step=_single(_first(options.scale_step, steps.scales)),
+        scale_step=_first(options.scale_step, steps.scales),
         opacity_levels=_first(options.opacity_levels, steps.opacity_levels),
         quat_levels=_first(options.quat_levels, steps.quat_levels),
-        sh0_step=_single(_first(options.sh0_step, steps.sh0)),
-        sh_step=_single(_first(options.sh_step, steps.sh)),
-        codebook_step=_single(_first(options.sh_step, steps.sh / 2**preset.codebook_finer)),
+        sh0_step=_first(options.sh0_step, steps.sh0),
+        sh_step=_first(options.sh_step, steps.sh),
+        codebook_step=_first(options.sh_step, steps.sh / 2**preset.codebook_finer),
         codebook_share=preset.codebook_share,
         escape_fraction=preset.escape_fraction,
         escape_coarse=0 if options.sh_step else preset.codebook_finer,
@@ -155,11 +160,6 @@ def _steps(statistics: Statistics, quality: float, sh_quality: float, *, has_sh:
         sh0=0.07 * coarse(quality + for_sh0),
         sh=0.0135 * coarse(sh_quality),
     )
-
-
-def _single(step: float) -> float:
-    """The binary32 value nearest to a step (ATT-10)."""
-    return float(np.float32(step))
 
 
 def _first(chosen: Any, otherwise: Any) -> Any:

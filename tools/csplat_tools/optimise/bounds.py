@@ -146,10 +146,10 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
         elif name == "opacities":
             chosen["opacity_levels"] = _within(1.0 / bound, 1, 65535)
         elif name == "covariance":
-            chosen["scale_step"] = min(max(0.4 * bound, 1e-6), 1e3)
+            chosen["scale_step"] = _a_step(0.4 * bound)
             chosen["quat_levels"] = _within(4.0 / bound, 8, 32767)
         else:
-            step = min(max(_AIM * bound, 1e-6), 1e3)
+            step = _a_step(_AIM * bound)
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
     if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
         if encoding.sh_coding == "none":
@@ -176,14 +176,19 @@ def _finer(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions
             levels = _levels(options.opacity_levels, factor)
             chosen["opacity_levels"] = _within(levels, 1, 65535)
         elif name == "covariance":
-            chosen["scale_step"] = min(max((options.scale_step or 1.0) * factor, 1e-6), 1e3)
+            chosen["scale_step"] = _a_step((options.scale_step or 1.0) * factor)
             chosen["quat_levels"] = _within(_levels(options.quat_levels, factor), 8, 32767)
         else:
             knob = _KNOBS[_family(name)][0]
             before = getattr(options, knob)
-            step = min(max(before * factor, 1e-6), 1e3)
+            step = _a_step(before * factor)
             chosen[knob] = min(step, chosen.get(knob, step))
     return replace(options, **chosen)
+
+
+def _a_step(wanted: float) -> float:
+    """The nearest step that the encoder takes."""
+    return min(max(wanted, 1e-6), 1e3)
 
 
 def _levels(levels: int | None, factor: float) -> int:
