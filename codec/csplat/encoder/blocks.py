@@ -25,7 +25,7 @@ __all__ = [
 Integers = NDArray[Any]
 I64 = NDArray[np.int64]
 
-_MOSTLY = 0.95  # share of the splats from which on a mask is not worth trying
+_MOSTLY = 0.9  # share of the splats from which on a mask is not worth the time that it takes decoders
 
 
 def levels_block(q: Integers, coding: Coding) -> bytes:
