@@ -78,13 +78,10 @@ def read_columns(
         exponent = read_exponent(cursor, record, fixed=escape or attribute == _spec.ATTRIBUTE_QUATS)
     if coding == _spec.CODING_OFFSET:
         offsets = read_offsets(cursor, columns)
+    if coding == _spec.CODING_SIGNED:
+        return read_signed(cursor, record, exponent, count)
     at = cursor.at
-    elements = read_stream(
-        cursor,
-        columns * count,
-        _spec.CODING_WIDTH_MAX[coding],
-        signed=coding == _spec.CODING_SIGNED,
-    )
+    elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[coding])
     block = Columns(elements.reshape(columns, count), offsets, exponent, at)
     check_integers(block.lows, block.highs, record, at)
     return block
