@@ -250,6 +250,7 @@ def rules_module(registry: Registry) -> str:
             choices.append(f"Choice({where}, {tuple(used)}, {tuple(others)}, {refusal})")
         else:
             listed = sum(ids_of(enum_named(registry, rule["flags"]))[0]) if rule["flags"] else 0
+            listed |= rule.get("skipped", 0)
             masks.append(f"Mask({where}, {listed}, {bits_of(base)}, {refusal})")
     return "\n".join(
         [
@@ -268,7 +269,7 @@ def rules_module(registry: Registry) -> str:
             *rule_class(
                 "Choice", "Ids of an enum; some that are none.", "used: tuple[int, ...]", "others: tuple[int, ...]"
             ),
-            *rule_class("Mask", "The listed bits of a field that has so many.", "listed: int", "bits: int"),
+            *rule_class("Mask", "The bits that a field of so many may have.", "listed: int", "bits: int"),
             *rule_tuple("RANGES", "Range", ranges),
             *rule_tuple("CHOICES", "Choice", choices),
             *rule_tuple("MASKS", "Mask", masks),
@@ -288,7 +289,7 @@ def rules_of(registry: Registry) -> Iterator[tuple[str, Field, Registry]]:
                 kind = next((key for key in USUAL_ERRORS if key in rule), "none")
                 found = {"error": USUAL_ERRORS.get(kind)} | rule
                 where = f"registry: {structure['name']}.{name}: {rule}"
-                if set(found) - {kind, "of", "clause", "error"} or found["error"] not in codes:
+                if set(found) - {kind, "of", "clause", "error", "skipped"} or found["error"] not in codes:
                     raise SystemExit(f"{where}: wanted one of {', '.join(USUAL_ERRORS)}, and of, clause, error")
                 if kind == "range" and not fits(found["range"], field[1]):
                     raise SystemExit(f"{where}: not a range of {field[1]}")
@@ -496,7 +497,9 @@ def values_text(rule: Registry, registry: Registry) -> str:
             return "0"
         title = enum_named(registry, name)["title"].split(" (")[0]
         registered = f"registry of {title[0].lower()}{title[1:]}"
-        return registered if "enum" in rule else f"{registered}; other bits reserved, 0"
+        if "enum" in rule:
+            return registered
+        return f"{registered}; other bits reserved, 0" + ", but for those of ANC-1" * ("skipped" in rule)
     low, high = rule["range"]
     if low == high:
         return f"{low:g}"

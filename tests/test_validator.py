@@ -48,8 +48,8 @@ UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which
 #: Clauses of sections 2 to 8 that are not about a file's bytes: decoders, readers of parts, editors, permissions; and
 #: CBK-6 and CBK-7, which say where other clauses hold.
 NOT_ABOUT_FILES = {
-    "NUM-1", "ORD-1", "HDR-12", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5", "CHK-6", "CHK-7",
-    "COD-4", "CBK-6", "CBK-7",
+    "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5",
+    "CHK-6", "CHK-7", "COD-4", "CBK-6", "CBK-7",
 }  # fmt: skip
 
 
@@ -149,7 +149,7 @@ def test_all_defects_of_a_file_are_named():
     changes = {
         "header.profile": 9,
         "header.reserved_0": 1,
-        "index.scene_flags": 0x80,
+        "index.scene_flags": 0x08,
         "index.unit_metres": -1.0,
         "attribute[means].levels": 3,
         "attribute[sh1].chroma_shift": 17,
@@ -216,9 +216,10 @@ def test_a_file_of_nothing_but_violations_ends():
     data = bytearray(build(scene(chunks=names)).data)
     header = _spec.unpack_header(data)
     count = 60_000
-    record = _spec.pack_directory_record(_spec.DirectoryRecord(b"bad!", 0xFF00, 1, 1, 1, 1, 0, 0, 0))
+    record = _spec.pack_directory_record(_spec.DirectoryRecord(b"bad!", 0x00FC, 1, 1, 1, 1, 0, 0, 0))
     index = bytearray(data[_spec.HEADER_SIZE : _spec.HEADER_SIZE + header.index_size - 4])
-    index[12:14] = count.to_bytes(2, "little")
+    at = _spec.INDEX_HEAD_OFFSETS["directory_count"]
+    index[at : at + 2] = count.to_bytes(2, "little")
     data[16:20] = (len(index) + count * len(record) + 4).to_bytes(4, "little")
     found = validate(bytes(data[: _spec.HEADER_SIZE]) + bytes(index) + record * count + bytes(4))
 

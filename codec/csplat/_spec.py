@@ -29,6 +29,9 @@ TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
 EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
+ANCILLARY_ID_MIN: Final = 128  # least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
+ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
+ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 BUDGET_SPLATS: Final = 33554432  # default budget: splats of one whole-scene decode, 2^25
 BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables, 8 GiB
 BUDGET_BYTES_JS: Final = 2147483648  # default budget in JavaScript, 2 GiB
@@ -221,6 +224,14 @@ def pack_header(r: Header) -> bytes:
 class IndexHead(NamedTuple):
     """Head of the index."""
 
+    head_size: int
+    attribute_size: int
+    codebook_size: int
+    extra_size: int
+    directory_size: int
+    tile_size: int
+    layer_size: int
+    reserved_0: int
     splat_count: int
     tile_count: int
     directory_count: int
@@ -234,20 +245,20 @@ class IndexHead(NamedTuple):
     origin: tuple[float, float, float]
 
 
-INDEX_HEAD_STRUCT: Final = struct.Struct("<QIHHHBBB3sdddd")
-INDEX_HEAD_SIZE: Final = 56
-INDEX_HEAD_OFFSETS: Final[dict[str, int]] = {"splat_count": 0, "tile_count": 8, "directory_count": 12, "codebook_count": 14, "extra_count": 16, "attribute_count": 18, "sh_degree": 19, "scene_flags": 20, "axes": 21, "unit_metres": 24, "origin": 32}
+INDEX_HEAD_STRUCT: Final = struct.Struct("<BBBBBBBBQIHHHBBB3sdddd")
+INDEX_HEAD_SIZE: Final = 64
+INDEX_HEAD_OFFSETS: Final[dict[str, int]] = {"head_size": 0, "attribute_size": 1, "codebook_size": 2, "extra_size": 3, "directory_size": 4, "tile_size": 5, "layer_size": 6, "reserved_0": 7, "splat_count": 8, "tile_count": 16, "directory_count": 20, "codebook_count": 22, "extra_count": 24, "attribute_count": 26, "sh_degree": 27, "scene_flags": 28, "axes": 29, "unit_metres": 32, "origin": 40}
 
 
 def unpack_index_head(data: bytes | bytearray | memoryview, offset: int = 0) -> IndexHead:
     """Read a IndexHead at a byte offset; struct.error where the data is too short."""
     v = INDEX_HEAD_STRUCT.unpack_from(data, offset)
-    return IndexHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], (v[10], v[11], v[12]))
+    return IndexHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14], v[15], v[16], v[17], (v[18], v[19], v[20]))
 
 
 def pack_index_head(r: IndexHead) -> bytes:
-    """Return the 56 bytes of a IndexHead."""
-    return INDEX_HEAD_STRUCT.pack(r.splat_count, r.tile_count, r.directory_count, r.codebook_count, r.extra_count, r.attribute_count, r.sh_degree, r.scene_flags, r.axes, r.unit_metres, *r.origin)
+    """Return the 64 bytes of a IndexHead."""
+    return INDEX_HEAD_STRUCT.pack(r.head_size, r.attribute_size, r.codebook_size, r.extra_size, r.directory_size, r.tile_size, r.layer_size, r.reserved_0, r.splat_count, r.tile_count, r.directory_count, r.codebook_count, r.extra_count, r.attribute_count, r.sh_degree, r.scene_flags, r.axes, r.unit_metres, *r.origin)
 
 
 class AttributeRecord(NamedTuple):

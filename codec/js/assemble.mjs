@@ -58,7 +58,7 @@ export class Assembly {
  * @param {Required<Limits>} limits
  */
 export function checkBudget(count, bytes, limits) {
-  const at = spec.HEADER_SIZE; // splat_count
+  const at = spec.HEADER_SIZE + spec.INDEX_HEAD_OFFSETS.splat_count;
   if (count > limits.splats)
     throw fault(spec.ERROR_LIMIT, at, 'LIM-1', `${count} splats, the budget is ${limits.splats}`);
   if (bytes > limits.bytes) {

@@ -53,8 +53,9 @@ export interface CodebookRecord {
 
 export interface ExtraRecord {
   name: string;
-  dtype: 'u8' | 'i8' | 'u16' | 'i16' | 'u32' | 'i32' | 'f32' | 'f64';
-  /** Of one value. */
+  /** null where this decoder does not know the type: then the column is not returned. */
+  dtype: 'u8' | 'i8' | 'u16' | 'i16' | 'u32' | 'i32' | 'f32' | 'f64' | null;
+  /** Of one value; 0 where the type is not known. */
   bytes: number;
 }
 
@@ -99,6 +100,7 @@ export interface TileRecord {
   max: number[];
   /** Natural logarithm of the largest standard deviation. */
   maxScale: number;
+  /** Those that this decoder does not know too. */
   layers: LayerRecord[];
   /** Ids of the codebooks. */
   tables: number[];

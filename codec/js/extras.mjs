@@ -18,6 +18,14 @@ const EXTRA_VIEWS = {
   f64: (buffer) => new Float64Array(buffer),
 };
 
+/**
+ * Whether this version knows a column's type; a column of another one is not returned (ANC-3).
+ *
+ * @param {ExtraRecord} record
+ * @returns {record is ExtraRecord & {dtype: string}}
+ */
+export const isKnown = ({ dtype }) => dtype !== null;
+
 /** Extra columns, bit for bit: floats are never read as such, so that NaN keep their bits. */
 export class ExtraArrays {
   /**
@@ -25,8 +33,8 @@ export class ExtraArrays {
    * @param {ExtraRecord[]} records
    */
   constructor(count, records) {
-    this.records = records;
-    this.buffers = records.map(({ bytes }) => new ArrayBuffer(count * bytes));
+    this.records = records.filter(isKnown);
+    this.buffers = this.records.map(({ bytes }) => new ArrayBuffer(count * bytes));
   }
 
   /**

@@ -26,6 +26,16 @@ const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE
 const AT_HEAD = spec.INDEX_HEAD_OFFSETS;
 /** @type {Record<string, number | undefined>} Directions along one line. */
 const LINES = { R: 0, L: 0, U: 1, D: 1, F: 2, B: 2 };
+/** Sizes that the head states, with the least of each. */
+const RECORD_SIZES = /** @type {const} */ ([
+  ['head_size', spec.INDEX_HEAD_SIZE],
+  ['attribute_size', spec.ATTRIBUTE_RECORD_SIZE],
+  ['codebook_size', spec.CODEBOOK_RECORD_SIZE],
+  ['extra_size', spec.EXTRA_RECORD_SIZE],
+  ['directory_size', spec.DIRECTORY_RECORD_SIZE],
+  ['tile_size', spec.TILE_RECORD_SIZE],
+  ['layer_size', spec.LAYER_RECORD_SIZE],
+]);
 const INDEX_GROWTH = 8; // the objects made of an index take about so many times its bytes
 
 /**
@@ -39,30 +49,37 @@ const INDEX_GROWTH = 8; // the objects made of an index take about so many times
 export function readIndex(bytes, file, limits) {
   checkIndexCrc(bytes);
   const index = new Payload(bytes.subarray(0, -CRC_SIZE), spec.HEADER_SIZE, 'IDX-2', ERROR_INDEX);
-  const { fields: head } = index.read(spec.unpackIndexHead, spec.INDEX_HEAD_SIZE, {}, 'the head of the index');
+  const { fields: head } = index.read(
+    spec.unpackIndexHead,
+    spec.INDEX_HEAD_SIZE,
+    spec.INDEX_HEAD_RESERVED,
+    'the head of the index',
+  );
+  checkSizes(head);
   const scene = readScene(head);
   checkCounts(head, index, limits);
+  index.claim(head.head_size - spec.INDEX_HEAD_SIZE, 'the tail of the head');
 
   const attributes = [];
-  for (let i = 0; i < head.attribute_count; i++) attributes.push(readAttribute(index, i));
+  for (let i = 0; i < head.attribute_count; i++) attributes.push(readAttribute(index, head.attribute_size, i));
   /** @type {CodebookRecord[]} */
   const codebooks = [];
   for (let i = 0; i < head.codebook_count; i++)
-    codebooks.push(readCodebook(index, codebooks.at(-1)?.id ?? -1, head.sh_degree));
+    codebooks.push(readCodebook(index, head.codebook_size, codebooks.at(-1)?.id ?? -1, head.sh_degree));
   /** @type {ExtraRecord[]} */
   const extras = [];
   const names = new Set();
-  for (let i = 0; i < head.extra_count; i++) extras.push(readExtra(index, names));
+  for (let i = 0; i < head.extra_count; i++) extras.push(readExtra(index, head.extra_size, names));
   const directoryOffset = index.offset;
   const directory = [];
-  for (let i = 0; i < head.directory_count; i++) directory.push(readDirectory(index));
+  for (let i = 0; i < head.directory_count; i++) directory.push(readDirectory(index, head.directory_size));
   checkDirectory(directory, codebooks, directoryOffset);
 
   /** @type {Header} */
   const header = { ...scene, ...omit(file), attributes, codebooks, extras, directory, tiles: [], splatCount: 0 };
   const ids = new Set(codebooks.map(({ id }) => id));
   for (let i = 0; i < head.tile_count; i++) {
-    const tile = readTile(index, header, i);
+    const tile = readTile(index, head, header, i);
     checkTables(tile, ids);
     header.splatCount += tile.splatCount; // below 2^32 × 2^16
     header.tiles.push(tile);
@@ -71,7 +88,7 @@ export function readIndex(bytes, file, limits) {
   if (head.splat_count !== BigInt(header.splatCount)) {
     throw fault(
       ERROR_INDEX,
-      spec.HEADER_SIZE,
+      spec.HEADER_SIZE + AT_HEAD.splat_count,
       'IDX-7',
       `N is ${head.splat_count}, the tiles hold ${header.splatCount}`,
     );
@@ -83,12 +100,24 @@ export function readIndex(bytes, file, limits) {
 /** @param {FileHeader} file */
 const omit = ({ profile, fileSize, indexSize }) => ({ profile, fileSize, indexSize });
 
+/**
+ * IDX-8: what this version reads of a record lies within it.
+ *
+ * @param {IndexHead} head
+ */
+function checkSizes(head) {
+  for (const [name, least] of RECORD_SIZES) {
+    const size = head[name];
+    if (size < least) throw fault(ERROR_VALUE, spec.HEADER_SIZE + AT_HEAD[name], 'IDX-8', `${name} ${size}`);
+  }
+}
+
 /** @param {IndexHead} head */
 function readScene(head) {
   const at = spec.HEADER_SIZE;
   if (head.sh_degree > spec.SH_DEGREE_MAX)
     throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', `SH degree ${head.sh_degree}`);
-  const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT;
+  const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;
   if (head.scene_flags & ~flags)
     throw fault(ERROR_RESERVED, at + AT_HEAD.scene_flags, 'RES-1', `scene flags ${head.scene_flags}`);
   const axes = [...head.axes];
@@ -136,11 +165,12 @@ function checkCounts(head, index, limits) {
     );
   }
   const least =
-    head.attribute_count * spec.ATTRIBUTE_RECORD_SIZE +
-    head.codebook_count * spec.CODEBOOK_RECORD_SIZE +
-    head.extra_count * spec.EXTRA_RECORD_SIZE +
-    head.directory_count * spec.DIRECTORY_RECORD_SIZE +
-    head.tile_count * spec.TILE_RECORD_SIZE;
+    (head.head_size - spec.INDEX_HEAD_SIZE) +
+    head.attribute_count * head.attribute_size +
+    head.codebook_count * head.codebook_size +
+    head.extra_count * head.extra_size +
+    head.directory_count * head.directory_size +
+    head.tile_count * head.tile_size;
   if (least > index.left)
     throw fault(ERROR_INDEX, at, 'IDX-2', `records of at least ${least} bytes, ${index.left} are there`);
   if (index.bytes.length * INDEX_GROWTH > limits.bytes) {
@@ -155,14 +185,15 @@ function checkCounts(head, index, limits) {
 
 /**
  * @param {Payload} index
+ * @param {number} size of the record
  * @param {number} place
  * @returns {AttributeRecord}
  */
-function readAttribute(index, place) {
+function readAttribute(index, size, place) {
   const places = spec.ATTRIBUTE_RECORD_OFFSETS;
   const { fields, offset } = index.read(
     spec.unpackAttributeRecord,
-    spec.ATTRIBUTE_RECORD_SIZE,
+    size,
     spec.ATTRIBUTE_RECORD_RESERVED,
     'an attribute record',
   );
@@ -203,15 +234,16 @@ function readAttribute(index, place) {
 
 /**
  * @param {Payload} index
+ * @param {number} recordSize
  * @param {number} before id of the record before
  * @param {number} shDegree
  * @returns {CodebookRecord}
  */
-function readCodebook(index, before, shDegree) {
+function readCodebook(index, recordSize, before, shDegree) {
   const places = spec.CODEBOOK_RECORD_OFFSETS;
   const { fields, offset } = index.read(
     spec.unpackCodebookRecord,
-    spec.CODEBOOK_RECORD_SIZE,
+    recordSize,
     spec.CODEBOOK_RECORD_RESERVED,
     'a codebook record',
   );
@@ -244,14 +276,16 @@ function readCodebook(index, before, shDegree) {
 
 /**
  * @param {Payload} index
+ * @param {number} recordSize
  * @param {Set<string>} names those of the columns before
  * @returns {ExtraRecord}
  */
-function readExtra(index, names) {
+function readExtra(index, recordSize, names) {
   const places = spec.EXTRA_RECORD_OFFSETS;
-  const { fields, offset } = index.read(spec.unpackExtraRecord, spec.EXTRA_RECORD_SIZE, {}, 'an extra column record');
+  const { fields, offset } = index.read(spec.unpackExtraRecord, recordSize, {}, 'an extra column record');
   const dtype = nameOf(spec.EXTRA_DTYPE_NAMES, fields.dtype);
-  if (dtype === undefined) throw fault(ERROR_UNSUPPORTED, offset, 'RES-2', `type ${fields.dtype} of an extra column`);
+  if (dtype === undefined && fields.dtype < spec.ANCILLARY_ID_MIN)
+    throw fault(ERROR_UNSUPPORTED, offset, 'RES-2', `type ${fields.dtype} of an extra column`);
   const size = fields.name_size;
   if (size < 1 || size > spec.EXTRA_NAME_MAX)
     throw fault(ERROR_VALUE, offset + places.name_size, 'EXR-1', `a name of ${size} bytes`);
@@ -268,6 +302,7 @@ function readExtra(index, names) {
   const rest = fields.name.subarray(size).find((byte) => byte !== 0);
   if (rest !== undefined)
     throw fault(ERROR_RESERVED, offset + places.name + size, 'EXR-3', `a byte of ${rest} behind the name`);
+  if (dtype === undefined) return { name, dtype: null, bytes: 0 };
   const bytes = spec.EXTRA_DTYPE_BYTES[/** @type {keyof typeof spec.EXTRA_DTYPE_BYTES} */ (fields.dtype)];
   return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes };
 }
@@ -286,13 +321,14 @@ function decodeUtf8(bytes) {
 
 /**
  * @param {Payload} index
+ * @param {number} recordSize
  * @returns {DirectoryRecord}
  */
-function readDirectory(index) {
+function readDirectory(index, recordSize) {
   const places = spec.DIRECTORY_RECORD_OFFSETS;
   const { fields, offset: at } = index.read(
     spec.unpackDirectoryRecord,
-    spec.DIRECTORY_RECORD_SIZE,
+    recordSize,
     spec.DIRECTORY_RECORD_RESERVED,
     'a directory record',
   );
@@ -301,7 +337,8 @@ function readDirectory(index) {
   if (type === spec.CHUNK_TILE || /[^\x20-\x7e]/.test(type)) {
     throw fault(ERROR_VALUE, at, 'DIR-1', `the type ${JSON.stringify(type)} in the directory`);
   }
-  if (flags & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
+  const known = flags & ~spec.ANCILLARY_CHUNK_FLAGS;
+  if (known & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
     throw fault(ERROR_RESERVED, at + places.flags, 'RES-1', `chunk flags ${flags}`);
   }
   if (type === spec.CHUNK_TREE) {
@@ -309,9 +346,10 @@ function readDirectory(index) {
   }
   if (Object.hasOwn(spec.CHUNK_NAMES, type)) {
     const registered = registeredFlags(type);
-    if (flags !== registered)
+    if (known !== registered)
       throw fault(ERROR_VALUE, at + places.flags, 'CHK-4', `flags ${flags} of ${type}, not ${registered}`);
   } else if (flags & spec.CHUNK_FLAG_CRITICAL) {
+    if (/^[a-z]/.test(type)) throw fault(ERROR_VALUE, at + places.flags, 'DIR-6', `a critical private chunk ${type}`);
     throw fault(ERROR_UNSUPPORTED, at, 'DIR-2', `an unknown critical chunk ${JSON.stringify(type)}`);
   }
   return {

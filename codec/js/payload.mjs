@@ -48,7 +48,7 @@ export class Payload {
    *
    * @template {Record<string, unknown>} T
    * @param {(view: DataView, at: number) => T} unpack
-   * @param {number} size
+   * @param {number} size of the structure with its tail, which is skipped
    * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
    * @param {string} what for the message
    * @returns {{fields: T, offset: number}} `offset` in the file

@@ -21,6 +21,9 @@ export const TRANSFORMS_MAX = 4; // transforms of a stream
 export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
 export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
+export const ANCILLARY_ID_MIN = 128; // least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
+export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
+export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 export const BUDGET_SPLATS = 33554432; // default budget: splats of one whole-scene decode, 2^25
 export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables, 8 GiB
 export const BUDGET_BYTES_JS = 2147483648; // default budget in JavaScript, 2 GiB
@@ -201,9 +204,10 @@ export function unpackHeader(view, at) {
   };
 }
 
-export const INDEX_HEAD_SIZE = 56;
-export const INDEX_HEAD_OFFSETS = Object.freeze({ splat_count: 0, tile_count: 8, directory_count: 12, codebook_count: 14, extra_count: 16, attribute_count: 18, sh_degree: 19, scene_flags: 20, axes: 21, unit_metres: 24, origin: 32 });
+export const INDEX_HEAD_SIZE = 64;
+export const INDEX_HEAD_OFFSETS = Object.freeze({ head_size: 0, attribute_size: 1, codebook_size: 2, extra_size: 3, directory_size: 4, tile_size: 5, layer_size: 6, reserved_0: 7, splat_count: 8, tile_count: 16, directory_count: 20, codebook_count: 22, extra_count: 24, attribute_count: 26, sh_degree: 27, scene_flags: 28, axes: 29, unit_metres: 32, origin: 40 });
 export const INDEX_HEAD_STRIDES = Object.freeze({ origin: 8 });
+export const INDEX_HEAD_RESERVED = Object.freeze({ reserved_0: 7 });
 /**
  * Head of the index. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -211,17 +215,25 @@ export const INDEX_HEAD_STRIDES = Object.freeze({ origin: 8 });
  */
 export function unpackIndexHead(view, at) {
   return {
-    splat_count: view.getBigUint64(at + 0, true),
-    tile_count: view.getUint32(at + 8, true),
-    directory_count: view.getUint16(at + 12, true),
-    codebook_count: view.getUint16(at + 14, true),
-    extra_count: view.getUint16(at + 16, true),
-    attribute_count: view.getUint8(at + 18),
-    sh_degree: view.getUint8(at + 19),
-    scene_flags: view.getUint8(at + 20),
-    axes: new Uint8Array(view.buffer, view.byteOffset + at + 21, 3),
-    unit_metres: view.getFloat64(at + 24, true),
-    origin: [view.getFloat64(at + 32, true), view.getFloat64(at + 40, true), view.getFloat64(at + 48, true)],
+    head_size: view.getUint8(at + 0),
+    attribute_size: view.getUint8(at + 1),
+    codebook_size: view.getUint8(at + 2),
+    extra_size: view.getUint8(at + 3),
+    directory_size: view.getUint8(at + 4),
+    tile_size: view.getUint8(at + 5),
+    layer_size: view.getUint8(at + 6),
+    reserved_0: view.getUint8(at + 7),
+    splat_count: view.getBigUint64(at + 8, true),
+    tile_count: view.getUint32(at + 16, true),
+    directory_count: view.getUint16(at + 20, true),
+    codebook_count: view.getUint16(at + 22, true),
+    extra_count: view.getUint16(at + 24, true),
+    attribute_count: view.getUint8(at + 26),
+    sh_degree: view.getUint8(at + 27),
+    scene_flags: view.getUint8(at + 28),
+    axes: new Uint8Array(view.buffer, view.byteOffset + at + 29, 3),
+    unit_metres: view.getFloat64(at + 32, true),
+    origin: [view.getFloat64(at + 40, true), view.getFloat64(at + 48, true), view.getFloat64(at + 56, true)],
   };
 }
 

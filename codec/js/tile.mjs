@@ -11,6 +11,7 @@ import {
   readValues,
 } from './codings.mjs';
 import { fault } from './errors.mjs';
+import { isKnown } from './extras.mjs';
 import { ldexp } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import * as spec from './spec.mjs';
@@ -25,6 +26,7 @@ const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
  * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
+ * @typedef {import('./decoder.d.ts').ExtraRecord} ExtraRecord
  * @typedef {import('./codings.mjs').Block} Block
  * @typedef {import('./codebooks.mjs').Indices} Indices
  * @typedef {import('./codebooks.mjs').Table} Table
@@ -122,8 +124,10 @@ export class Tile {
     for (const attribute of attributes) blocks.push(this.finish(await this.readBlock(payload, attribute, integers)));
     const extras = [];
     if (layer === spec.LAYER_EXTRA) {
-      for (const [column, extra] of this.header.extras.entries())
-        extras.push(await this.readRaw(payload, column, extra.bytes));
+      for (const [column, extra] of this.header.extras.entries()) {
+        const elements = await this.readRaw(payload, column, extra);
+        if (isKnown(extra)) extras.push(elements);
+      }
     }
     payload.finish();
     return { blocks, extras };
@@ -156,9 +160,9 @@ export class Tile {
   /**
    * @param {Payload} payload at the block's head
    * @param {number} column
-   * @param {number} width
+   * @param {ExtraRecord} extra its record
    */
-  async readRaw(payload, column, width) {
+  async readRaw(payload, column, extra) {
     const head = readBlockHead(payload);
     if (head.attribute !== spec.ATTRIBUTE_EXTRA) {
       throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the extra layer`);
@@ -173,8 +177,9 @@ export class Tile {
     if (fields.column !== column)
       throw fault(ERROR_STREAM, offset, 'RAW-1', `column ${fields.column} instead of ${column}`);
     const stream = await readStream(payload, this.splatCount, spec.CODING_WIDTH_MAX[spec.CODING_RAW], this.inflate);
-    if (stream.width !== width) {
-      throw fault(ERROR_STREAM, stream.offset, 'RAW-2', `elements of ${stream.width} bytes, the type has ${width}`);
+    if (isKnown(extra) && stream.width !== extra.bytes) {
+      const what = `elements of ${stream.width} bytes, the type has ${extra.bytes}`;
+      throw fault(ERROR_STREAM, stream.offset, 'RAW-2', what);
     }
     return stream;
   }

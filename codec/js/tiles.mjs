@@ -15,20 +15,22 @@ const AXES = [0, 1, 2];
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
  * @typedef {import('./payload.mjs').Payload} Payload
+ * @typedef {Pick<ReturnType<typeof spec.unpackIndexHead>, 'tile_size' | 'layer_size'>} RecordSizes as the index head states them
  */
 
 /**
  * Read the record of one tile, with its layers and table ids.
  *
  * @param {Payload} index at the record
+ * @param {RecordSizes} sizes
  * @param {Header} header with attributes and extras; the tiles before stand in `tiles`
  * @param {number} place number of the tile
  * @returns {TileRecord}
  */
-export function readTile(index, header, place) {
+export function readTile(index, sizes, header, place) {
   const { fields, offset } = index.read(
     spec.unpackTileRecord,
-    spec.TILE_RECORD_SIZE,
+    sizes.tile_size,
     spec.TILE_RECORD_RESERVED,
     'a tile record',
   );
@@ -38,13 +40,13 @@ export function readTile(index, header, place) {
   if (splatCount < 1 || splatCount > spec.TILE_SPLATS_MAX) {
     throw fault(ERROR_VALUE, offset, 'TIL-1', `a tile of ${splatCount} splats`);
   }
-  const lists = layer_count * spec.LAYER_RECORD_SIZE + TABLE_ID_SIZE * table_count;
+  const lists = layer_count * sizes.layer_size + TABLE_ID_SIZE * table_count;
   if (lists > index.left) throw fault(ERROR_INDEX, offset, 'IDX-2', `lists of ${lists} bytes, ${index.left} are left`);
   const corner = readCorner(fields.corner, extent, offset);
   const step = ldexp(header.attributes[spec.ATTRIBUTE_MEANS - 1].step, exponent);
   if (!(step > 0 && step < Infinity))
     throw fault(ERROR_VALUE, offset + AT.exponent, 'TIL-9', `a lattice with the exponent ${exponent}`);
-  const layers = readLayers(index, layer_count, header);
+  const layers = readLayers(index, sizes.layer_size, layer_count, header);
   const tablesOffset = index.offset;
   const tables = [];
   for (let i = 0; i < table_count; i++)
@@ -93,11 +95,12 @@ function readCorner(corner, extent, offset) {
 
 /**
  * @param {Payload} index
+ * @param {number} recordSize
  * @param {number} count
  * @param {Header} header
  * @returns {LayerRecord[]}
  */
-function readLayers(index, count, header) {
+function readLayers(index, recordSize, count, header) {
   const start = index.offset;
   /** @type {LayerRecord[]} */
   const layers = [];
@@ -105,17 +108,19 @@ function readLayers(index, count, header) {
   for (let i = 0; i < count; i++) {
     const { fields, offset: at } = index.read(
       spec.unpackLayerRecord,
-      spec.LAYER_RECORD_SIZE,
+      recordSize,
       spec.LAYER_RECORD_RESERVED,
       'a layer record',
     );
     const { layer, size, offset, crc } = fields;
-    if (nameOf(spec.LAYER_NAMES, layer) === undefined) throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `layer ${layer}`);
+    const skipped = layer >= spec.ANCILLARY_ID_MIN;
+    if (!skipped && nameOf(spec.LAYER_NAMES, layer) === undefined)
+      throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `layer ${layer}`);
     const before = layers.at(-1)?.layer;
     if (before === undefined ? layer !== spec.LAYER_GEOMETRY : layer <= before) {
       throw fault(ERROR_INDEX, at, 'TIL-2', `layer ${layer} after ${before ?? 'none'}`);
     }
-    if (layer !== spec.LAYER_EXTRA && layer > header.shDegree) {
+    if (!skipped && layer !== spec.LAYER_EXTRA && layer > header.shDegree) {
       throw fault(ERROR_INDEX, at, 'TIL-3', `layer ${layer} in a scene of SH degree ${header.shDegree}`);
     }
     layers.push({
@@ -130,7 +135,7 @@ function readLayers(index, count, header) {
     });
   }
   if (count === 0) throw fault(ERROR_INDEX, start, 'TIL-2', 'no layers');
-  const hasExtra = layers[count - 1].layer === spec.LAYER_EXTRA;
+  const hasExtra = layers.some(({ layer }) => layer === spec.LAYER_EXTRA);
   if (hasExtra !== header.extras.length > 0) {
     throw fault(
       ERROR_INDEX,

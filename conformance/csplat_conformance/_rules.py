@@ -35,7 +35,7 @@ class Choice(NamedTuple):
 
 
 class Mask(NamedTuple):
-    """The listed bits of a field that has so many."""
+    """The bits that a field of so many may have."""
 
     structure: str
     field: str
@@ -49,6 +49,13 @@ class Mask(NamedTuple):
 RANGES: Final[tuple[Range, ...]] = (
     Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
     Range("header", "version_minor", "", 2, 2, "HDR-2", "E_VERSION"),
+    Range("index_head", "head_size", "", 64, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "attribute_size", "", 16, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "codebook_size", "", 24, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "extra_size", "", 64, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "directory_size", "", 28, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "tile_size", "", 52, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "layer_size", "", 20, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "sh_degree", "", 0, 3, "IDX-3", "E_UNSUPPORTED"),
     Range("index_head", "unit_metres", "", 0.0, 1.7976931348623157e+308, "IDX-5", "E_VALUE"),
     Range("index_head", "origin", "", -1.7976931348623157e+308, 1.7976931348623157e+308, "IDX-6", "E_VALUE"),
@@ -105,10 +112,11 @@ CHOICES: Final[tuple[Choice, ...]] = (
 MASKS: Final[tuple[Mask, ...]] = (
     Mask("header", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("header", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),
-    Mask("index_head", "scene_flags", "", 3, 8, "RES-1", "E_RESERVED"),
+    Mask("index_head", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
+    Mask("index_head", "scene_flags", "", 243, 8, "RES-1", "E_RESERVED"),
     Mask("attribute_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("codebook_record", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
-    Mask("directory_record", "flags", "", 3, 16, "RES-1", "E_RESERVED"),
+    Mask("directory_record", "flags", "", 65283, 16, "RES-1", "E_RESERVED"),
     Mask("directory_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("directory_record", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),
     Mask("tile_record", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),

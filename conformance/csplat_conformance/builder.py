@@ -7,7 +7,7 @@ overwrite it afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,16 @@ from csplat_conformance.scene import Block, Chunk, Codebook, Scene, Stream, Tile
 
 __all__ = ["Built", "build", "chunk_names"]
 
+#: Structures whose sizes the index head states, in its order.
+_SIZED = (
+    "index_head",
+    "attribute_record",
+    "codebook_record",
+    "extra_record",
+    "directory_record",
+    "tile_record",
+    "layer_record",
+)
 _CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
 
 
@@ -103,13 +113,36 @@ def _header(index_size: int, file_size: int) -> list[Any]:
 # Index ---------------------------------------------------------------------------------------------
 
 
+class _Records(Writer):
+    """The index: structures with the tails that the scene declares."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.tails = dict(scene.tails)
+
+    def structure(self, name: str, structure: str, values: Iterable[Any]) -> None:
+        super().structure(name, structure, values)
+        tail = self.tails.get(_kind(structure), b"")
+        if tail:
+            self.raw(f"{name}.tail", tail)
+
+    def size_of(self, structure: str) -> int:
+        return int(getattr(_spec, f"{structure.upper()}_SIZE")) + len(self.tails.get(_kind(structure), b""))
+
+
+def _kind(structure: str) -> str:
+    """`head` of `index_head`, `tile` of `tile_record`."""
+    return structure.removeprefix("index_").removesuffix("_record")
+
+
 def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> Writer:
-    out = Writer()
+    out = _Records(scene)
+    sizes = [out.size_of(name) for name in _SIZED]
     directory = scene.directory or tuple(n for n in scene.order or chunks if not n.startswith("TILE."))
     counts = [len(directory), len(scene.codebooks), len(scene.extras), len(scene.attributes)]
     splats = sum(tile.splat_count for tile in scene.tiles)
     facts: list[Any] = [scene.sh_degree, scene.scene_flags, bytes(scene.axes), scene.unit_metres, scene.origin]
-    out.structure("index", "index_head", [splats, len(scene.tiles), *counts, *facts])
+    out.structure("index", "index_head", [*sizes, 0, splats, len(scene.tiles), *counts, *facts])
     for attribute, record in scene.attributes.items():
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         facts = [attribute, record.mapping, record.chroma_shift, 0, record.levels, record.step]
@@ -141,7 +174,7 @@ def _directory(scene: Scene, name: str, chunk: Writer, offset: int) -> list[Any]
 
 
 def _tile_record(
-    out: Writer, scene: Scene, i: int, tile: Tile, chunks: dict[str, Writer], offsets: dict[str, int]
+    out: _Records, scene: Scene, i: int, tile: Tile, chunks: dict[str, Writer], offsets: dict[str, int]
 ) -> None:
     used = {b.codebook for b in tile.blocks.values() if b.coding == _spec.CODING_CODEBOOK}
     tables = sorted(used) if tile.tables is None else tile.tables
@@ -167,7 +200,7 @@ def _chunks(scene: Scene) -> dict[str, Writer]:
     for name, chunk in zip(_ancillary_names(scene), scene.chunks, strict=True):
         flags = chunk.flags if chunk.flags is not None else _flags(chunk.type)
         out[name] = _framed(chunk.type, flags, _ancillary(chunk))
-    for layer in sorted(_spec.LAYER_NAMES):
+    for layer in sorted({*_spec.LAYER_NAMES, *(layer for tile in scene.tiles for layer in tile.layers)}):
         for book in scene.codebooks:
             if layer in book.layers:
                 out[f"CODB.{book.id}.{layer}"] = _framed(
@@ -175,7 +208,7 @@ def _chunks(scene: Scene) -> dict[str, Writer]:
                 )
         for i, tile in enumerate(scene.tiles):
             if layer in tile.layers:
-                payload = _tile(scene, tile, layer)
+                payload = _tile(scene, tile, layer) if layer in _spec.LAYER_NAMES else _unknown(tile, layer)
                 out[f"TILE.{i}.{layer}"] = _framed(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
     return out
 
@@ -240,6 +273,12 @@ def _tile(scene: Scene, tile: Tile, layer: int) -> Writer:
     for k, (name, attribute, block) in enumerate(blocks):
         _block(out, name, scene, attribute, block, k)
     _tail(out, dict(tile.tails).get(layer, b""))
+    return out
+
+
+def _unknown(tile: Tile, layer: int) -> Writer:
+    out = Writer()
+    out.raw("payload", dict(tile.unknown)[layer])
     return out
 
 

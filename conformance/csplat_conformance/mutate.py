@@ -67,11 +67,17 @@ def mapped(data: bytes) -> Built:
     head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)
     out.structure("index", "index_head", head)
     spans = {}
+    if head.head_size > _spec.INDEX_HEAD_SIZE:
+        out.raw("index.tail", data[len(out.data) : _spec.HEADER_SIZE + head.head_size])
 
     def record(name: str, structure: str) -> tuple[int, ...]:
         unpack = getattr(_spec, f"unpack_{structure}")
         values: tuple[int, ...] = unpack(data, len(out.data))
+        at = len(out.data)
         out.structure(name, structure, values)
+        end = at + int(getattr(head, structure.replace("_record", "_size")))
+        if end > len(out.data):
+            out.raw(f"{name}.tail", data[len(out.data) : end])
         return values
 
     for structure, count in (("attribute", head.attribute_count), ("codebook", head.codebook_count)):

@@ -58,24 +58,25 @@ def chunk_records(data: bytes) -> list[tuple[str, int]]:
 
 def _records(data: bytes) -> Iterator[tuple[str, int, int]]:
     """Yield structure, place and size of the records that name chunks, up to the first beyond the data."""
-    at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_SIZE
-    if at > len(data):
+    at = _spec.HEADER_SIZE
+    if at + _spec.INDEX_HEAD_SIZE > len(data):
         return
-    head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)
-    at += head.attribute_count * _spec.ATTRIBUTE_RECORD_SIZE
-    at += head.codebook_count * _spec.CODEBOOK_RECORD_SIZE
-    at += head.extra_count * _spec.EXTRA_RECORD_SIZE
+    head = _spec.unpack_index_head(data, at)
+    at += head.head_size
+    at += head.attribute_count * head.attribute_size
+    at += head.codebook_count * head.codebook_size
+    at += head.extra_count * head.extra_size
     for _ in range(head.directory_count):
         yield "directory_record", at, _spec.DIRECTORY_RECORD_SIZE
-        at += _spec.DIRECTORY_RECORD_SIZE
+        at += head.directory_size
     for _ in range(head.tile_count):
         if at + _spec.TILE_RECORD_SIZE > len(data):
             return
         tile = _spec.unpack_tile_record(data, at)
-        at += _spec.TILE_RECORD_SIZE
+        at += head.tile_size
         for _layer in range(tile.layer_count):
             yield "layer_record", at, _spec.LAYER_RECORD_SIZE
-            at += _spec.LAYER_RECORD_SIZE
+            at += head.layer_size
         at += 2 * tile.table_count
 
 

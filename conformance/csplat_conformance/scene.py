@@ -108,6 +108,7 @@ class Tile:
         tables: ids, or None for those that the blocks use.
         order: attributes of layer 0 as their blocks follow one another.
         tails: layer to bytes after the last block.
+        unknown: layers that this version does not have, and their payloads.
     """
 
     blocks: dict[int, Block]
@@ -117,6 +118,7 @@ class Tile:
     tables: tuple[int, ...] | None = None
     order: tuple[int, ...] = _LAYER_0
     tails: tuple[tuple[int, bytes], ...] = ()
+    unknown: tuple[tuple[int, bytes], ...] = ()
 
     @property
     def splat_count(self) -> int:
@@ -127,7 +129,7 @@ class Tile:
     def layers(self) -> list[int]:
         """Layers that the tile holds, ascending."""
         layers = {_spec.ATTRIBUTE_LAYER[attribute] for attribute in self.blocks}
-        return sorted(layers | ({_spec.LAYER_EXTRA} if self.extras else set()))
+        return sorted(layers | ({_spec.LAYER_EXTRA} if self.extras else set()) | {layer for layer, _ in self.unknown})
 
 
 @dataclass(frozen=True)
@@ -210,6 +212,7 @@ class Scene:
         directory: names in the order of the directory; None for the order of the chunks.
         gap: bytes between the index and the first chunk.
         trailing: bytes after the end.
+        tails: kind of record, or `head`, to the bytes behind what this version knows of it (IDX-9).
     """
 
     attributes: dict[int, Attribute]
@@ -226,6 +229,7 @@ class Scene:
     directory: tuple[str, ...] | None = None
     gap: bytes = b""
     trailing: bytes = b""
+    tails: tuple[tuple[str, bytes], ...] = ()
 
 
 def attribute_named(name: str) -> int:

@@ -121,6 +121,33 @@ def _skip_critical(right: Wrong, record: _spec.DirectoryRecord, at: int) -> None
         return
 
 
+def _constants(**values: int) -> Callable[[ExitStack], None]:
+    def apply(stack: ExitStack) -> None:
+        for name, value in values.items():
+            stack.enter_context(mock.patch.object(_spec, name, value))
+
+    return apply
+
+
+def _without_tails(stack: ExitStack) -> None:
+    """Take the structures' own sizes for those of the records."""
+
+    def unpack(right: Wrong, *args: Any) -> _spec.IndexHead:
+        head: _spec.IndexHead = right(*args)
+        return head._replace(
+            attribute_size=_spec.ATTRIBUTE_RECORD_SIZE,
+            directory_size=_spec.DIRECTORY_RECORD_SIZE,
+            tile_size=_spec.TILE_RECORD_SIZE,
+            layer_size=_spec.LAYER_RECORD_SIZE,
+        )
+
+    stack.enter_context(mock.patch.object(_spec, "unpack_index_head", _bound(unpack, _spec.unpack_index_head)))
+
+
+def _known_extras(right: Wrong, *args: Any) -> Any:
+    return tuple(column for column in right(*args) if column.dtype)
+
+
 def _no_limits(stack: ExitStack) -> None:
     for name in ("CHROMA_SHIFT_MAX", "QUAT_LEVELS_MAX", "OPACITY_LEVELS_MAX", "COLUMN_MAX", "JSON_DEPTH_MAX"):
         stack.enter_context(mock.patch.object(_spec, name, 2**60))
@@ -267,6 +294,15 @@ MISTAKES: Final = (
     Mistake(
         "critical chunks", "whatever is unknown is skipped", "DIR-2", _replaced("_check_chunk_type", _skip_critical)
     ),
+    Mistake("tails of records", "a record is as long as its fields", "IDX-9", _without_tails),
+    Mistake(
+        "flags",
+        "what is not listed is refused",
+        "ANC-1",
+        _constants(ANCILLARY_SCENE_FLAGS=0, ANCILLARY_CHUNK_FLAGS=0),
+    ),
+    Mistake("layers", "what is not known is refused", "ANC-2", _constants(ANCILLARY_ID_MIN=256)),
+    Mistake("extra types", "an unknown one has no block", "ANC-3", _replaced("read_extras", _known_extras)),
     Mistake("limits", "levels, shifts, columns, nesting without bound", "LAT-4", _no_limits),
     Mistake("box", "max_scale is believed", "TIL-11", _replaced("check_max_scale", _nothing)),
     Mistake("zigzag", "odd values are one too large", "STR-3", _replaced("_undo_zigzag", _zigzag)),

@@ -74,8 +74,8 @@ def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
         raise FormatError(_spec.ERROR_STREAM, at, "RAW-1", "column", found=params.column, wanted=column)
     width_at = cursor.at
     elements = read_stream(cursor, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
-    width, wanted = cursor.view[width_at], np.dtype(context.header.extras[column].dtype).itemsize
-    if width != wanted:
+    width, dtype = cursor.view[width_at], context.header.extras[column].dtype
+    if dtype and width != (wanted := np.dtype(dtype).itemsize):
         raise FormatError(_spec.ERROR_STREAM, width_at, "RAW-2", "width", found=width, wanted=wanted)
     return elements
 

@@ -15,11 +15,11 @@ class ExtraColumn:
 
     Attributes:
         name: as in `SplatModel.extra`.
-        dtype: NumPy name of its type, `<u2`.
+        dtype: NumPy name of its type, `<u2`; `None` where this version does not know it: then it is not returned.
     """
 
     name: str
-    dtype: str
+    dtype: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Tile:
         corner: lattice integers of the box's smallest corner.
         extent: largest minus smallest lattice integer.
         max_scale: largest of its scales (natural logarithm).
-        layers: layer records by layer id.
+        layers: layer records by layer id, those of layers that this version does not know too.
         tables: ids of the codebooks it may use.
     """
 

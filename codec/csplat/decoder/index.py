@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from csplat import _spec
 from csplat.decoder.container import check_index_crc, check_reserved, read_file_header, view_of
@@ -18,6 +18,16 @@ if TYPE_CHECKING:
 
 __all__ = ["read_header"]
 
+#: The sizes that the index head states, and the least of each: what this version reads of it.
+_RECORD_SIZES: Final = {
+    "head_size": _spec.INDEX_HEAD_SIZE,
+    "attribute_size": _spec.ATTRIBUTE_RECORD_SIZE,
+    "codebook_size": _spec.CODEBOOK_RECORD_SIZE,
+    "extra_size": _spec.EXTRA_RECORD_SIZE,
+    "directory_size": _spec.DIRECTORY_RECORD_SIZE,
+    "tile_size": _spec.TILE_RECORD_SIZE,
+    "layer_size": _spec.LAYER_RECORD_SIZE,
+}
 _STEP_MIN = 2.0**-1022
 _SINGLE_MIN, _SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104
 
@@ -52,19 +62,18 @@ def read_header(data: Buffer) -> SceneHeader:
     head = _spec.unpack_index_head(view, start)
     _check_head(head, start)
     _check_room(head, file.index_size)
-    at = start + _spec.INDEX_HEAD_SIZE
+    at = start + head.head_size
     attributes = _read_attributes(view, at, head)
-    at += head.attribute_count * _spec.ATTRIBUTE_RECORD_SIZE
+    at += head.attribute_count * head.attribute_size
     codebooks = read_codebook_records(view, at, head)
-    at += head.codebook_count * _spec.CODEBOOK_RECORD_SIZE
-    extras = read_extras(view, at, head.extra_count)
-    at += head.extra_count * _spec.EXTRA_RECORD_SIZE
-    directory_at = at
-    directory = read_directory(view, at, head.directory_count)
-    check_codebook_chunks(directory, at, codebooks)
-    at += head.directory_count * _spec.DIRECTORY_RECORD_SIZE
-    tiles = read_tiles(view, at, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
-    check_coverage(directory, directory_at, tiles, end, file.file_size)
+    at += head.codebook_count * head.codebook_size
+    extras = read_extras(view, at, head)
+    at += head.extra_count * head.extra_size
+    places = range(at, at + head.directory_count * head.directory_size, head.directory_size)
+    directory = read_directory(view, places)
+    check_codebook_chunks(directory, places, codebooks)
+    tiles = read_tiles(view, places.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
+    check_coverage(directory, places, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
     return SceneHeader(
         version=(file.version_major, file.version_minor),
@@ -88,9 +97,20 @@ def read_header(data: Buffer) -> SceneHeader:
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:
     places = _spec.INDEX_HEAD_OFFSETS
+    check_reserved(head, at, places)
+    for name, least in _RECORD_SIZES.items():
+        if getattr(head, name) < least:
+            raise FormatError(
+                _spec.ERROR_VALUE,
+                at + places[name],
+                "IDX-8",
+                name,
+                found=getattr(head, name),
+                wanted=f"{least} or more",
+            )
     if head.sh_degree > _spec.SH_DEGREE_MAX:
         raise UnsupportedError(f"SH degree {head.sh_degree}", offset=at + places["sh_degree"], clause="IDX-3")
-    if head.scene_flags & ~sum(_spec.SCENE_FLAG_NAMES):
+    if head.scene_flags & ~(sum(_spec.SCENE_FLAG_NAMES) | _spec.ANCILLARY_SCENE_FLAGS):
         raise FormatError(
             _spec.ERROR_RESERVED, at + places["scene_flags"], "RES-1", "scene_flags", found=f"{head.scene_flags:#04x}"
         )
@@ -115,12 +135,12 @@ def _check_head(head: _spec.IndexHead, at: int) -> None:
 def _check_room(head: _spec.IndexHead, index_size: int) -> None:
     """Refuse counts that the index cannot hold before a single record is read (IDX-2)."""
     least = (
-        _spec.INDEX_HEAD_SIZE
-        + head.attribute_count * _spec.ATTRIBUTE_RECORD_SIZE
-        + head.codebook_count * _spec.CODEBOOK_RECORD_SIZE
-        + head.extra_count * _spec.EXTRA_RECORD_SIZE
-        + head.directory_count * _spec.DIRECTORY_RECORD_SIZE
-        + head.tile_count * _spec.TILE_RECORD_SIZE
+        head.head_size
+        + head.attribute_count * head.attribute_size
+        + head.codebook_count * head.codebook_size
+        + head.extra_count * head.extra_size
+        + head.directory_count * head.directory_size
+        + head.tile_count * head.tile_size
         + 4
     )
     if least > index_size:
@@ -147,7 +167,7 @@ def _read_attributes(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[
         )
     records = []
     for i, attribute in enumerate(wanted):
-        place = at + i * _spec.ATTRIBUTE_RECORD_SIZE
+        place = at + i * head.attribute_size
         record = _spec.unpack_attribute_record(view, place)
         if record.attribute != attribute:
             raise FormatError(_spec.ERROR_INDEX, place, "ATT-1", "attribute", found=record.attribute, wanted=attribute)

@@ -18,7 +18,7 @@ def read_codebook_records(view: memoryview, at: int, head: _spec.IndexHead) -> t
     records: list[_spec.CodebookRecord] = []
     places = _spec.CODEBOOK_RECORD_OFFSETS
     for i in range(head.codebook_count):
-        place = at + i * _spec.CODEBOOK_RECORD_SIZE
+        place = at + i * head.codebook_size
         record = _spec.unpack_codebook_record(view, place)
         check_reserved(record, place, places)
         if records and record.codebook_id <= records[-1].codebook_id:
@@ -68,14 +68,14 @@ def _check_codebook(record: _spec.CodebookRecord, at: int, sh_degree: int) -> No
             )
 
 
-def read_extras(view: memoryview, at: int, count: int) -> tuple[ExtraColumn, ...]:
+def read_extras(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[ExtraColumn, ...]:
     """Read the extra column records, which begin at `at`; the caller has checked that they fit."""
     columns: dict[str, ExtraColumn] = {}
     places = _spec.EXTRA_RECORD_OFFSETS
-    for i in range(count):
-        place = at + i * _spec.EXTRA_RECORD_SIZE
+    for i in range(head.extra_count):
+        place = at + i * head.extra_size
         record = _spec.unpack_extra_record(view, place)
-        if record.dtype not in _spec.EXTRA_DTYPE_NAMES:
+        if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             raise UnsupportedError(f"type {record.dtype} of an extra column", offset=place, clause="RES-2")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
             raise FormatError(
@@ -89,8 +89,8 @@ def read_extras(view: memoryview, at: int, count: int) -> tuple[ExtraColumn, ...
         name = _column_name(record, place + places["name"])
         if name in columns:
             raise FormatError(_spec.ERROR_VALUE, place + places["name"], "EXR-2", f"a second column is named {name!r}")
-        kind = _spec.EXTRA_DTYPE_NAMES[record.dtype][0]
-        columns[name] = ExtraColumn(name, f"<{kind}{_spec.EXTRA_DTYPE_BYTES[record.dtype]}")
+        kind = _spec.EXTRA_DTYPE_NAMES.get(record.dtype)
+        columns[name] = ExtraColumn(name, kind and f"<{kind[0]}{_spec.EXTRA_DTYPE_BYTES[record.dtype]}")
     return tuple(columns.values())
 
 
@@ -107,13 +107,12 @@ def _column_name(record: _spec.ExtraRecord, at: int) -> str:
     return name
 
 
-def read_directory(view: memoryview, at: int, count: int) -> tuple[_spec.DirectoryRecord, ...]:
-    """Read the directory records, which begin at `at`; the caller has checked that they fit."""
+def read_directory(view: memoryview, at: range) -> tuple[_spec.DirectoryRecord, ...]:
+    """Read the directory records, which begin at the places `at`; the caller has checked that they fit."""
     records = []
     seen = set()
     places = _spec.DIRECTORY_RECORD_OFFSETS
-    for i in range(count):
-        place = at + i * _spec.DIRECTORY_RECORD_SIZE
+    for place in at:
         record = _spec.unpack_directory_record(view, place)
         check_reserved(record, place, places)
         _check_chunk_type(record, place)
@@ -144,36 +143,37 @@ def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
     if record.type == _spec.CHUNK_TILE or not all(0x20 <= byte <= 0x7E for byte in record.type):
         raise FormatError(_spec.ERROR_VALUE, at, "DIR-1", "type", found=record.type)
     place = at + _spec.DIRECTORY_RECORD_OFFSETS["flags"]
-    if record.flags & ~sum(_spec.CHUNK_FLAG_NAMES):
+    flags = record.flags & ~_spec.ANCILLARY_CHUNK_FLAGS
+    if flags & ~sum(_spec.CHUNK_FLAG_NAMES):
         raise FormatError(_spec.ERROR_RESERVED, place, "RES-1", "flags", found=f"{record.flags:#06x}")
     name = record.type.decode("ascii")
     if record.type in _spec.CHUNK_NAMES:
         registered = sum(
             flag for flag, word in _spec.CHUNK_FLAG_NAMES.items() if word in _spec.CHUNK_FLAGS[record.type]
         )
-        if record.flags != registered:
-            raise FormatError(
-                _spec.ERROR_VALUE, place, "CHK-4", f"flags of {name}", found=record.flags, wanted=registered
-            )
+        if flags != registered:
+            raise FormatError(_spec.ERROR_VALUE, place, "CHK-4", f"flags of {name}", found=flags, wanted=registered)
     elif record.type == _spec.CHUNK_TREE:
         raise UnsupportedError(f"chunk type {name}", offset=at, clause="RES-2")
-    elif record.flags & _spec.CHUNK_FLAG_CRITICAL:
+    elif flags & _spec.CHUNK_FLAG_CRITICAL:
+        if name[0].islower():
+            raise FormatError(_spec.ERROR_VALUE, place, "DIR-6", f"the private chunk type {name} is critical")
         raise UnsupportedError(f"critical chunk type {name}", offset=at, clause="DIR-2")
 
 
 def check_codebook_chunks(
-    directory: tuple[_spec.DirectoryRecord, ...], at: int, codebooks: tuple[_spec.CodebookRecord, ...]
+    directory: tuple[_spec.DirectoryRecord, ...], at: range, codebooks: tuple[_spec.CodebookRecord, ...]
 ) -> None:
-    """DIR-5: one CODB chunk for each codebook and, for the kind SH, each of its bands."""
+    """DIR-5: one CODB chunk for each codebook and, for the kind SH, each of its bands; the records lie at `at`."""
     wanted = {(book.codebook_id, layer) for book in codebooks for layer in range(book.band_first, book.band_last + 1)}
-    for i, record in enumerate(directory):
+    for place, record in zip(at, directory, strict=True):
         if record.type != _spec.CHUNK_CODEBOOK:
             continue
         key = (record.id, record.layer)
         if key not in wanted:
             raise FormatError(
                 _spec.ERROR_INDEX,
-                at + i * _spec.DIRECTORY_RECORD_SIZE,
+                place,
                 "DIR-5",
                 "no codebook record asks for this CODB chunk, or it is the second",
                 found=f"id {key[0]}, layer {key[1]}",
@@ -182,5 +182,5 @@ def check_codebook_chunks(
     if wanted:
         missing = min(wanted)
         raise FormatError(
-            _spec.ERROR_INDEX, at, "DIR-5", f"no CODB chunk for codebook {missing[0]}, layer {missing[1]}"
+            _spec.ERROR_INDEX, at.start, "DIR-5", f"no CODB chunk for codebook {missing[0]}, layer {missing[1]}"
         )

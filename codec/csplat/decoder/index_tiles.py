@@ -57,15 +57,21 @@ def read_tiles(
         )
     if start != head.splat_count:
         raise FormatError(
-            _spec.ERROR_INDEX, _spec.HEADER_SIZE, "IDX-7", "splat_count", found=head.splat_count, wanted=start
+            _spec.ERROR_INDEX,
+            _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"],
+            "IDX-7",
+            "splat_count",
+            found=head.splat_count,
+            wanted=start,
         )
     return tuple(tiles)
 
 
 def check_coverage(
     directory: tuple[_spec.DirectoryRecord, ...],
-    directory_at: int,
+    directory_at: range,
     tiles: tuple[Tile, ...],
+    head: _spec.IndexHead,
     index_end: int,
     file_size: int,
 ) -> None:
@@ -73,19 +79,18 @@ def check_coverage(
 
     Args:
         directory: the directory records.
-        directory_at: where the first of them begins.
+        directory_at: where each of them begins.
         tiles: the tiles.
+        head: the index head.
         index_end: where the first chunk begins.
         file_size: where the last chunk ends.
     """
-    record_size, place = _spec.DIRECTORY_RECORD_SIZE, _spec.DIRECTORY_RECORD_OFFSETS["offset"]
-    chunks = [
-        (record.offset, record.size, directory_at + i * record_size + place) for i, record in enumerate(directory)
-    ]
+    place = _spec.DIRECTORY_RECORD_OFFSETS["offset"]
+    chunks = [(record.offset, record.size, at + place) for at, record in zip(directory_at, directory, strict=True)]
     for tile in tiles:
-        layer_at = tile.offset + _spec.TILE_RECORD_SIZE + _spec.LAYER_RECORD_OFFSETS["offset"]
+        layer_at = tile.offset + head.tile_size + _spec.LAYER_RECORD_OFFSETS["offset"]
         for i, layer in enumerate(tile.layers.values()):
-            chunks.append((layer.offset, layer.size, layer_at + i * _spec.LAYER_RECORD_SIZE))
+            chunks.append((layer.offset, layer.size, layer_at + i * head.layer_size))
     chunks.sort()
     expected = index_end
     for offset, size, named_at in chunks:
@@ -112,11 +117,11 @@ def check_coverage(
 
 def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head: _spec.IndexHead) -> tuple[Tile, int]:
     """Return a tile, its layers checked, and how many bytes of the index it takes."""
-    if end - at < _spec.TILE_RECORD_SIZE:
+    if end - at < head.tile_size:
         _ends_early(at)
     record = _spec.unpack_tile_record(view, at)
-    layers_at = at + _spec.TILE_RECORD_SIZE
-    tables_at = layers_at + record.layer_count * _spec.LAYER_RECORD_SIZE
+    layers_at = at + head.tile_size
+    tables_at = layers_at + record.layer_count * head.layer_size
     after = tables_at + 2 * record.table_count
     if after > end:
         _ends_early(at)
@@ -154,14 +159,14 @@ def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -
     layers: dict[int, _spec.LayerRecord] = {}
     last = -1
     for i in range(count):
-        place = at + i * _spec.LAYER_RECORD_SIZE
+        place = at + i * head.layer_size
         record = _spec.unpack_layer_record(view, place)
         check_reserved(record, place, _spec.LAYER_RECORD_OFFSETS)
         if record.layer <= last or (i == 0 and record.layer != _spec.LAYER_GEOMETRY):
             raise FormatError(
                 _spec.ERROR_INDEX, place, "TIL-2", "layer", found=record.layer, wanted="0, then ascending"
             )
-        if record.layer not in _spec.LAYER_NAMES:
+        if record.layer < _spec.ANCILLARY_ID_MIN and record.layer not in _spec.LAYER_NAMES:
             raise UnsupportedError(f"layer {record.layer}", offset=place, clause="RES-2")
         if head.sh_degree < record.layer <= _spec.SH_DEGREE_MAX:
             raise FormatError(

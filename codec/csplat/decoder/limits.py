@@ -39,7 +39,7 @@ class Limits:
 def float_bytes(header: SceneHeader, degree: int) -> int:
     """Return the bytes of one splat in the arrays of section 3."""
     floats = 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
-    return 4 * floats + sum(np.dtype(column.dtype).itemsize for column in header.extras)
+    return 4 * floats + sum(np.dtype(column.dtype).itemsize for column in header.extras if column.dtype)
 
 
 def integer_bytes(degree: int) -> int:
@@ -72,7 +72,7 @@ def check_budget(
         LimitError: E_LIMIT by LIM-1; `limit` is the name of the field of `Limits`.
     """
     counts = [tile.splat_count for tile in tiles]
-    at = _spec.HEADER_SIZE
+    at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
     if at_once and sum(counts) > limits.splats:
         raise LimitError("splats", sum(counts), limits.splats, offset=at, clause="LIM-1")
     splats = sum(counts) if at_once else max(counts, default=0)

@@ -235,7 +235,8 @@ def _allocate(count: int, make: Callable[[], _T], job: _Job) -> _T:
         return make()
     except MemoryError:
         wanted = count * float_bytes(job.header, job.degree)
-        raise LimitError("memory of this machine", wanted, offset=_spec.HEADER_SIZE, clause="LIM-1") from None
+        at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
+        raise LimitError("memory of this machine", wanted, offset=at, clause="LIM-1") from None
 
 
 def _read_side_chunks(job: _Job) -> tuple[dict[str, Any] | None, StatedErrors | None]:

@@ -64,7 +64,7 @@ class Arrays:
             opacities=np.empty(count, np.float32),
             sh0=np.empty((count, 3), np.float32),
             shN=np.empty((count, (sh_degree + 1) ** 2 - 1, 3), np.float32),
-            extra={column.name: np.empty(count, column.dtype) for column in header.extras},
+            extra={column.name: np.empty(count, column.dtype) for column in header.extras if column.dtype},
         )
 
     def part(self, start: int, stop: int) -> Arrays:
@@ -87,7 +87,7 @@ class TileBlocks:
     Attributes:
         tile: its record.
         blocks: by attribute id, those the tile has.
-        extra: the bits of the extra columns, in the order of their records.
+        extra: the bits of the extra columns of known types, in the order of their records.
     """
 
     tile: Tile
@@ -98,13 +98,15 @@ class TileBlocks:
 def read_tile(
     view: memoryview, header: SceneHeader, tile: Tile, degree: int, books: Mapping[int, Codebook]
 ) -> TileBlocks:
-    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile."""
+    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; of others only the frame."""
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
     for layer in tile.layers.values():
         if degree < layer.layer <= _spec.SH_DEGREE_MAX:
             continue
         cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
+        if layer.layer not in _spec.LAYER_NAMES:
+            continue  # ANC-2
         if layer.layer == _spec.LAYER_EXTRA:
             wanted = [_spec.ATTRIBUTE_EXTRA] * len(header.extras)
         else:
@@ -116,7 +118,9 @@ def read_tile(
         _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), layer.layer, len(wanted))
         for place, attribute in enumerate(wanted):
             if attribute == _spec.ATTRIBUTE_EXTRA:
-                result.extra.append(read_raw(cursor, context, place))
+                bits = read_raw(cursor, context, place)
+                if header.extras[place].dtype:
+                    result.extra.append(bits)
             else:
                 result.blocks[attribute] = read_block(cursor, context, attribute)
         cursor.finish()

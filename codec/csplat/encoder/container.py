@@ -132,6 +132,14 @@ def _index(
     layers: Mapping[tuple[int, int], _spec.LayerRecord],
 ) -> bytes:
     head = _spec.IndexHead(
+        head_size=_spec.INDEX_HEAD_SIZE,
+        attribute_size=_spec.ATTRIBUTE_RECORD_SIZE,
+        codebook_size=_spec.CODEBOOK_RECORD_SIZE,
+        extra_size=_spec.EXTRA_RECORD_SIZE,
+        directory_size=_spec.DIRECTORY_RECORD_SIZE,
+        tile_size=_spec.TILE_RECORD_SIZE,
+        layer_size=_spec.LAYER_RECORD_SIZE,
+        reserved_0=0,
         splat_count=sum(tile.splat_count for tile in tiles),
         tile_count=len(tiles),
         directory_count=len(directory),

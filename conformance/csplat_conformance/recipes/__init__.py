@@ -7,6 +7,7 @@ from csplat_conformance.recipes.deflate_streams import invalid_deflate_recipes, 
 from csplat_conformance.recipes.edges import edge_recipes
 from csplat_conformance.recipes.extreme import extreme_recipes
 from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
+from csplat_conformance.recipes.growth import invalid_growth_recipes, valid_growth_recipes
 from csplat_conformance.recipes.invalid_alone import alone_recipes
 from csplat_conformance.recipes.invalid_alone_blocks import alone_block_recipes
 from csplat_conformance.recipes.invalid_alone_streams import alone_stream_recipes
@@ -39,6 +40,7 @@ def all_recipes() -> list[Recipe]:
         extreme_stream_recipes,
         valid_deflate_recipes,
         edge_recipes,
+        valid_growth_recipes,
         good_text_recipes,
         rendered_recipes,
     )
@@ -57,6 +59,7 @@ def all_recipes() -> list[Recipe]:
         alone_tile_recipes,
         alone_stream_recipes,
         alone_block_recipes,
+        invalid_growth_recipes,
         bad_text_recipes,
     )
     return [recipe for make in (*valid, *invalid) for recipe in make()]

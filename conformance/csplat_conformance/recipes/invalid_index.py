@@ -44,7 +44,7 @@ def _index() -> list[Recipe]:
             "E_INDEX",
             base,
             {"index.tile_count": 2},
-            at="index.splat_count",
+            at="index.head_size",
         ),
         patched(
             "index_tile_count_huge",
@@ -54,7 +54,7 @@ def _index() -> list[Recipe]:
             base,
             {"index.tile_count": 2**32 - 1},
             ("E_LIMIT",),
-            at="index.splat_count",
+            at="index.head_size",
         ),
         patched(
             "index_tile_count_by_layers",
@@ -81,7 +81,7 @@ def _index() -> list[Recipe]:
             "E_INDEX",
             base,
             {"index.directory_count": 65535},
-            at="index.splat_count",
+            at="index.head_size",
         ),
         patched(
             "axes_one_unspecified",

@@ -34,7 +34,7 @@ def tile_recipes() -> list[Recipe]:
 def _directory() -> list[Recipe]:
     made = rich_scene()
     base = rich()
-    critical = scene(chunks=(Chunk(b"priv", payload=b"x", flags=_KNOWN),))
+    critical = scene(chunks=(Chunk(b"NEXT", payload=b"x", flags=_KNOWN),))
     reserved = scene(chunks=(Chunk(_spec.CHUNK_TREE, payload=b"x", flags=_KNOWN),))
     twice = scene(chunks=(Chunk(_spec.CHUNK_METADATA, b"{}"), Chunk(_spec.CHUNK_METADATA, b"{}")))
     odd = {"directory[META].type": b"M\x1fTA", "META/header.type": b"M\x1fTA"}
@@ -43,7 +43,7 @@ def _directory() -> list[Recipe]:
         patched("directory_tile", "a TILE in the directory", "DIR-1", "E_VALUE", base, tile_type),
         patched("directory_type_control", "a control character in a type", "DIR-1", "E_VALUE", base, odd),
         whole(
-            "critical_unknown", "an unknown critical chunk", "DIR-2", "E_UNSUPPORTED", critical, "directory[priv].type"
+            "critical_unknown", "an unknown critical chunk", "DIR-2", "E_UNSUPPORTED", critical, "directory[NEXT].type"
         ),
         whole(
             "critical_reserved",
@@ -58,7 +58,7 @@ def _directory() -> list[Recipe]:
             "an unlisted flag of an unknown chunk",
             "RES-1",
             "E_RESERVED",
-            scene(chunks=(Chunk(b"priv", payload=b"x", flags=0x8000),)),
+            scene(chunks=(Chunk(b"priv", payload=b"x", flags=0x0080),)),
             "directory[priv].flags",
         ),
         whole("metadata_twice", "two META chunks", "DIR-4", "E_INDEX", twice, "directory[META#1].type"),

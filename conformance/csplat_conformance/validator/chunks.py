@@ -73,17 +73,18 @@ def chunk_record(findings: Findings, chunk: Chunk) -> Chunk:
 
 
 def read_directory(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Chunk]:
-    """Read the directory records that lie within the index; DIR-1 to DIR-5."""
+    """Read the directory records that lie within the index; DIR-1 to DIR-6."""
     start, chunks = at, list[Chunk]()
     count = index.head.record.directory_count
-    for _ in range(min(count, max(0, (end - at) // _spec.DIRECTORY_RECORD_SIZE))):
+    size = index.size_of("directory")
+    for _ in range(min(count, max(0, (end - at) // size))):
         record = _spec.unpack_directory_record(view, at)
         name = _name(record, [chunk.name for chunk in chunks])
         placed = place(view, _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_OFFSETS, at, f"directory[{name}]")
         findings.reserved(placed)
         chunks.append(chunk_record(findings, Chunk(name, record.type, record.flags, placed, record.id, record.layer)))
         _check_type(findings, placed)
-        at += _spec.DIRECTORY_RECORD_SIZE
+        at += size
     index.complete &= len(chunks) == count
     index.end = at
     _check_single(findings, chunks)
@@ -108,15 +109,18 @@ def _check_type(findings: Findings, placed: Placed[_spec.DirectoryRecord]) -> No
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
         findings.of("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
-    unlisted = record.flags & ~sum(_spec.CHUNK_FLAG_NAMES)
+    flags = record.flags & 0x00FF  # the others are ancillary
+    unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
         findings.of("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
     if kind in _spec.CHUNK_NAMES:
-        if record.flags & ~unlisted != registered_flags(kind):
+        if flags & ~unlisted != registered_flags(kind):
             findings.of("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
     elif kind == _spec.CHUNK_TREE:
         findings.of("RES-2", placed, "type", f"{kind.decode()} is reserved")
-    elif record.flags & _spec.CHUNK_FLAG_CRITICAL:
+    elif flags & _spec.CHUNK_FLAG_CRITICAL:
+        if kind[:1].islower():
+            findings.of("DIR-6", placed, "flags", f"{kind!r} is private and critical")
         findings.of("DIR-2", placed, "type", f"{kind!r} is critical and not known")
 
 

@@ -12,6 +12,16 @@ from csplat_conformance.validator.reading import place
 
 __all__ = ["Index", "read_records", "scaled"]
 
+#: Bytes of the fields that this version knows.
+_LEAST = {
+    "head": _spec.INDEX_HEAD_SIZE,
+    "attribute": _spec.ATTRIBUTE_RECORD_SIZE,
+    "codebook": _spec.CODEBOOK_RECORD_SIZE,
+    "extra": _spec.EXTRA_RECORD_SIZE,
+    "directory": _spec.DIRECTORY_RECORD_SIZE,
+    "tile": _spec.TILE_RECORD_SIZE,
+    "layer": _spec.LAYER_RECORD_SIZE,
+}
 _CRC_SIZE = 4
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
@@ -51,6 +61,10 @@ class Index:
     complete: bool = True
     end: int = 0
 
+    def size_of(self, kind: str) -> int:
+        """Bytes of the head or of a kind of records, tail included; those of the fields where the head says fewer."""
+        return max(_LEAST[kind], int(getattr(self.head.record, f"{kind}_size")))
+
 
 def scaled(step: float, exponent: int, *, single: bool = False) -> float | None:
     """Return step × 2^exponent, `None` where it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
@@ -72,19 +86,13 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
     start = _spec.HEADER_SIZE
     head = place(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
     record = head.record
-    counts = (
-        (record.attribute_count, _spec.ATTRIBUTE_RECORD_SIZE),
-        (record.codebook_count, _spec.CODEBOOK_RECORD_SIZE),
-        (record.extra_count, _spec.EXTRA_RECORD_SIZE),
-        (record.directory_count, _spec.DIRECTORY_RECORD_SIZE),
-        (record.tile_count, _spec.TILE_RECORD_SIZE),
-    )
-    needed = _spec.INDEX_HEAD_SIZE + sum(count * size for count, size in counts)
+    index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
+    kinds = ("attribute", "codebook", "extra", "directory", "tile")
+    needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
         findings.add("IDX-2", start, "index", f"its counts ask for {needed} bytes at least, it has {end - start}")
-    index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
     _check_head(findings, head)
-    at = start + _spec.INDEX_HEAD_SIZE
+    at = start + index.size_of("head")
     at = _read_attributes(view, at, end, index, findings)
     at = _read_codebooks(view, at, end, index, findings)
     index.end = _read_extras(view, at, end, index, findings)
@@ -100,9 +108,14 @@ def _fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
 
 def _check_head(findings: Findings, head: Head) -> None:
     record = head.record
+    findings.reserved(head)
+    for kind, least in _LEAST.items():
+        size = getattr(record, f"{kind}_size")
+        if size < least:
+            findings.of("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
         findings.of("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
-    unlisted = record.scene_flags & ~sum(_spec.SCENE_FLAG_NAMES)
+    unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         findings.of("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
@@ -126,7 +139,7 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings
     wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(wanted):
         findings.of("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
-    for i in range(_fitting(index, at, end, count, _spec.ATTRIBUTE_RECORD_SIZE)):
+    for i in range(_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = place(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
@@ -136,7 +149,7 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
             _check_attribute(findings, placed, index)
-        at += _spec.ATTRIBUTE_RECORD_SIZE
+        at += index.size_of("attribute")
     return at
 
 
@@ -194,7 +207,7 @@ def _is_single(step: Fraction) -> bool:
 
 def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
     last = -1
-    for _ in range(_fitting(index, at, end, index.head.record.codebook_count, _spec.CODEBOOK_RECORD_SIZE)):
+    for _ in range(_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"codebook[{identity}]"
         placed = place(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
@@ -205,7 +218,7 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings:
         index.codebook_ids.add(identity)
         if _is_sound_codebook(findings, placed, index):
             index.codebooks.setdefault(identity, placed)
-        at += _spec.CODEBOOK_RECORD_SIZE
+        at += index.size_of("codebook")
     return at
 
 
@@ -240,17 +253,17 @@ def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> 
 
 def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
     names: set[str] = set()
-    for i in range(_fitting(index, at, end, index.head.record.extra_count, _spec.EXTRA_RECORD_SIZE)):
+    for i in range(_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
         placed = place(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
         record = placed.record
-        if record.dtype not in _spec.EXTRA_DTYPE_NAMES:
+        if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             findings.of("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
             findings.of("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
         else:
             _check_name(findings, placed, names)
         index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
-        at += _spec.EXTRA_RECORD_SIZE
+        at += index.size_of("extra")
     return at
 
 

@@ -52,9 +52,9 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
     tiles: list[Tile] = []
     head = index.head.record
     # A count that the index has no room for has been refused already, by IDX-2.
-    told = _spec.TILE_RECORD_SIZE * head.tile_count > end - at
+    told = index.size_of("tile") * head.tile_count > end - at
     while len(tiles) < head.tile_count:
-        size = _tile_size(view, at, end)
+        size = _tile_size(view, at, end, index)
         if size > end - at:
             if not told:
                 findings.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
@@ -70,11 +70,12 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
     return tiles
 
 
-def _tile_size(view: memoryview, at: int, end: int) -> int:
-    if end - at < _spec.TILE_RECORD_SIZE:
-        return _spec.TILE_RECORD_SIZE
+def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
+    size = index.size_of("tile")
+    if end - at < size:
+        return size
     record = _spec.unpack_tile_record(view, at)
-    return _spec.TILE_RECORD_SIZE + record.layer_count * _spec.LAYER_RECORD_SIZE + 2 * record.table_count
+    return size + record.layer_count * index.size_of("layer") + 2 * record.table_count
 
 
 def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: Findings) -> Tile:
@@ -86,9 +87,9 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: F
     if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
         findings.of("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
     _check_box(findings, tile, index)
-    at += _spec.TILE_RECORD_SIZE
+    at += index.size_of("tile")
     _read_layers(view, at, tile, index, findings)
-    _read_tables(view, at + placed.record.layer_count * _spec.LAYER_RECORD_SIZE, tile, index, findings)
+    _read_tables(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, findings)
     return tile
 
 
@@ -120,14 +121,14 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, findings: 
             findings.of("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
         elif layer <= last:
             findings.of("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
-        if layer not in _spec.LAYER_NAMES:
+        if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
             findings.of("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
             findings.of("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
         chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
         tile.chunks.append(chunk_record(findings, chunk))
         last = max(last, layer)
-        at += _spec.LAYER_RECORD_SIZE
+        at += index.size_of("layer")
     if not tile.chunks:
         findings.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
         return  # TIL-5 would say nothing more

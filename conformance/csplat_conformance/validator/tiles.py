@@ -72,6 +72,8 @@ class TileReader:
             UnreadableError: the rest of the payload cannot be told apart.
         """
         findings = self.findings
+        if chunk.layer >= _spec.ANCILLARY_ID_MIN:
+            return  # ANC-2
         head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
         if head.record.layer != chunk.layer:
             findings.of("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")

@@ -76,7 +76,7 @@ def _scene(facts: FileFacts) -> str:
         f"flags        {', '.join(flags) or 'none'}",
         f"tiles        {_tiles(facts)}",
     ]
-    extras = ", ".join(f"{one.name} ({one.dtype})" for one in header.extras)
+    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
     if extras:
         lines.append(f"extra        {extras}")
     if facts.cameras is not None:

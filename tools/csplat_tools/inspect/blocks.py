@@ -68,7 +68,7 @@ def attribute_use(data: bytes | mmap, header: SceneHeader) -> dict[str, Attribut
     codebooks = {record.codebook_id: record for record in header.codebooks}
     use: dict[int, AttributeUse] = {}
     for tile in header.tiles:
-        for layer in tile.layers.values():
+        for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
             _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
     for chunk in header.directory:
         if chunk.type == _spec.CHUNK_CODEBOOK:

@@ -229,7 +229,9 @@ def _layers(header: SceneHeader) -> dict[str, LayerFacts]:
             codebook_bytes[chunk.layer] += chunk.size
     sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
     return {
-        _spec.LAYER_NAMES[id_]: LayerFacts(size, codebook_bytes[id_], _bits(size, header.splat_count), tile_count[id_])
+        _spec.LAYER_NAMES.get(id_, f"layer {id_}"): LayerFacts(
+            size, codebook_bytes[id_], _bits(size, header.splat_count), tile_count[id_]
+        )
         for id_, size in sizes.items()
     }
 
