@@ -27,6 +27,7 @@ needs_node = pytest.mark.skipif(bool(node.missing_javascript()), reason=f"skippe
 # Our decoder by the protocol, with a fault to order.
 FAULTY = """
 import json, os, pathlib, signal, sys, time
+import numpy as np
 from csplat_conformance import adapter
 
 fault, source, outdir = sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3])
@@ -72,6 +73,8 @@ if fault == "rounding":
     raw = bytearray(means.read_bytes())
     raw[0] ^= 1
     means.write_bytes(raw)
+if fault in ("2 ulp", "3 ulp"):
+    means.write_bytes((np.fromfile(means, "<u4") + int(fault[0])).tobytes())
 sys.exit(status)
 """
 
@@ -220,7 +223,7 @@ def test_a_command_that_cannot_be_run_is_refused_at_once(command):
         run_command(command, Choice(pattern="valid/quats"))
 
 
-@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}])
+@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}, {"by": "fast"}])
 def test_a_choice_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(InputError):
         Choice(**wrong)
@@ -264,6 +267,26 @@ def test_a_pattern_may_name_a_chapter_of_clauses():
 def test_a_pattern_that_matches_nothing_is_named(choice, message):
     with pytest.raises(InputError, match=message):
         run_builtin(choice)
+
+
+@pytest.mark.parametrize(("fault", "by", "message"), [
+    ("2 ulp", "renderer", ""),
+    ("3 ulp", "renderer", "floats.means: 15 of 15 values too far"),
+    ("2 ulp", "exact", "floats.means differs"),
+    ("missing", "renderer", "integers.means is missing"),
+    ("longer", "renderer", "61 bytes for 60"),
+])  # fmt: skip
+def test_the_class_says_how_near_floats_must_be(faulty, fault, by, message):
+    report = run_command(faulty(fault), Choice(pattern="valid/quats", by=by))
+
+    assert [message in outcome.message for outcome in report.failures] == ([True] if message else [])
+
+
+@pytest.mark.parametrize("by", ["renderer", "exact"])
+def test_a_report_names_the_class_that_is_not_exact(by):
+    report = run_builtin(Choice(pattern="valid/quats", by=by))
+
+    assert (["judged as a decoder of the class renderer"] if by == "renderer" else []) == [*report.notes]
 
 
 # The command ---------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Decoders that are wrong on purpose: the suite notices each, and names the clause."""
 
+from dataclasses import replace
 from unittest import mock
 
 import pytest
@@ -9,10 +10,13 @@ from csplat.decoder import scene
 from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter, wrong
 from csplat_conformance.manifest import load
+from csplat_conformance.near import EXACT, RENDERER
 from csplat_conformance.node import missing_javascript
 from csplat_conformance.report import Status
+from csplat_conformance.single import GPUS
+from csplat_conformance.wrong import MISTAKES
 from csplat_conformance.wrong_js import EDITS, catch_edit, edited
-from csplat_conformance.wrong_python import MISTAKES
+from csplat_conformance.wrong_single import off_by, single_precision
 
 needs_javascript = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 
@@ -40,6 +44,24 @@ def test_a_right_decoder_is_not_caught():
     nothing = wrong.Mistake("none", "", "CHK-1", lambda _: None)
 
     assert [] == list(wrong.catch(nothing).failed)
+
+
+@pytest.mark.parametrize("gpu", [gpu for gpus in GPUS.values() for gpu in gpus], ids=str)
+def test_a_decoder_in_single_precision_is_a_renderer_and_not_exact(gpu):
+    vectors = [vector for vector in load() if {"CNF-7", "CNF-8", "QUA-2", "LEV-1"} & {*vector.clauses}]
+    decoder = wrong.Mistake("none", "", "CNF-7", single_precision(gpu), RENDERER)
+
+    assert [] == list(wrong.catch(decoder, vectors).failed)
+    assert "CNF-7" in wrong.catch(replace(decoder, by=EXACT), vectors).clauses
+
+
+@pytest.mark.parametrize(("ulps", "by", "failed"), [(2, RENDERER, False), (3, RENDERER, True), (2, EXACT, True)])
+def test_a_renderer_may_be_off_by_2_ulp_and_an_exact_decoder_by_none(ulps, by, failed):
+    vectors = [vector for vector in load() if vector.name == "extreme/means_cancelling"]
+    caught = wrong.catch(wrong.Mistake("off", "", "CNF-7", off_by(ulps), by), vectors)
+
+    assert (["extreme/means_cancelling"] if failed else []) == caught.vectors
+    assert {"L3"} >= {outcome.level for outcome in caught.failed}
 
 
 def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector():

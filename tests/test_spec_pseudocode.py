@@ -15,6 +15,7 @@ from csplat.decoder.morton import morton_axes
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
 from csplat.decoder.streams import _undo_run_length, undo_transforms
 from csplat_conformance.deflate import Deflate
+from csplat_conformance.near import too_far
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
@@ -23,7 +24,14 @@ PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0
 @pytest.fixture(scope="module")
 def spec() -> SimpleNamespace:
     text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
-    names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp}
+    names = {
+        "float64": np.float64,
+        "float32": np.float32,
+        "sqrt": np.sqrt,
+        "ldexp": math.ldexp,
+        "isfinite": np.isfinite,
+    }
+    names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
     blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
     assert blocks
     for block in blocks:
@@ -174,6 +182,21 @@ def test_quats(spec, levels):
     write_quats(columns(rows), record(3, _spec.MAPPING_UNIT_W, levels=levels, step=0.0), out)
     expected = np.array([spec.quat(*row, levels) for row in rows], np.float32)
     assert expected.tobytes() == out.tobytes()
+
+
+@pytest.mark.parametrize("array", ["means", "scales", "sh0", "shN", "opacities", "quats"])
+def test_nearness(spec, array):
+    zero, tiny, normal, one, largest = 0, 1, 0x00800000, 0x3F800000, 0x7F7FFFFF
+    starts = [zero, tiny, normal, normal + 3, one, one - 1, 0x35800000, 0x01000000, 0x2EDBE6FF, largest - 2]
+    rng = np.random.default_rng(1)
+    bits = [start + sign for start in starts for sign in (0, 2**31)] + rng.integers(0, 2**31 - 2**24, 50).tolist()
+    exact = np.array(bits, np.uint32).view(np.float32)
+    exact = exact[np.isfinite(exact)]
+    for step in (-4, -3, -2, -1, 0, 1, 2, 3, 5, 16, 17, -(2**24), 2**31):
+        values = (exact.view(np.uint32).astype(np.int64) + step).astype(np.uint32).view(np.float32)
+        for y, x in zip(values, exact, strict=True):
+            far = too_far(array, y.tobytes(), np.array([x]))
+            assert spec.is_near(y, x, array) == (not far), (y, x, far)
 
 
 def lengths_of_codes(count):

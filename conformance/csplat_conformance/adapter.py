@@ -43,11 +43,13 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
         header, arrays = _decoded(data, limits, threads)
     except CsplatError as error:
         code, clause, offset = _place(error)
-        return Answer(Status.REFUSED, str(error), {}, {}, code, clause, offset, time.monotonic() - began)
+        seconds = time.monotonic() - began
+        return Answer(Status.REFUSED, str(error), code=code, clause=clause, offset=offset, seconds=seconds)
     except _DifferError as error:
         return Answer(Status.FAILED, str(error), seconds=time.monotonic() - began)
     sums = {key: (len(raw), hashlib.sha256(raw).hexdigest()) for key, raw in arrays.items()}
-    return Answer(Status.PASSED, "", header, sums, seconds=time.monotonic() - began)
+    floats = {key.removeprefix("floats."): raw for key, raw in arrays.items() if key.startswith("floats.")}
+    return Answer(Status.PASSED, "", header, sums, floats, seconds=time.monotonic() - began)
 
 
 class _DifferError(Exception):

@@ -4,7 +4,7 @@
 |---|---|
 | L1 | `header.json`; for broken files the refusal |
 | L2 | the integer arrays of spec 9.2 |
-| L3 | the float arrays of spec section 3 and the extra columns, bit for bit |
+| L3 | the float arrays of spec section 3 and the extra columns, bit for bit; floats of the class renderer by `near` |
 
 L4, pictures, is `views`.
 """
@@ -12,18 +12,24 @@ L4, pictures, is `views`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from numpy.typing import NDArray
+
 from csplat_conformance.manifest import Vector
+from csplat_conformance.near import too_far
 from csplat_conformance.report import Outcome, Status
 
-__all__ = ["LEVELS", "PARTS", "Answer", "judge", "level_name"]
+__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name"]
 
 #: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
 LEVELS = (*PARTS, 4)
+
+#: From the name of a vector to its float arrays.
+FloatsOf = Callable[[str], Mapping[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Answer:
         message: one line about what went wrong.
         header: facts of header and index.
         arrays: by `part.name`, as `floats.means`: bytes and SHA-256 of the raw little-endian values.
+        floats: by name, as `means`: the raw values, where they were kept for the class renderer.
         code: error code of a refusal.
         clause: clause that it names, if any.
         offset: byte of the file that it names, if any.
@@ -45,6 +52,7 @@ class Answer:
     message: str = ""
     header: Mapping[str, Any] = field(default_factory=dict)
     arrays: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    floats: Mapping[str, bytes] = field(default_factory=dict)
     code: str = ""
     clause: str | None = None
     offset: int | None = None
@@ -56,7 +64,9 @@ def level_name(level: int) -> str:
     return f"L{level}"
 
 
-def judge(vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False) -> list[Outcome]:
+def judge(
+    vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False, near: FloatsOf | None = None
+) -> list[Outcome]:
     """Compare an answer with the manifest: one outcome for each level that applies to the vector.
 
     Args:
@@ -64,6 +74,7 @@ def judge(vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: boo
         answer: what the decoder did.
         levels: numbers of the levels that are asked for.
         exact: of refusals demand code, clause and offset too, and optional refusals: for csplat's own decoders.
+        near: gives the exact floats of a vector, which a decoder of the class renderer need only be near to.
     """
     if vector.error:
         return [_judge_refusal(vector, answer, exact)] if 1 in levels else []
@@ -73,7 +84,7 @@ def judge(vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: boo
             continue
         status, message = answer.status, answer.message
         if status is Status.PASSED:
-            status, message = _compare(vector, answer, parts)
+            status, message = _compare(vector, answer, parts, near)
         elif status is Status.REFUSED:
             message = message or "refused a valid file"
         passed = status is Status.PASSED
@@ -127,7 +138,7 @@ def _words(code: str, clause: str | None, offset: int | None) -> str:
 # Arrays --------------------------------------------------------------------------------------------
 
 
-def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...]) -> tuple[Status, str]:
+def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: FloatsOf | None) -> tuple[Status, str]:
     if not answer.header and not answer.arrays:
         return Status.NO_OUTPUT, "nothing was written"
     if "header" in parts:
@@ -135,7 +146,8 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...]) -> tuple[St
     found: list[tuple[Status, str]] = []
     for part in parts:
         for name, summary in vector.expect[part].items():
-            found += _compare_array(f"{part}.{name}", summary, answer.arrays.get(f"{part}.{name}"))
+            key = f"{part}.{name}"
+            found += _compare_size(key, summary, answer.arrays.get(key)) or _compare_values(vector, answer, key, near)
         more = [key for key in answer.arrays if key.split(".", 1)[0] == part]
         extra = [key for key in more if key.split(".", 1)[1] not in vector.expect[part]]
         found += [(Status.FAILED, f"{key}: not asked for") for key in extra]
@@ -162,12 +174,22 @@ def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tupl
     return (Status.FAILED, "; ".join(wrong)) if wrong else (Status.PASSED, "")
 
 
-def _compare_array(key: str, summary: list[Any], found: tuple[int, str] | None) -> list[tuple[Status, str]]:
-    dtype, shape, digest = summary
+def _compare_size(key: str, summary: list[Any], found: tuple[int, str] | None) -> list[tuple[Status, str]]:
+    dtype, shape, _ = summary
     if found is None:
         return [(Status.WRONG_ANSWER, f"{key} is missing")]
     size = math.prod(shape) * int(dtype[1:])
     if found[0] != size:
         status = Status.PARTIAL_OUTPUT if found[0] < size else Status.FAILED
         return [(status, f"{key}: {found[0]} bytes for {size}, {dtype} {shape}")]
-    return [] if found[1] == digest else [(Status.FAILED, f"{key} differs")]
+    return []
+
+
+def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsOf | None) -> list[tuple[Status, str]]:
+    part, name = key.split(".", 1)
+    if answer.arrays[key][1] == vector.expect[part][name][2]:
+        return []
+    if near and part == "floats" and name in answer.floats:
+        far = too_far(name, answer.floats[name], near(vector.name)[name])
+        return [(Status.FAILED, f"{key}: {far}")] if far else []
+    return [(Status.FAILED, f"{key} differs")]

@@ -21,6 +21,7 @@ EXCUSES: Final = {
     "CNF-4": "about a decoder's interface: `tests/test_decoder_scene.py`",
     "CNF-5": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
     "CNF-6": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
+    "CNF-9": "about what a decoder says of itself",
 }
 
 _SHOWN = 4

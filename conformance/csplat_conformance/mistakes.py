@@ -1,15 +1,23 @@
-"""What a wrong decoder does wrong, and what the suite says of it."""
+"""What a wrong decoder does wrong, how the Python one is made wrong, and what the suite says of it."""
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
+from unittest import mock
 
+from csplat import decoder
+from csplat_conformance.near import EXACT
 from csplat_conformance.report import Outcome
 
-__all__ = ["Caught", "Mistake"]
+__all__ = ["Caught", "Mistake", "Wrong", "method", "nothing", "replaced"]
+
+#: Takes the right function, then its arguments.
+Wrong = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -21,12 +29,14 @@ class Mistake:
         what: what a hurried implementer might do.
         clause: of the spec, that it breaks.
         apply: makes the decoder wrong until the stack is closed.
+        by: class of decoders (spec 9.2) that it is judged as.
     """
 
     name: str
     what: str
     clause: str
     apply: Callable[[ExitStack], None]
+    by: str = EXACT
 
 
 @dataclass(frozen=True)
@@ -54,3 +64,39 @@ class Caught:
         by_vector = {outcome.name: outcome.clauses for outcome in self.failed}
         counts = Counter(clause for clauses in by_vector.values() for clause in clauses)
         return [clause for clause, _ in counts.most_common()]
+
+
+def replaced(name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
+    """Return what replaces a function of the decoder wherever it was imported; `wrong` gets the right one first."""
+
+    def apply(stack: ExitStack) -> None:
+        prefix = decoder.__name__ + "."
+        modules = [module for key, module in list(sys.modules.items()) if key.startswith(prefix)]
+        owners = [module for module in modules if hasattr(module, name)]
+        assert owners, f"the decoder has no {name}"
+        for owner in owners:
+            right = getattr(owner, name)
+            stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
+
+    return apply
+
+
+def method(owner: type, name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
+    """Return what replaces a method."""
+
+    def apply(stack: ExitStack) -> None:
+        right = getattr(owner, name)
+        stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
+
+    return apply
+
+
+def _bound(wrong: Wrong, right: Wrong) -> Wrong:
+    def replacement(*args: Any, **options: Any) -> Any:
+        return wrong(right, *args, **options)
+
+    return replacement
+
+
+def nothing(_right: Wrong, *_args: Any, **_options: Any) -> None:
+    """Do nothing in the place of a function."""

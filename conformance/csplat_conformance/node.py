@@ -166,7 +166,7 @@ def _answer(found: dict[str, Any], seconds: float) -> Answer:
     if "defect" in found:
         return Answer(Status.CRASHED, " | ".join(found["defect"].splitlines()[:3]), seconds=seconds)
     if "code" in found:
-        place = found["code"], found.get("clause"), found.get("offset")
-        return Answer(Status.REFUSED, "refused", {}, {}, *place, seconds)
+        code, clause, offset = found["code"], found.get("clause"), found.get("offset")
+        return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=seconds)
     arrays = {key: (size, digest) for key, (size, digest) in found["arrays"].items()}
     return Answer(Status.PASSED, "", found["header"], arrays, seconds=seconds)

@@ -26,13 +26,14 @@ _WORDS_MAX = 200  # characters of a program's own message
 _PARTS = ("integers", "floats", "extra")
 
 
-def ask(command: str, path: Path, timeout: float) -> Answer:
+def ask(command: str, path: Path, timeout: float, *, keep_floats: bool = False) -> Answer:
     """Let a decoder have one file.
 
     Args:
         command: command line with `{input}` and `{outdir}`.
         path: the file.
         timeout: seconds after which the process and its children are killed.
+        keep_floats: the answer holds the values of the float arrays too, not their hashes alone.
     """
     with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
         outdir = Path(folder) / "out"
@@ -43,7 +44,7 @@ def ask(command: str, path: Path, timeout: float) -> Answer:
         left = sorted(entry.name for entry in outdir.iterdir())
         if ended.returncode == 1:
             return _refusal(ended, left)
-        return _decoded(outdir, left, ended.seconds)
+        return _decoded(outdir, left, ended.seconds, keep_floats=keep_floats)
 
 
 def _refusal(ended: Ended, left: list[str]) -> Answer:
@@ -67,9 +68,9 @@ def last_words(ended: Ended) -> str:
     return f": {words[:_WORDS_MAX]}" if words else ""
 
 
-def _decoded(outdir: Path, left: list[str], seconds: float) -> Answer:
+def _decoded(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool) -> Answer:
     header: dict[str, Any] = {}
-    arrays = {}
+    arrays, floats = {}, {}
     for name in left:
         path = outdir / name
         part, _, rest = name.partition(".")
@@ -83,7 +84,10 @@ def _decoded(outdir: Path, left: list[str], seconds: float) -> Answer:
         elif part in _PARTS and rest.endswith(".bin") and path.is_file():
             with path.open("rb") as stream:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            arrays[f"{part}.{unquote(rest.removesuffix('.bin'))}"] = (path.stat().st_size, digest)
+            array = unquote(rest.removesuffix(".bin"))
+            arrays[f"{part}.{array}"] = (path.stat().st_size, digest)
+            if keep_floats and part == "floats":
+                floats[array] = path.read_bytes()
         else:
             return Answer(Status.WRONG_ANSWER, f"{name} is no file of the protocol", seconds=seconds)
-    return Answer(Status.PASSED, header=header, arrays=arrays, seconds=seconds)
+    return Answer(Status.PASSED, header=header, arrays=arrays, floats=floats, seconds=seconds)

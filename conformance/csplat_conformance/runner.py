@@ -17,11 +17,13 @@ from dataclasses import dataclass
 
 from csplat.errors import InputError
 from csplat_conformance import adapter, views
-from csplat_conformance.answers import LEVELS, PARTS, judge
+from csplat_conformance.answers import LEVELS, PARTS, FloatsOf, judge
 from csplat_conformance.choosing import matching
 from csplat_conformance.manifest import VECTORS, Vector, load
+from csplat_conformance.near import CLASSES, EXACT, RENDERER
 from csplat_conformance.process import split_command
 from csplat_conformance.protocol import ask
+from csplat_conformance.recipes import exact_floats
 from csplat_conformance.report import Outcome, Report
 
 __all__ = ["TIMEOUT_SECONDS", "Choice", "parse_levels", "run_builtin", "run_command"]
@@ -44,6 +46,7 @@ class Choice:
         exact: of refusals demand code, clause and offset, and optional refusals too: for csplat's own decoders.
         timeout: seconds for one process.
         jobs: processes at a time; None for as many as there are processors.
+        by: the class of decoders (spec 9.2) whose rules hold.
     """
 
     pattern: str | None = None
@@ -52,6 +55,7 @@ class Choice:
     exact: bool = False
     timeout: float = TIMEOUT_SECONDS
     jobs: int | None = None
+    by: str = EXACT
 
     def __post_init__(self) -> None:
         if not self.levels or any(level not in LEVELS for level in self.levels):
@@ -60,6 +64,13 @@ class Choice:
             raise InputError(f"a timeout of {self.timeout:g} s, wanted more than 0")
         if self.jobs is not None and self.jobs < 1:
             raise InputError(f"{self.jobs} jobs, wanted 1 or more")
+        if self.by not in CLASSES:
+            raise InputError(f"the class {self.by!r} of decoders, wanted {' or '.join(CLASSES)}")
+
+    @property
+    def near(self) -> FloatsOf | None:
+        """What floats need only be near to, if not bit for bit."""
+        return exact_floats if self.by == RENDERER else None
 
 
 def parse_levels(text: str) -> tuple[int, ...]:
@@ -92,7 +103,7 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
     def run(vector: Vector) -> list[Outcome]:
         outcomes = []
         if any(level in choice.levels for level in PARTS):
-            outcomes = judge(vector, adapter.answer(vector.data), choice.levels, exact=True)
+            outcomes = judge(vector, adapter.answer(vector.data), choice.levels, exact=True, near=choice.near)
         if 4 in choice.levels and vector.views:
             if views.can_render():
                 outcomes += views.judge_ours(vector)
@@ -106,7 +117,7 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
         results.append(run(vector))
         if progress:
             progress(done, len(chosen))
-    return _report("csplat's decoder", results)
+    return _report("csplat's decoder", results, choice)
 
 
 def run_command(
@@ -132,8 +143,8 @@ def run_command(
     def run(vector: Vector) -> list[Outcome]:
         outcomes = []
         if command is not None and any(level in choice.levels for level in PARTS):
-            answer = ask(command, VECTORS / vector.file, choice.timeout)
-            outcomes = judge(vector, answer, choice.levels, exact=choice.exact)
+            answer = ask(command, VECTORS / vector.file, choice.timeout, keep_floats=choice.near is not None)
+            outcomes = judge(vector, answer, choice.levels, exact=choice.exact, near=choice.near)
         if 4 in choice.levels:
             if render is None:
                 outcomes += views.skipped_views(vector, "no command of a renderer was given")
@@ -150,7 +161,7 @@ def run_command(
             results.append(outcomes)
             if progress:
                 progress(done, len(chosen))
-    return _report(command or render or "", results)
+    return _report(command or render or "", results, choice)
 
 
 def _chosen(choice: Choice) -> list[Vector]:
@@ -160,6 +171,7 @@ def _chosen(choice: Choice) -> list[Vector]:
     return [vector for vector in vectors if vector.name in names and clauses & {*vector.clauses}]
 
 
-def _report(subject: str, results: Sequence[list[Outcome]]) -> Report:
+def _report(subject: str, results: Sequence[list[Outcome]], choice: Choice) -> Report:
     outcomes = [outcome for result in results for outcome in result]
-    return Report("decoder", subject, outcomes)
+    notes = () if choice.by == EXACT else (f"judged as a decoder of the class {choice.by}",)
+    return Report("decoder", subject, outcomes, notes)

@@ -5,6 +5,7 @@ Usage:
     python -m csplat_conformance.wrong --only python --vectors
 
 The mistakes of the Python decoder replace one of its functions, those of the JavaScript decoder a piece of its text.
+Some have it decode in single precision, badly, and are judged by the class *renderer*.
 Of refusals the code does not count, as of any decoder that is not ours.
 """
 
@@ -20,11 +21,16 @@ from csplat_conformance.adapter import answer
 from csplat_conformance.answers import PARTS, Answer, judge
 from csplat_conformance.manifest import Vector, load
 from csplat_conformance.mistakes import Caught, Mistake
+from csplat_conformance.near import RENDERER
+from csplat_conformance.recipes import exact_floats
 from csplat_conformance.report import Status
 from csplat_conformance.wrong_js import catch_all
-from csplat_conformance.wrong_python import MISTAKES
+from csplat_conformance.wrong_python import MISTAKES as WRONG_PYTHON
+from csplat_conformance.wrong_single import MISTAKES as WRONG_SINGLE
 
-__all__ = ["catch", "main", "table"]
+__all__ = ["MISTAKES", "catch", "main", "table"]
+
+MISTAKES = (*WRONG_PYTHON, *WRONG_SINGLE)
 
 _SHOWN_CLAUSES = 4
 
@@ -35,7 +41,9 @@ def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
     with ExitStack() as stack:
         mistake.apply(stack)
         for vector in load() if vectors is None else vectors:
-            failed += [one for one in judge(vector, _asked(vector.data), tuple(PARTS)) if not one.good]
+            near = exact_floats if mistake.by == RENDERER else None
+            outcomes = judge(vector, _asked(vector.data), tuple(PARTS), near=near)
+            failed += [one for one in outcomes if not one.good]
     return Caught("Python", mistake, failed)
 
 

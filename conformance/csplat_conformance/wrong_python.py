@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -14,52 +13,13 @@ from unittest import mock
 
 import numpy as np
 
-from csplat import _spec, decoder
+from csplat import _spec
 from csplat.decoder import blocks, container, reconstruct, streams
 from csplat.errors import FormatError, UnsupportedError
-from csplat_conformance.mistakes import Mistake
+from csplat_conformance.mistakes import Mistake, Wrong, method, nothing, replaced
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
 __all__ = ["MISTAKES"]
-
-Wrong = Callable[..., Any]
-
-
-def _replaced(name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
-    """Return what replaces a function of the decoder wherever it was imported; `wrong` gets the right one first."""
-
-    def apply(stack: ExitStack) -> None:
-        prefix = decoder.__name__ + "."
-        modules = [module for key, module in list(sys.modules.items()) if key.startswith(prefix)]
-        owners = [module for module in modules if hasattr(module, name)]
-        assert owners, f"the decoder has no {name}"
-        for owner in owners:
-            right = getattr(owner, name)
-            stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
-
-    return apply
-
-
-def _method(owner: type, name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
-    """Return what replaces a method."""
-
-    def apply(stack: ExitStack) -> None:
-        right = getattr(owner, name)
-        stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
-
-    return apply
-
-
-def _bound(wrong: Wrong, right: Wrong) -> Wrong:
-    def replacement(*args: Any, **options: Any) -> Any:
-        return wrong(right, *args, **options)
-
-    return replacement
-
-
-def _nothing(_right: Wrong, *_args: Any, **_options: Any) -> None:
-    return None
-
 
 # What is checked -----------------------------------------------------------------------------------
 
@@ -131,17 +91,17 @@ def _constants(**values: int) -> Callable[[ExitStack], None]:
 
 def _without_tails(stack: ExitStack) -> None:
     """Take the structures' own sizes for those of the records."""
+    right = _spec.unpack_index_head
 
-    def unpack(right: Wrong, *args: Any) -> _spec.IndexHead:
-        head: _spec.IndexHead = right(*args)
-        return head._replace(
+    def unpack(data: Any, at: int) -> _spec.IndexHead:
+        return right(data, at)._replace(
             attribute_size=_spec.ATTRIBUTE_RECORD_SIZE,
             directory_size=_spec.DIRECTORY_RECORD_SIZE,
             tile_size=_spec.TILE_RECORD_SIZE,
             layer_size=_spec.LAYER_RECORD_SIZE,
         )
 
-    stack.enter_context(mock.patch.object(_spec, "unpack_index_head", _bound(unpack, _spec.unpack_index_head)))
+    stack.enter_context(mock.patch.object(_spec, "unpack_index_head", unpack))
 
 
 def _known_extras(right: Wrong, *args: Any) -> Any:
@@ -277,22 +237,22 @@ def _sorted_codes(right: Wrong, codes: Any) -> Any:
 
 
 MISTAKES: Final = (
-    Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", _replaced("_check_crc", _nothing)),
-    Mistake("CRC of the index", "the chunks have theirs", "IDX-1", _replaced("_check_crc", _crc_but("IDX-1"))),
-    Mistake("CRCs of chunks", "the index has its own", "CHK-1", _replaced("_check_crc", _crc_but("CHK-1"))),
-    Mistake("chunks unused", "what is not used is not read", "CHK-2", _replaced("_read_side_chunks", _no_side_chunks)),
-    Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", _replaced("view_of", _cut_to_size)),
-    Mistake("tails of payloads", "a payload may go on", "TLE-3", _method(container.Cursor, "finish", _nothing)),
-    Mistake("lenient inflate", "as most libraries do by default", "COD-2", _replaced("_inflate", _tail_of_inflate)),
+    Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),
+    Mistake("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", _crc_but("IDX-1"))),
+    Mistake("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", _crc_but("CHK-1"))),
+    Mistake("chunks unused", "what is not used is not read", "CHK-2", replaced("_read_side_chunks", _no_side_chunks)),
+    Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", replaced("view_of", _cut_to_size)),
+    Mistake("tails of payloads", "a payload may go on", "TLE-3", method(container.Cursor, "finish", nothing)),
+    Mistake("lenient inflate", "as most libraries do by default", "COD-2", replaced("_inflate", _tail_of_inflate)),
     Mistake(
-        "DEFLATE, counts", "any number of 5 bits is a count", "COD-5", _replaced("_inflate", _inflate_without("COD-5"))
+        "DEFLATE, counts", "any number of 5 bits is a count", "COD-5", replaced("_inflate", _inflate_without("COD-5"))
     ),
-    Mistake("DEFLATE, codes", "complete or not", "COD-6", _replaced("_inflate", _inflate_without("COD-6"))),
-    Mistake("DEFLATE, lengths", "repetitions as they come", "COD-7", _replaced("_inflate", _inflate_without("COD-7"))),
-    Mistake("DEFLATE, symbols", "each means something", "COD-8", _replaced("_inflate", _inflate_without("COD-8"))),
-    Mistake("reserved bits", "reserved fields are not looked at", "RES-1", _replaced("check_reserved", _nothing)),
+    Mistake("DEFLATE, codes", "complete or not", "COD-6", replaced("_inflate", _inflate_without("COD-6"))),
+    Mistake("DEFLATE, lengths", "repetitions as they come", "COD-7", replaced("_inflate", _inflate_without("COD-7"))),
+    Mistake("DEFLATE, symbols", "each means something", "COD-8", replaced("_inflate", _inflate_without("COD-8"))),
+    Mistake("reserved bits", "reserved fields are not looked at", "RES-1", replaced("check_reserved", nothing)),
     Mistake(
-        "critical chunks", "whatever is unknown is skipped", "DIR-2", _replaced("_check_chunk_type", _skip_critical)
+        "critical chunks", "whatever is unknown is skipped", "DIR-2", replaced("_check_chunk_type", _skip_critical)
     ),
     Mistake("tails of records", "a record is as long as its fields", "IDX-9", _without_tails),
     Mistake(
@@ -302,30 +262,30 @@ MISTAKES: Final = (
         _constants(ANCILLARY_SCENE_FLAGS=0, ANCILLARY_CHUNK_FLAGS=0),
     ),
     Mistake("layers", "what is not known is refused", "ANC-2", _constants(ANCILLARY_ID_MIN=256)),
-    Mistake("extra types", "an unknown one has no block", "ANC-3", _replaced("read_extras", _known_extras)),
+    Mistake("extra types", "an unknown one has no block", "ANC-3", replaced("read_extras", _known_extras)),
     Mistake("limits", "levels, shifts, columns, nesting without bound", "LAT-4", _no_limits),
-    Mistake("box", "max_scale is believed", "TIL-11", _replaced("check_max_scale", _nothing)),
-    Mistake("zigzag", "odd values are one too large", "STR-3", _replaced("_undo_zigzag", _zigzag)),
-    Mistake("modulus", "DELTA and ZIGZAG not modulo 2^(8w)", "STR-2", _replaced("_wrap", _no_wrap)),
-    Mistake("sign", "elements of SIGNED read as unsigned", "LAT-4", _replaced("_as_signed", _as_unsigned)),
-    Mistake("order", "Morton codes taken for sorted", "ORD-1", _replaced("morton_axes", _sorted_codes)),
-    Mistake("escapes", "escaped splats take the last entry", "CBK-3", _method(blocks.Coded, "rows", _no_escapes)),
-    Mistake("stages", "stages after the first are dropped", "CBR-3", _method(blocks.Coded, "rows", _one_stage)),
-    Mistake("unused entries", "entries of a codebook are believed", "CBK-7", _replaced("_check_entries", _nothing)),
-    Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", _method(blocks.Coded, "rows", _no_summand)),
-    Mistake("mask", "bits from the highest on", "SPA-2", _replaced("read_sparse", _mask_from_the_top)),
-    Mistake("rounding", "products in binary32", "NUM-1", _replaced("_scale", _binary32_product)),
-    Mistake("quats, order of operations", "q / M / √2", "NUM-1", _replaced("write_quats", _loose_quats)),
-    Mistake("quats, sign of w", "w is negative", "QUA-2", _replaced("write_quats", _minus_w)),
-    Mistake("quats, place of w", "x, y, z, w", "QUA-2", _replaced("write_quats", _w_last)),
-    Mistake("opacities", "the square is forgotten", "LEV-1", _replaced("opacity_table", _linear)),
-    Mistake("layers swapped", "band 2 before band 1", "ATT-1", _replaced("write_bands", _bands_swapped)),
-    Mistake("SH columns", "coefficient by coefficient", "ATT-1", _replaced("write_colour", _channels_innermost)),
-    Mistake("tile offset", "the tile's corner is not added", "TIL-7", _replaced("lattice_rows", _without_corner)),
+    Mistake("box", "max_scale is believed", "TIL-11", replaced("check_max_scale", nothing)),
+    Mistake("zigzag", "odd values are one too large", "STR-3", replaced("_undo_zigzag", _zigzag)),
+    Mistake("modulus", "DELTA and ZIGZAG not modulo 2^(8w)", "STR-2", replaced("_wrap", _no_wrap)),
+    Mistake("sign", "elements of SIGNED read as unsigned", "LAT-4", replaced("_as_signed", _as_unsigned)),
+    Mistake("order", "Morton codes taken for sorted", "ORD-1", replaced("morton_axes", _sorted_codes)),
+    Mistake("escapes", "escaped splats take the last entry", "CBK-3", method(blocks.Coded, "rows", _no_escapes)),
+    Mistake("stages", "stages after the first are dropped", "CBR-3", method(blocks.Coded, "rows", _one_stage)),
+    Mistake("unused entries", "entries of a codebook are believed", "CBK-7", replaced("_check_entries", nothing)),
+    Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", method(blocks.Coded, "rows", _no_summand)),
+    Mistake("mask", "bits from the highest on", "SPA-2", replaced("read_sparse", _mask_from_the_top)),
+    Mistake("rounding", "products in binary32", "NUM-1", replaced("_scale", _binary32_product)),
+    Mistake("quats, order of operations", "q / M / √2", "NUM-1", replaced("write_quats", _loose_quats)),
+    Mistake("quats, sign of w", "w is negative", "QUA-2", replaced("write_quats", _minus_w)),
+    Mistake("quats, place of w", "x, y, z, w", "QUA-2", replaced("write_quats", _w_last)),
+    Mistake("opacities", "the square is forgotten", "LEV-1", replaced("opacity_table", _linear)),
+    Mistake("layers swapped", "band 2 before band 1", "ATT-1", replaced("write_bands", _bands_swapped)),
+    Mistake("SH columns", "coefficient by coefficient", "ATT-1", replaced("write_colour", _channels_innermost)),
+    Mistake("tile offset", "the tile's corner is not added", "TIL-7", replaced("lattice_rows", _without_corner)),
     Mistake(
-        "tile offset as float", "corner and rest rounded apart", "TIL-7", _replaced("write_lattice", _added_as_floats)
+        "tile offset as float", "corner and rest rounded apart", "TIL-7", replaced("write_lattice", _added_as_floats)
     ),
     Mistake("exponents", "2^exponent is forgotten", "LAT-1", _no_exponents),
-    Mistake("chroma shift", "Co and Cg are not shifted", "ATT-8", _replaced("lift", _no_chroma_shift)),
-    Mistake("lifting", "halves rounded towards zero", "ATT-2", _replaced("lift", _lift_towards_zero)),
+    Mistake("chroma shift", "Co and Cg are not shifted", "ATT-8", replaced("lift", _no_chroma_shift)),
+    Mistake("lifting", "halves rounded towards zero", "ATT-2", replaced("lift", _lift_towards_zero)),
 )

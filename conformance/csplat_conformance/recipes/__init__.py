@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache, lru_cache
+from typing import Any
+
+from numpy.typing import NDArray
+
 from csplat_conformance.boundaries import boundary_recipes
 from csplat_conformance.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
 from csplat_conformance.recipes.edges import edge_recipes
@@ -25,9 +30,11 @@ from csplat_conformance.recipes.texts import bad_text_recipes, good_text_recipes
 from csplat_conformance.recipes.valid import valid_recipes
 from csplat_conformance.recipes.valid_combined import combined_recipes
 from csplat_conformance.recipes.valid_streams import valid_stream_recipes
+from csplat_conformance.reference import expected
 from csplat_conformance.samples import Recipe
+from csplat_conformance.scene import Scene
 
-__all__ = ["all_recipes"]
+__all__ = ["all_recipes", "exact_floats"]
 
 
 def all_recipes() -> list[Recipe]:
@@ -63,3 +70,16 @@ def all_recipes() -> list[Recipe]:
         bad_text_recipes,
     )
     return [recipe for make in (*valid, *invalid) for recipe in make()]
+
+
+@lru_cache(maxsize=8)
+def exact_floats(name: str) -> dict[str, NDArray[Any]]:
+    """Return the float arrays of a vector: the manifest has only their hashes."""
+    made = _scenes()[name]
+    assert made is not None, f"{name} has no values"
+    return expected(made).floats
+
+
+@cache
+def _scenes() -> dict[str, Scene | None]:
+    return {recipe.name: recipe.scene for recipe in all_recipes()}

@@ -37,7 +37,7 @@ _LARGEST = float_info.max
 
 def extreme_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_numbers(), *_facts(), *_tiles()]
+    return [*_numbers(), *_single(), *_facts(), *_tiles()]
 
 
 def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
@@ -206,6 +206,43 @@ def _numbers() -> list[Recipe]:
             _with(
                 {QUATS: signed([[32767, -32767, 0], [0, 0, 32767], [18918, 18918, -18918]], Stream(2))},
                 records={QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=32767)},
+            ),
+        ),
+    ]
+
+
+def _single() -> list[Recipe]:
+    """Values that single precision gets wrong in the order that comes to mind first (9.2)."""
+    far = axis([[0, 0, 0], [2**23 - 1, 1, 2**24 - 2], [2**23 + 1, 2, 2**24 - 1], [2**24 - 1, 3, 1]], Stream(3))
+    small = signed([[32763, 32753, 1086], [-32747, 32642, -3080], [849, -32760, 32763], [0, 0, 1]], Stream(2))
+    return [
+        _recipe(
+            "means_cancelling",
+            "a box around 0, whose corner and rest cancel, and integers that binary32 cannot hold, between two steps",
+            "MEA-1 NUM-1 CNF-7",
+            _with(
+                {MEANS: far},
+                4,
+                corner=(-(2**23), 2**25, _MAX - 2**24),
+                exponent=0,
+                records={MEANS: _lattice((1 + 2.0**-24 + 2.0**-40) * 2.0**-20)},
+            ),
+        ),
+        _recipe(
+            "quats_small_w",
+            "R of 4, 5 and 8 beside squares of 2^30: w is what a rounded R or 1 − x² − y² − z² loses",
+            "QUA-2 CNF-7",
+            _with({QUATS: small}, 4, records={QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=32767)}),
+        ),
+        _recipe(
+            "mean_nearly_infinite",
+            "the largest number of binary32; the factors, each rounded to binary32, overflow",
+            "MEA-1 CNF-7 CNF-8",
+            _with(
+                {MEANS: axis([[0, 0, 0], [1, 0, 0], [2, 0, 0]])},
+                corner=(2**25 + 1, 0, 0),
+                exponent=0,
+                records={MEANS: _lattice(float(2**128 - 2**103) / (2**25 + 3) * (1 - 2.0**-50))},
             ),
         ),
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from csplat import _spec
 from csplat_conformance.broken import patched, rich, small, whole
@@ -15,6 +16,7 @@ from csplat_conformance.samples import (
     SH0,
     Recipe,
     attributes,
+    axis,
     book,
     levels,
     morton,
@@ -199,6 +201,19 @@ def _values() -> list[Recipe]:
             scene(tiles=[tile(corner=(2**50, 0, 0))], attributes=attributes() | {MEANS: far}),
             "TILE.0.0/means.stream.width",
         ),
+        whole(
+            "mean_rounds_to_infinity",
+            "a centre that rounds up to infinity; cut to binary32 it is finite",
+            "MEA-1 CNF-8",
+            "E_RANGE",
+            _with(
+                {MEANS: axis([[0, 0, 0], [31, 0, 0]])},
+                {MEANS: replace(attributes()[MEANS], step=1082401 * 2.0**103)},
+                corner=(0, 0, 0),
+                exponent=0,
+            ),
+            "TILE.0.0/means.stream.width",
+        ),
         quats("quat_component", "a component of M + 1", "QUA-1", [m + 1, 0, 0]),
         quats("quat_component_negative", "a component of −M − 1", "QUA-1", [0, -m - 1, 0]),
         quats("quat_component_smallest", "a component of −2^15", "QUA-1", [0, 0, -(2**15)]),
@@ -269,6 +284,6 @@ def _sparse() -> list[Recipe]:
     ]
 
 
-def _with(changes: dict[int, Block], records: dict[int, Attribute] | None = None) -> Scene:
-    made = scene(tiles=[tile(changes=changes)])
+def _with(changes: dict[int, Block], records: dict[int, Attribute] | None = None, **rest: Any) -> Scene:
+    made = scene(tiles=[tile(changes=changes, **rest)])
     return replace(made, attributes=made.attributes | (records or {}))

@@ -16,6 +16,7 @@ from csplat.model import SplatModel
 from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder
 from csplat_conformance.encoders.judge import PictureJudge
 from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
+from csplat_conformance.near import EXACT
 from csplat_conformance.report import Report, to_json, to_junit, to_table
 from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
 from csplat_tools.cli.console import FAILED
@@ -116,16 +117,19 @@ def decoder(
         list[str] | None,
         typer.Option(metavar="PATTERN,...", help="Only vectors of such clauses of the spec: 'HDR-*'. May repeat."),
     ] = None,
+    by: Annotated[
+        str, typer.Option("--class", metavar="CLASS", help="exact, or renderer: floats in single precision (spec 9.2).")
+    ] = EXACT,
     exact: Annotated[
         bool, typer.Option("--exact", help="Of refusals demand code, clause and offset too: for our decoders.")
     ] = False,
 ) -> None:
     """Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
 
-    L1: header and refusals. L2: integers. L3: floats, bit for bit. L4: pictures
-    of a renderer. Another decoder writes what it decodes into {outdir}, or
-    exits with status 1 and the error code in a line of JSON:
-    conformance/IMPLEMENTERS.md says how.
+    L1: header and refusals. L2: integers. L3: floats, bit for bit, or near
+    enough for --class renderer. L4: pictures of a renderer. Another decoder
+    writes what it decodes into {outdir}, or exits with status 1 and the error
+    code in a line of JSON: conformance/IMPLEMENTERS.md says how.
 
     Examples:
       csplat conformance decoder --filter 'invalid/*'
@@ -139,7 +143,7 @@ def decoder(
         # A renderer alone is tested at L4 alone.
         levels = parse_levels(level or ("3" if render_program is None else "4"))
         timeout = run.timeout or TIMEOUT_SECONDS
-        choice = Choice(run.pattern, _joined(clause), levels, exact, timeout, run.jobs)
+        choice = Choice(run.pattern, _joined(clause), levels, exact, timeout, run.jobs, by)
         if program is None and render_program is None:
             report = run_builtin(choice, _moved(bar))
         else:
