@@ -130,12 +130,20 @@ def invalid_growth_recipes() -> list[Recipe]:
             {"extra[2].name": b"label".ljust(62, b"\0"), "extra[2].name_size": 5},
         ),
         patched(
-            "ancillary_flag_of_chunk_alone",
-            "flags of which only the chunk has a skipped one",
-            "CHK-3",
+            "ancillary_flag_of_record_alone",
+            "a flag that may be skipped, in the record and not in the chunk",
+            "CHK-3 ANC-1",
             "E_INDEX",
             flags,
             {"META/header.flags": _spec.CHUNK_FLAG_SAFE_TO_COPY},
+        ),
+        patched(
+            "ancillary_flag_of_tile",
+            "a flag that may be skipped, in a TILE",
+            "CHK-3 ANC-1",
+            "E_INDEX",
+            flags,
+            {"TILE.0.0/header.flags": _spec.CHUNK_FLAG_CRITICAL | 0x100},
         ),
         patched(
             "ancillary_and_critical",
