@@ -1,5 +1,6 @@
 """Decoders that are wrong on purpose: the suite notices each, and names the clause."""
 
+from contextlib import ExitStack
 from dataclasses import replace
 from unittest import mock
 
@@ -10,6 +11,7 @@ from csplat.decoder import scene
 from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter, wrong
 from csplat_conformance.manifest import load
+from csplat_conformance.mistakes import reworded
 from csplat_conformance.near import EXACT, RENDERER
 from csplat_conformance.node import missing_javascript
 from csplat_conformance.report import Status
@@ -88,6 +90,18 @@ def test_a_wrong_javascript_decoder_fails_a_vector_that_names_the_clause(edit):
 def test_an_edit_that_finds_nothing_to_change_is_an_error():
     with pytest.raises(ValueError, match="wanted once"):
         edited(EDITS[0], "another text")
+
+
+def test_clauses_that_0_2_added_or_changed_have_wrong_decoders_of_their_own():
+    wanted = """HDR-2 HDR-12 ATT-10 LAT-1 LAT-3 LAT-4 SPA-1 SPA-2 SPA-3 CHK-1 CHK-2 CBK-7 COD-5 COD-6 COD-7 COD-8
+    EXR-2 JSN-1 CNF-7 CNF-8"""
+
+    assert set() == {*wanted.split()} - {mistake.clause for mistake in MISTAKES}
+
+
+def test_words_that_a_function_lacks_are_an_error():
+    with ExitStack() as stack, pytest.raises(ValueError, match="wanted once"):
+        reworded("read_sparse", {"another text": ""})(stack)
 
 
 def test_there_are_ten_mistakes_and_more():

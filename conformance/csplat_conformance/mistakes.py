@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from csplat import decoder
 from csplat_conformance.near import EXACT
 from csplat_conformance.report import Outcome
 
-__all__ = ["Caught", "Mistake", "Wrong", "method", "nothing", "replaced"]
+__all__ = ["Caught", "Mistake", "Wrong", "method", "nothing", "replaced", "reworded"]
 
 #: Takes the right function, then its arguments.
 Wrong = Callable[..., Any]
@@ -30,6 +31,7 @@ class Mistake:
         clause: of the spec, that it breaks.
         apply: makes the decoder wrong until the stack is closed.
         by: class of decoders (spec 9.2) that it is judged as.
+        exact: it is judged as csplat's own, which read every payload (CHK-7).
     """
 
     name: str
@@ -37,6 +39,7 @@ class Mistake:
     clause: str
     apply: Callable[[ExitStack], None]
     by: str = EXACT
+    exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,25 @@ def replaced(name: str, wrong: Wrong) -> Callable[[ExitStack], None]:
         for owner in owners:
             right = getattr(owner, name)
             stack.enter_context(mock.patch.object(owner, name, _bound(wrong, right)))
+
+    return apply
+
+
+def reworded(name: str, words: Mapping[str, str]) -> Callable[[ExitStack], None]:
+    """Return what replaces pieces of the text of a function, each of which it has to hold once."""
+
+    def apply(stack: ExitStack) -> None:
+        prefix = decoder.__name__ + "."
+        modules = [module for key, module in list(sys.modules.items()) if key.startswith(prefix)]
+        (right,) = {getattr(module, name) for module in modules if hasattr(module, name)}
+        text = inspect.getsource(right)
+        for old, new in words.items():
+            if text.count(old) != 1:
+                raise ValueError(f"{name} has {old!r} {text.count(old)} times, wanted once: mend the mistake")
+            text = text.replace(old, new)
+        made: dict[str, Any] = {}
+        exec(text, right.__globals__, made)  # noqa: S102 - the text is the decoder's own
+        replaced(name, lambda _right, *args, **options: made[name](*args, **options))(stack)
 
     return apply
 

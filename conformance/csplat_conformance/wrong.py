@@ -27,10 +27,11 @@ from csplat_conformance.report import Status
 from csplat_conformance.wrong_js import catch_all
 from csplat_conformance.wrong_python import MISTAKES as WRONG_PYTHON
 from csplat_conformance.wrong_single import MISTAKES as WRONG_SINGLE
+from csplat_conformance.wrong_words import MISTAKES as WRONG_WORDS
 
 __all__ = ["MISTAKES", "catch", "main", "table"]
 
-MISTAKES = (*WRONG_PYTHON, *WRONG_SINGLE)
+MISTAKES = (*WRONG_PYTHON, *WRONG_WORDS, *WRONG_SINGLE)
 
 _SHOWN_CLAUSES = 4
 
@@ -42,7 +43,7 @@ def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
         mistake.apply(stack)
         for vector in load() if vectors is None else vectors:
             near = exact_floats if mistake.by == RENDERER else None
-            outcomes = judge(vector, _asked(vector.data), tuple(PARTS), near=near)
+            outcomes = judge(vector, _asked(vector.data), tuple(PARTS), exact=mistake.exact, near=near)
             failed += [one for one in outcomes if not one.good]
     return Caught("Python", mistake, failed)
 

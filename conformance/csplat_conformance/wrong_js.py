@@ -39,6 +39,40 @@ class Edit:
 
 
 EDITS: Final = (
+    Edit(
+        "version",
+        "any minor version is read",
+        "HDR-2",
+        "container.mjs",
+        "major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR",
+        "major !== spec.VERSION_MAJOR",
+    ),
+    Edit("steps", "binary64, as the means'", "ATT-10", "index.mjs", "Math.fround(step) === step && ", ""),
+    Edit(
+        "lattices",
+        "step × 2^exponent may be anything",
+        "LAT-1",
+        "codings.mjs",
+        "if (!(s >= SINGLE_MIN && s < 2 ** 128)) throw",
+        "if (false) throw",
+    ),
+    Edit(
+        "columns of chroma",
+        "the limit holds before the shift",
+        "LAT-4",
+        "codings.mjs",
+        "spec.COLUMN_MAX / 2 ** attribute.chromaShift",
+        "spec.COLUMN_MAX",
+    ),
+    Edit("bits of the mask", "uncounted", "SPA-2", "codings.mjs", "if (found !== count) throw", "if (false) throw"),
+    Edit(
+        "end of the mask",
+        "not looked at",
+        "SPA-3",
+        "codings.mjs",
+        "if (n & 7 && mask[n >> 3] >> (n & 7)) throw",
+        "if (false) throw",
+    ),
     Edit("CRCs of chunks", "ignored", "CHK-1", "container.mjs", "checkCrc(chunk, place.crc, offset, 'CHK-1');", ""),
     Edit(
         "CRC of the index",

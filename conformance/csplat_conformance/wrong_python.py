@@ -19,7 +19,7 @@ from csplat.errors import FormatError, UnsupportedError
 from csplat_conformance.mistakes import Mistake, Wrong, method, nothing, replaced
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
-__all__ = ["MISTAKES"]
+__all__ = ["MISTAKES", "crc_but"]
 
 # What is checked -----------------------------------------------------------------------------------
 
@@ -32,7 +32,9 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
     return view[: max(_spec.HEADER_SIZE, _spec.unpack_header(view).file_size)]
 
 
-def _crc_but(unchecked: str) -> Wrong:
+def crc_but(unchecked: str) -> Wrong:
+    """Return what checks all CRCs but those of one clause."""
+
     def wrong(right: Wrong, covered: memoryview, stored: int, at: int, clause: str) -> None:
         if clause != unchecked:
             right(covered, stored, at, clause)
@@ -238,8 +240,8 @@ def _sorted_codes(right: Wrong, codes: Any) -> Any:
 
 MISTAKES: Final = (
     Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),
-    Mistake("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", _crc_but("IDX-1"))),
-    Mistake("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", _crc_but("CHK-1"))),
+    Mistake("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
+    Mistake("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
     Mistake("chunks unused", "what is not used is not read", "CHK-2", replaced("_read_side_chunks", _no_side_chunks)),
     Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", replaced("view_of", _cut_to_size)),
     Mistake("tails of payloads", "a payload may go on", "TLE-3", method(container.Cursor, "finish", nothing)),
