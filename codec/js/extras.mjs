@@ -24,7 +24,7 @@ const EXTRA_VIEWS = {
  * @param {ExtraRecord} record
  * @returns {record is ExtraRecord & {dtype: string}}
  */
-export const isKnown = ({ dtype }) => dtype !== null;
+export const isKnown = (record) => record.dtype !== null;
 
 /** Extra columns, bit for bit: floats are never read as such, so that NaN keep their bits. */
 export class ExtraArrays {
