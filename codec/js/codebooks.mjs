@@ -220,17 +220,19 @@ async function readIndices(tile, payload, codebook, escapeCount, at) {
     }
     indices.push(low);
   }
-  const found = [];
-  for (let i = 0; i < n; i++) if (indices[0][i] === codebook.sizes[0]) found.push(i);
-  if (found.length !== escapeCount) {
+  const escaped = new Uint32Array(Math.min(escapeCount, n));
+  let found = 0;
+  // Beyond its end nothing is written.
+  for (let i = 0; i < n; i++) if (indices[0][i] === codebook.sizes[0]) escaped[found++] = i;
+  if (found !== escapeCount) {
     throw fault(
       ERROR_CODEBOOK,
       at + AT_PARAMS.escape_count,
       'CBK-3',
-      `${found.length} splats are escaped, ${escapeCount} announced`,
+      `${found} splats are escaped, ${escapeCount} announced`,
     );
   }
-  const shared = { indices, escapeCount, escaped: Uint32Array.from(found) };
+  const shared = { indices, escapeCount, escaped };
   tile.indices.set(codebook.id, shared);
   return shared;
 }

@@ -71,7 +71,7 @@ export async function decode(data, options = {}) {
   const payloads = openChunks(bytes, header);
   const scene = { header, codebooks, inflate: options.inflate ?? (await platformInflate()) };
   const { table, description } = await readDirectory(scene, payloads, limits.jsonBytes);
-  const scratch = reused();
+  const scratch = reused(shDegree);
   let first = 0;
   for (const record of tiles) {
     options.signal?.throwIfAborted();
@@ -132,17 +132,21 @@ async function readDirectory({ header, codebooks, inflate }, payloads, jsonBytes
 }
 
 /**
- * Arrays that tile after tile uses again: fresh memory costs more than what is done with it.
+ * Arrays that tile after tile uses again, and band after band: fresh memory costs more than what is done with it.
  *
+ * @param {number} shDegree
  * @returns {SceneContext['scratch']}
  */
-function reused() {
+function reused(shDegree) {
   /** @type {Map<number, Float64Array>} */
   const arrays = new Map();
   return (key, length) => {
-    const known = arrays.get(key);
-    const array = known && known.length >= length ? known : new Float64Array(length);
-    arrays.set(key, array);
+    const band = Math.abs(key) - spec.ATTRIBUTE_SH0;
+    const place = band > 0 ? Math.sign(key) * spec.ATTRIBUTE_SH1 : key;
+    const most = band > 0 ? (length / (2 * band + 1)) * (2 * shDegree + 1) : length; // what the highest band takes
+    const known = arrays.get(place);
+    const array = known && known.length >= length ? known : new Float64Array(most);
+    arrays.set(place, array);
     return array.subarray(0, length);
   };
 }

@@ -53,7 +53,7 @@ const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
  * @property {Inflate} inflate
  * @property {TileContext['table']} table
  * @property {(key: number, length: number) => Float64Array} scratch an array of any content, to be used until the
- *   tile is done
+ *   layer is done
  *
  * What a layer decodes to.
  *

@@ -181,7 +181,7 @@ def _sizes(count: int, plan: Plan, options: EncodeOptions) -> tuple[int, ...]:
     size = options.codebook_size
     if size is None:
         wanted = max(count * plan.codebook_share, min(_ENOUGH * plan.codebook_share, count / _USERS))
-        size = 1 << min(max(round(math.log2(max(1.0, wanted))), 4), 13)
+        size = min(1 << max(round(math.log2(max(1.0, wanted))), 4), plan.codebook_most)
     return (size,) * (options.codebook_stages or 1)
 
 

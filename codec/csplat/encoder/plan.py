@@ -40,6 +40,7 @@ class Plan:
         sh_coding: "auto", "codebook", "scalar" or "none"; the SH stage settles "auto".
         codebook_step: lattice step of the bands 1 to 3 if they get a codebook, whose entries are worth more precision.
         codebook_share: entries per splat.
+        codebook_most: entries at most.
         escape_fraction: share of the splats that are coded directly.
         escape_coarse: their values are multiples of 2**escape_coarse steps.
         coding: how streams are coded.
@@ -58,6 +59,7 @@ class Plan:
     sh_degree: int
     codebook_step: float
     codebook_share: float
+    codebook_most: int
     escape_fraction: float
     escape_coarse: int
     sh_coding: str
@@ -111,6 +113,7 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
         sh_step=_first(options.sh_step, steps.sh),
         codebook_step=_first(options.sh_step, steps.sh / 2**preset.codebook_finer),
         codebook_share=preset.codebook_share,
+        codebook_most=preset.codebook_most,
         escape_fraction=preset.escape_fraction,
         escape_coarse=0 if options.sh_step else preset.codebook_finer,
         chroma_shift=_first(options.chroma_shift, 1),

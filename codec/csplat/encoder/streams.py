@@ -17,7 +17,7 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 
 Integers = NDArray[Any]
 
-_HUFFMAN_LEVEL = 1  # at this level matches are not worth their search where Huffman codes alone do as well
+_RUNS_LEVEL = 1  # at this level matches are not worth their search where runs and Huffman codes alone do as well
 _LONG_RUN = 32  # bytes, of the mean run, from which runs are written as such
 _SAMPLE = 4096  # bytes from which the choice between the two is made
 
@@ -79,7 +79,7 @@ def smooth_stream(values: Integers, coding: Coding) -> bytes:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
         coding: what the coder may do; at the lowest level the entropies decide instead of trials.
     """
-    if coding.level > _HUFFMAN_LEVEL:
+    if coding.level > _RUNS_LEVEL:
         return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
     low = values.astype(np.uint8)
     differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
@@ -197,8 +197,8 @@ def _code(packed: NDArray[np.uint8], coding: Coding) -> tuple[int, bytes]:
 def _deflate(raw: bytes, coding: Coding) -> bytes:
     if coding.library == "zlib":
         return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
-    if coding.level <= _HUFFMAN_LEVEL and not _has_matches(raw):
-        return _zlib(raw, 1, zlib.Z_HUFFMAN_ONLY)
+    if coding.level <= _RUNS_LEVEL and not _has_matches(raw):
+        return _zlib(raw, 1, zlib.Z_RLE)
     return _libdeflate(raw, coding.level)
 
 
@@ -214,7 +214,7 @@ def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
 
 
 def _has_matches(raw: bytes) -> bool:
-    """Judge on samples whether a fast search for matches beats Huffman codes alone."""
+    """Judge on samples whether a fast search for matches beats runs and Huffman codes alone."""
     step = max(_SAMPLE, len(raw) // 4)
     sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
-    return len(_libdeflate(sample, 1)) < len(_zlib(sample, 1, zlib.Z_HUFFMAN_ONLY))
+    return len(_libdeflate(sample, 1)) < len(_zlib(sample, 1, zlib.Z_RLE))

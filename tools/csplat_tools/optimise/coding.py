@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from csplat.encoder import PRESETS, EncodeOptions
+from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.files.scenes import without_bands
 from csplat_tools.optimise.solving import Solver
@@ -61,7 +61,7 @@ class Codings:
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
         huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
-        plain = huge or PRESETS[self.encoding.preset].sh_coding == "scalar"
+        plain = huge or self.encoding.preset == "fast"  # a codebook for each precision that is tried takes too long
         return [scalar] if plain else [scalar, *kinds["codebook"]]
 
     def best(self, solver: Solver, part: Part, start: float, *, brief: bool = False) -> list[Trial]:
