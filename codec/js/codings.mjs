@@ -339,7 +339,7 @@ export function everySplat({ present, ...block }, n) {
 export function checkIntegers({ attribute, columns, bound, offset }, n) {
   const { id, levels } = attribute;
   if (id === spec.ATTRIBUTE_OPACITIES) {
-    const bad = columns.findIndex((q) => q < 0 || q > levels);
+    const bad = columns.findIndex((q) => q > levels);
     if (bad >= 0) throw fault(ERROR_RANGE, offset, 'LEV-1', `a level of ${columns[bad]}, the file has ${levels}`);
   } else if (id === spec.ATTRIBUTE_QUATS) {
     const bad = columns.findIndex((q) => q < -levels || q > levels);
