@@ -230,7 +230,6 @@ def test_limits(limits, name):
 @pytest.mark.parametrize(
     ("kind", "bands", "columns"),
     [
-        (_spec.CODEBOOK_KIND_OPACITIES, (0, 0), {0: 1}),
         (_spec.CODEBOOK_KIND_SCALES, (0, 0), {0: 3}),
         (_spec.CODEBOOK_KIND_QUATS, (0, 0), {0: 3}),
         (_spec.CODEBOOK_KIND_SH0, (0, 0), {0: 3}),

@@ -82,6 +82,21 @@ def test_a_constant_plane_costs_a_few_bytes():
     assert len(unsigned_stream(np.full(65536, 200), Coding(1))) <= _spec.STREAM_HEAD_SIZE + 3
 
 
+#: As the SH of splats of which some have none: noise, cut by runs of zeros.
+NOISE = RNG.integers(-20, 20, 60_000).astype(np.int8)
+CUT = np.where(np.repeat(RNG.random(20_000) < 0.6, 3), np.int8(0), NOISE)
+
+
+def test_short_runs_are_written_as_runs_where_that_is_smaller():
+    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(CUT, Coding(12)))[0].transforms
+    assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, Coding(12)))[0].transforms
+
+
+def test_the_lowest_level_finds_runs_and_no_matches_in_noise():
+    assert len(signed_stream(CUT, Coding(1))) < 1.15 * len(signed_stream(CUT, Coding(12)))
+    assert len(signed_stream(NOISE, Coding(1))) < 1.05 * len(signed_stream(NOISE, Coding(12)))
+
+
 @pytest.mark.parametrize("arguments", [(0,), (13,), (6, "gzip")])
 def test_refuses_a_level_or_library_that_does_not_exist(arguments):
     with pytest.raises(InputError):

@@ -20,11 +20,6 @@ import { signed } from './transforms.mjs';
 const { ERROR_CODEBOOK, ERROR_INDEX, ERROR_STREAM } = spec;
 const { CODEBOOK_HEAD_OFFSETS: AT_HEAD, CODEBOOK_PARAMS_OFFSETS: AT_PARAMS } = spec;
 const ENTRY_WIDTH_MAX = 4; // STR-2
-/** CBK-5: codings of escape blocks; of other attributes they are OFFSET and SIGNED. @type {Record<number, number[]>} */
-const ESCAPE_CODINGS = {
-  [spec.ATTRIBUTE_OPACITIES]: [spec.CODING_LEVELS],
-  [spec.ATTRIBUTE_QUATS]: [spec.CODING_SIGNED],
-};
 const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
 
 /**
@@ -360,7 +355,8 @@ async function readEscapes(tile, payload, attribute, count) {
       `escapes of attribute ${head.attribute} in a block of ${attribute.name}`,
     );
   }
-  if (!(ESCAPE_CODINGS[attribute.id] ?? [spec.CODING_OFFSET, spec.CODING_SIGNED]).includes(head.coding)) {
+  const mayOffset = attribute.id !== spec.ATTRIBUTE_QUATS;
+  if (head.coding !== spec.CODING_SIGNED && !(mayOffset && head.coding === spec.CODING_OFFSET)) {
     const what = `escapes of ${attribute.name} coded ${head.name}`;
     throw fault(ERROR_STREAM, head.offset + spec.BLOCK_HEAD_OFFSETS.coding, 'CBK-5', what);
   }

@@ -100,7 +100,7 @@ CHOICES: Final[tuple[Choice, ...]] = (
     Choice("header", "profile", "", (0,), (1, 2), "HDR-4", "E_UNSUPPORTED"),
     Choice("index_head", "axes", "", (0, 1, 2, 3, 4, 5, 6), (7,), "IDX-4", "E_VALUE"),
     Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
-    Choice("codebook_record", "kind", "", (1, 2, 3, 4, 5, 6), (0, 7), "RES-2", "E_UNSUPPORTED"),
+    Choice("codebook_record", "kind", "", (2, 3, 4, 5, 6), (1, 7), "RES-2", "E_UNSUPPORTED"),
     Choice("extra_record", "dtype", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "RES-2", "E_UNSUPPORTED"),
     Choice("layer_record", "layer", "", (0, 1, 2, 3, 8), (4, 5), "RES-2", "E_UNSUPPORTED"),
     Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "BLK-1", "E_UNSUPPORTED"),

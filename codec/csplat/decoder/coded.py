@@ -24,10 +24,7 @@ from csplat.errors import FormatError
 
 __all__ = ["TileContext", "read_coded"]
 
-_ESCAPE_CODINGS = {
-    _spec.ATTRIBUTE_OPACITIES: (_spec.CODING_LEVELS,),
-    _spec.ATTRIBUTE_QUATS: (_spec.CODING_SIGNED,),
-}
+_ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 _WIDE = np.dtype(np.int64)
 
 
@@ -68,7 +65,7 @@ def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) ->
         summand = _read_summand(cursor, context, attribute)
     escapes = None
     if params.escape_count:
-        legal = _ESCAPE_CODINGS.get(attribute, (_spec.CODING_OFFSET, _spec.CODING_SIGNED))
+        legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
         coding = read_block_head(cursor, attribute, legal)
         escapes = read_columns(cursor, context.header, attribute, coding, params.escape_count, escape=True)
     layer = _spec.ATTRIBUTE_LAYER[attribute]
@@ -152,7 +149,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
 
 
 def _check_sums(block: Coded, context: TileContext, attribute: int) -> None:
-    """CBK-6: the sums obey what LEV-1, QUA-1 and LAT-4 ask of integers that stand in a stream."""
+    """CBK-6: the sums obey what QUA-1 and LAT-4 ask of integers that stand in a stream."""
     record = context.header.attribute(attribute)
     if len(block.entries) == 1 and block.summand is None:
         return  # CBK-7: the entries do

@@ -150,7 +150,7 @@ def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
         FormatError: E_RANGE.
     """
     if record.attribute == _spec.ATTRIBUTE_OPACITIES:
-        _check_level(lows[0] if lows[0] < 0 else highs[0], 0, record.levels, at, "LEV-1")
+        _check_level(highs[0], 0, record.levels, at, "LEV-1")
     elif record.attribute == _spec.ATTRIBUTE_QUATS:
         for found in (min(lows), max(highs)):
             _check_level(found, -record.levels, record.levels, at, "QUA-1")

@@ -48,7 +48,8 @@ class EncodeOptions:
         grades: into how many grades splats are sorted, at most, 1 to 5: those whose errors show alike share tiles with
             steps of their own. Only where an importance holds curvatures; by default one per 2,500 splats, one in
             all with the preset "fast".
-        tile_splats: splats per tile at most, 1 to 65536.
+        tile_splats: splats per tile at most, 1 to 65536. Decoders spread tiles over cores: 16384 makes scenes of few
+            tiles 1.2 to 3.6 times as fast to decode on four, at most, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
         deflate_level: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: carry the model's extra columns.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +18,10 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 
 Integers = NDArray[Any]
 
-_RUNS_LEVEL = 1  # at this level matches are not worth their search where runs and Huffman codes alone do as well
-_LONG_RUN = 32  # bytes, of the mean run, from which runs are written as such
-_SAMPLE = 4096  # bytes from which the choice between the two is made
+_QUICK_LEVEL = 1  # of DEFLATE: samples decide, and nothing is tried twice
+_SHORT_RUN = 1.5  # bytes, of the mean run, from which RUN_LENGTH may save more than it costs decoders
+_LONG_RUN = 32  # bytes, from which it is tried at that level
+_SAMPLE = 4096  # bytes of each of four samples
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def smooth_stream(values: Integers, coding: Coding) -> bytes:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
         coding: what the coder may do; at the lowest level the entropies decide instead of trials.
     """
-    if coding.level > _RUNS_LEVEL:
+    if coding.level > _QUICK_LEVEL:
         return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
     low = values.astype(np.uint8)
     differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
@@ -136,12 +138,11 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
     if width > 1:
         steps.append(_spec.TRANSFORM_BYTE_PLANES)
     planes = _byte_planes(values, width)
-    packed: NDArray[np.uint8] = planes
-    runs = _run_length(planes)
-    if runs is not None:
-        packed = runs
+    runs = _run_length(planes, _LONG_RUN if coding.level <= _QUICK_LEVEL else _SHORT_RUN)
+    tried = [(data, *_code(data, coding)) for data in (planes, runs) if data is not None]
+    packed, coder, coded = min(tried, key=lambda one: len(one[2]))
+    if packed is runs:
         steps.append(_spec.TRANSFORM_RUN_LENGTH)
-    coder, coded = _code(packed, coding)
     head = _spec.StreamHead(
         width=width,
         coder=coder,
@@ -163,15 +164,16 @@ def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(columns[:, :width].T).reshape(-1)
 
 
-def _run_length(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """Return the runs where they are few enough to help DEFLATE, else None.
+def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
+    """Return the runs, or None where there are so many that the mean is shorter than `least`, which helps nobody.
 
-    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well.
+    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well. Short ones
+    cost it a distance each, and their lengths stand among the bytes: as runs, both have Huffman codes of their own.
     """
     if len(data) < 64:
         return None
     changes = np.flatnonzero(data[1:] != data[:-1])
-    if _LONG_RUN * (len(changes) + 1) > len(data):
+    if least * (len(changes) + 1) > len(data):
         return None
     starts = np.concatenate([[0], changes + 1])
     lengths = np.diff(np.append(starts, len(data)))
@@ -197,9 +199,21 @@ def _code(packed: NDArray[np.uint8], coding: Coding) -> tuple[int, bytes]:
 def _deflate(raw: bytes, coding: Coding) -> bytes:
     if coding.library == "zlib":
         return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
-    if coding.level <= _RUNS_LEVEL and not _has_matches(raw):
-        return _zlib(raw, 1, zlib.Z_RLE)
+    if coding.level <= _QUICK_LEVEL:
+        return _quickest(raw)
     return _libdeflate(raw, coding.level)
+
+
+def _quickest(raw: bytes) -> bytes:
+    """Do on all what is smallest on samples: a fast search for matches, runs of one byte, Huffman codes alone."""
+    ways: tuple[Callable[[bytes], bytes], ...] = (
+        lambda data: _libdeflate(data, 1),
+        lambda data: _zlib(data, 1, zlib.Z_RLE),
+        lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
+    )
+    step = max(_SAMPLE, len(raw) // 4)
+    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
+    return min(ways, key=lambda way: len(way(sample)))(raw)
 
 
 def _libdeflate(raw: bytes, level: int) -> bytes:
@@ -211,10 +225,3 @@ def _libdeflate(raw: bytes, level: int) -> bytes:
 def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
     coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
     return coder.compress(raw) + coder.flush()
-
-
-def _has_matches(raw: bytes) -> bool:
-    """Judge on samples whether a fast search for matches beats runs and Huffman codes alone."""
-    step = max(_SAMPLE, len(raw) // 4)
-    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
-    return len(_libdeflate(sample, 1)) < len(_zlib(sample, 1, zlib.Z_RLE))

@@ -8,14 +8,12 @@ from csplat import _spec
 from csplat_conformance.builder import build
 from csplat_conformance.samples import (
     MEANS,
-    OPACITIES,
     QUATS,
     SCALES,
     SH0,
     Recipe,
     attributes,
     book,
-    levels,
     morton,
     offset,
     scene,
@@ -175,7 +173,7 @@ def _many() -> Scene:
     """16,400 splats; every index and escape in long runs."""
     n, border = 16_400, 16_384
     how = Stream(1, _RUNS)
-    alphas = Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[9], [200]]}, {0: [[0], [50]]}))
+    colours = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[9, 8, 7], [-6, -5, 4]]}, {0: [[0, 0, 0], [50, -50, 5]]}))
     shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]},))
     bands = Codebook(3, _spec.CODEBOOK_KIND_SH, ({1: [[*range(9)], [*range(9, 0, -1)]]},), (1, 1))
     escaped = {0, border - 1, border, n - 1}
@@ -192,14 +190,14 @@ def _many() -> Scene:
     }
     later = tuple(i // 3000 % 2 for i in range(n))
     blocks |= {
-        OPACITIES: book(1, (indices(5000), later), levels([row[0] for row in rows(1)]), how),
         SCALES: replace(
             book(2, (indices(7000),), signed(rows(3)), how, summands=tuple(-(i // 4000) for i in range(n))), how=how
         ),
         QUATS: book(2, (), signed(rows(3))),
+        SH0: book(1, (indices(5000), later), signed(rows(3)), how),
         sh_attribute(1): book(3, (indices(6000),), signed(rows(9)), how),
     }
-    return scene(1, [replace(same, blocks=blocks)], codebooks=(alphas, shapes, bands))
+    return scene(1, [replace(same, blocks=blocks)], codebooks=(colours, shapes, bands))
 
 
 def _codes() -> Scene:

@@ -52,7 +52,7 @@ def _codebooks() -> list[Recipe]:
     junk = book(4, ((2, 0, 2), (1, 1, 0)), signed([[9, 8, 7], [6, 5, 4]]))
     low, high = {0: [[-(2**31), 2**31 - 1, 0]]}, {0: [[2**31 - 1, -(2**31), 0]]}
     far = Codebook(6, _spec.CODEBOOK_KIND_SCALES, (low, low, high, high), how=Stream(4))
-    alone = Codebook(3, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[-5]]}, {0: [[5], [260]]}))
+    alone = Codebook(3, _spec.CODEBOOK_KIND_QUATS, ({0: [[-200, 0, 0]]}, {0: [[201, 3, 4], [190, 5, 6]]}))
     shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(3, 2, 6, -9, 9)},))
     ignored = {
         SCALES: book(9, ((2, 0, 1),), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
@@ -65,11 +65,10 @@ def _codebooks() -> list[Recipe]:
     bands = {SH0 + 1: book(8, ((0, 2, 0), (0, 0, 0)), signed([[5, -6, 7] * 3]))}
     largest = _spec.COLUMN_MAX
     at_bounds = (
-        Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[9], [0], [255]]},)),
         Codebook(2, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3], [127, -127, 0], [0, 127, 127]]},)),
         Codebook(3, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [largest, 0, -largest]]},), how=Stream(4)),
     )
-    ids = {OPACITIES: 1, QUATS: 2, SH0: 3}
+    ids = {QUATS: 2, SH0: 3}
     shifted = Codebook(
         1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]},), how=Stream(4)
     )
@@ -127,7 +126,7 @@ def _codebooks() -> list[Recipe]:
         ),
         _recipe(
             "codebook_entries_at_bounds",
-            "levels, rotations and colours that no splat uses and that are just allowed",
+            "rotations and colours that no splat uses and that are just allowed",
             "CBK-7",
             replace(
                 _with({a: book(id, ((0, 0, 0),)) for a, id in ids.items()}, records={SH0: _lattice(2.0**105)}),
@@ -142,9 +141,9 @@ def _codebooks() -> list[Recipe]:
         ),
         _recipe(
             "codebook_negative_entries",
-            "levels that only the sum makes legal",
-            "CBK-6 LEV-1",
-            replace(_with({OPACITIES: book(3, ((0, 0, 0), (0, 1, 0)))}), codebooks=(alone,)),
+            "rotations that only the sum makes legal",
+            "CBK-6 QUA-1",
+            replace(_with({QUATS: book(3, ((0, 0, 0), (0, 1, 0)))}), codebooks=(alone,)),
         ),
     ]
 

@@ -161,9 +161,8 @@ def _codebooks() -> list[Recipe]:
     one = build(scene(tiles=[], codebooks=(scales(3),)))
     no_stage = {"codebook[3].stage_count": 0, "codebook[3].sizes": (0, 0, 0, 0), "CODB.3.0/head.stage_count": 0}
     one_stage = one.spans["CODB.3.0"][1] - _spec.CHUNK_HEADER_SIZE - _spec.CODEBOOK_HEAD_SIZE
-    many = Codebook(
-        3, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[7]] * (_spec.CODEBOOK_ENTRIES_MAX + 1)},), how=Stream(1, _RUNS)
-    )
+    too_many = [[7] * 3] * (_spec.CODEBOOK_ENTRIES_MAX + 1)
+    many = Codebook(3, _spec.CODEBOOK_KIND_SH0, ({0: too_many},), how=Stream(1, _RUNS))
     shared = scene(tiles=[], codebooks=(scales(2), scales(3)), chunks=(_META,), order=("META", "CODB.2.0"))
     no_bands = scene(2, [], codebooks=(sh((2, 1), 1),), chunks=(_META,), order=("META",))
     bands = "codebook[3].band_first"

@@ -201,17 +201,12 @@ def _coded() -> list[Recipe]:
         why = f"an escape block of {name} that says CODEBOOK and holds another coding"
         return patched(f"escape_of_{name}_by_codebook", why, "CBK-5", "E_STREAM", base, coding)
 
-    alphas = Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[0], [1]]}, {0: [[1]]}))
     turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3]]},))
     shades = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3]]},))
     elsewhere = (
-        (OPACITIES, alphas, book(1, ((0, 2), (0, 0)), signed([[3]]))),
         (QUATS, turns, book(1, ((0, 1),), offset([[4, 5, 6]]))),
         (SH0, shades, book(1, ((0, 1),), Block(_spec.CODING_LEVELS, [[4, 5, 6]]))),
     )
-    two = scene(tiles=[tile(changes={OPACITIES: book(1, ((0, 1), (0, 0)))})], codebooks=(alphas,))
-    two = replace(two, attributes=two.attributes | {OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=1)})
-    alpha = tile(changes={OPACITIES: book(1, ((0, 2), (0, 0)), levels([3]))})
     turn = tile(changes={QUATS: book(1, ((0, 1),), signed([[4, 5, 6]]))})
     both = Codebook(4, _spec.CODEBOOK_KIND_SH, ({b: rows_of(b, 2, 6 * b + 3, -9, 9) for b in (1, 2)},), (1, 2))
     first = book(4, ((0, 2),), signed(rows_of(7, 1, 9, -9, 9)))
@@ -237,7 +232,14 @@ def _coded() -> list[Recipe]:
         ),
         shape("summand_low", "a sum of −2^22 − 1", "LAT-4", -_COLUMN, -1, "attribute"),
         escaped("band_1", rich(), "TILE.0.1/sh1"),
-        escaped("opacities", build(scene(tiles=[alpha], codebooks=(alphas,))), "TILE.0.0/opacities"),
+        whole(
+            "coding_codebook_of_opacities",
+            "opacities by a codebook, which no kind is for",
+            "BLK-1",
+            "E_VALUE",
+            scene(tiles=[tile(changes={OPACITIES: book(1, ((0, 0),))})], codebooks=(shades,)),
+            "TILE.0.0/opacities.coding",
+        ),
         escaped("quats", build(scene(tiles=[turn], codebooks=(turns,))), "TILE.0.0/quats"),
         *(
             whole(
@@ -265,9 +267,6 @@ def _coded() -> list[Recipe]:
             "E_CODEBOOK",
             fewer,
             "TILE.0.2/sh2.params.codebook_id",
-        ),
-        whole(
-            "codebook_level_of_two", "a sum of 2 where M is 1", "LEV-1", "E_RANGE", two, "TILE.0.0/opacities.attribute"
         ),
         whole(
             "codebook_of_other_band",

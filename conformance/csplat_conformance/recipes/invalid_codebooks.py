@@ -7,7 +7,6 @@ from dataclasses import replace
 from csplat import _spec
 from csplat_conformance.broken import patched, rich, whole
 from csplat_conformance.samples import (
-    OPACITIES,
     QUATS,
     SCALES,
     SH0,
@@ -50,14 +49,9 @@ def _codebooks() -> list[Recipe]:
     without = {a: b for a, b in first.blocks.items() if a != sh_attribute(1)}
     lone = replace(made, tiles=(replace(first, blocks=without), made.tiles[1]))
     two = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)}, {0: rows_of(5, 2, 3, -60, 60)}))
-    level_book = Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[3], [300]]}, {0: [[0], [-4]]}))
     quat_book = Codebook(
         1, _spec.CODEBOOK_KIND_QUATS, ({0: [[0, 0, 0], [127, 127, 1], [127, 0, 0]]}, {0: [[0, 0, 0], [1, 0, 0]]})
     )
-
-    def opacities(name: str, why: str, clauses: str, indices: tuple[tuple[int, ...], ...]) -> Recipe:
-        made = scene(tiles=[tile(changes={OPACITIES: book(1, indices)})], codebooks=(level_book,))
-        return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/opacities.attribute")
 
     def quats(name: str, why: str, clauses: str, indices: tuple[tuple[int, ...], ...]) -> Recipe:
         made = scene(tiles=[tile(changes={QUATS: book(1, indices)})], codebooks=(quat_book,))
@@ -212,8 +206,6 @@ def _codebooks() -> list[Recipe]:
             scene(codebooks=(replace(one, how=Stream(1, coder="deflate", coded=b"\xff\xff")),)),
             "CODB.1.0/stage[0].coded",
         ),
-        opacities("codebook_level_negative", "a sum below 0", "LEV-1 CBK-6", ((0, 0), (0, 1))),
-        opacities("codebook_level_large", "a sum above M", "LEV-1 CBK-6", ((0, 1), (0, 0))),
         quats("codebook_quat_radicand", "a sum whose R is below 0", "QUA-2 CBK-6", ((0, 1), (0, 0))),
         quats("codebook_quat_component", "a sum beyond M", "QUA-1 CBK-6", ((0, 2), (0, 1))),
         whole(
@@ -232,8 +224,6 @@ def _unused_entries() -> list[Recipe]:
     far = 2.0**107  # 2^21 steps of it are beyond binary32
     four = Stream(4)
     kinds = {
-        "opacity": ("a level above M", "LEV-1", _spec.CODEBOOK_KIND_OPACITIES, OPACITIES, [[3], [300]]),
-        "opacity_negative": ("a level below 0", "LEV-1", _spec.CODEBOOK_KIND_OPACITIES, OPACITIES, [[3], [-1]]),
         "scale": ("scales", "LAT-5", _spec.CODEBOOK_KIND_SCALES, SCALES, [[-3, 2, 1], [0, 0, -(2**21)]]),
         "quat": ("a component beyond M", "QUA-1", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [0, -128, 0]]),
         "quat_radicand": ("R below 0", "QUA-2", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [127, 1, 127]]),

@@ -137,7 +137,6 @@ def _tile_of_widths(k: int, ways: Iterator[Stream]) -> Tile:
 
 def _all_codebooks() -> Scene:
     books = (
-        Codebook(1, _spec.CODEBOOK_KIND_OPACITIES, ({0: [[5], [90]]}, {0: [[0], [7], [100]]}), how=Stream(1, (1,))),
         Codebook(2, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(2, 3, 3, -90, 0)},), how=Stream(2, (2, 3))),
         Codebook(3, _spec.CODEBOOK_KIND_QUATS, ({0: rows_of(3, 2, 3, -40, 40)}, {0: rows_of(4, 2, 3, -9, 9)})),
         Codebook(4, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(5, 2, 6, -40, 40)}, {0: rows_of(6, 3, 6, -9, 9)})),
@@ -162,10 +161,9 @@ def _all_codebooks() -> Scene:
 
 
 def _apart() -> Tile:
-    """Return a tile whose scales and quats have codebooks of their own; each attribute has an escape."""
+    """Return a tile whose scales and quats have codebooks of their own; each has an escape."""
     i, wide = (0, 1, 1, 0), Stream(2)
     changes = {
-        OPACITIES: book(1, ((0, 1, 2, 0), (2, 1, 0, 0)), levels([255])),
         SCALES: book(2, ((2, 3, 0, 3),), signed(rows_of(1, 2, 3, -300, 300), wide), Stream(4, (1, 3))),
         QUATS: book(3, ((2, 1, 0, 1), i), signed(rows_of(2, 1, 3, -60, 60))),
         SH0: book(5, ((3, 2, 1, 0),), offset(rows_of(3, 1, 3, -9, 9)), Stream(3)),
@@ -177,7 +175,7 @@ def _apart() -> Tile:
 
 
 def _together() -> Tile:
-    """Return a tile whose scales and quats share one codebook; opacities and band 2 are coded plainly."""
+    """Return a tile whose scales and quats share one codebook; bands 2 and 3 are coded plainly."""
     i, stages = (0, 1, 1, 0), ((1, 2, 0, 0), (2, 0, 1, 1))
     changes = {
         SCALES: book(4, stages, offset(rows_of(7, 1, 3, -20, 20)), summands=(-40, 0, -60, -20), offsets=(-60,)),

@@ -8,7 +8,6 @@ from itertools import combinations
 from csplat import _spec
 from csplat_conformance.builder import build
 from csplat_conformance.samples import (
-    OPACITIES,
     QUATS,
     SCALES,
     SH0,
@@ -16,7 +15,6 @@ from csplat_conformance.samples import (
     book,
     coded,
     integers,
-    levels,
     offset,
     rows_of,
     scene,
@@ -34,10 +32,9 @@ _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_RUN_LENGTH,
 )
 _KINDS = {
-    "opacities": (_spec.CODEBOOK_KIND_OPACITIES, OPACITIES, 1),
-    "scales": (_spec.CODEBOOK_KIND_SCALES, SCALES, 3),
-    "quats": (_spec.CODEBOOK_KIND_QUATS, QUATS, 3),
-    "sh0": (_spec.CODEBOOK_KIND_SH0, SH0, 3),
+    "scales": (_spec.CODEBOOK_KIND_SCALES, SCALES),
+    "quats": (_spec.CODEBOOK_KIND_QUATS, QUATS),
+    "sh0": (_spec.CODEBOOK_KIND_SH0, SH0),
 }
 
 
@@ -67,17 +64,15 @@ def _streams() -> list[Recipe]:
 
 def _codebooks() -> list[Recipe]:
     result = []
-    for name, (kind, attribute, columns) in _KINDS.items():
-        low = 0 if attribute == OPACITIES else -60
-        made = Codebook(1, kind, ({0: rows_of(4, 3, columns, low, 60)},))
+    for name, (kind, attribute) in _KINDS.items():
+        made = Codebook(1, kind, ({0: rows_of(4, 3, 3, -60, 60)},))
         one = tile(3, 4, 0, {attribute: book(1, ((2, 0, 1, 0),))})
         result.append(
             _recipe(
                 f"codebook_{name}", "one stage, no escapes", "CBK-1 CBK-2 CBK-6", scene(tiles=[one], codebooks=(made,))
             )
         )
-        one_escape = levels([200]) if attribute == OPACITIES else signed(rows_of(2, 1, columns, -70, 70))
-        escaped = tile(3, 4, 0, {attribute: book(1, ((2, 0, 3, 0),), one_escape)})
+        escaped = tile(3, 4, 0, {attribute: book(1, ((2, 0, 3, 0),), signed(rows_of(2, 1, 3, -70, 70)))})
         result.append(
             _recipe(
                 f"codebook_{name}_escape",

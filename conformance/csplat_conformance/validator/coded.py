@@ -23,11 +23,7 @@ from csplat_conformance.validator.values import I64, check_integers
 __all__ = ["read_coded"]
 
 _WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
-_ESCAPES = {
-    _spec.ATTRIBUTE_OPACITIES: (_spec.CODING_LEVELS,),
-    _spec.ATTRIBUTE_QUATS: (_spec.CODING_SIGNED,),
-}
-_LATTICE_ESCAPES = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
+_ESCAPES = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 
 Params = Placed[_spec.CodebookParams]
 
@@ -153,7 +149,7 @@ def _read_escapes(reader: TileReader, payload: Payload, name: str, attribute: in
         message = f"{head.record.attribute}, wanted that of its block, {attribute}"
         reader.findings.of("CBK-5", head, "attribute", message)
     coding = head.record.coding
-    legal = _ESCAPES.get(attribute, _LATTICE_ESCAPES)
+    legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPES
     if coding not in _spec.CODING_NAMES:
         message = f"{coding} is no coding that this version uses"
         reader.findings.of("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
