@@ -121,7 +121,8 @@ export function readLatticeParams(payload, attribute, mustBeZero) {
 function checkStep({ step }, exponent, offset) {
   if (step === 0) return;
   const s = ldexp(step, exponent);
-  if (!(s >= SINGLE_MIN && s < 2 ** 128)) throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
+  if (!(s >= SINGLE_MIN && s < 2 ** 128))
+    throw fault(ERROR_VALUE, offset, 'LAT-1', `a lattice with the exponent ${exponent}`);
 }
 
 /**
@@ -308,7 +309,8 @@ async function readSparse(tile, payload, attribute, n) {
   if (n & 7 && mask[n >> 3] >> (n & 7)) throw fault(ERROR_RANGE, offset, 'SPA-3', `a mask of more than ${n} splats`);
   const present = new Uint32Array(count);
   let found = 0;
-  for (let i = 0; i < n; i++) if ((mask[i >> 3] >> (i & 7)) & 1) present[found++] = i; // beyond its end nothing is written
+  // Beyond its end nothing is written.
+  for (let i = 0; i < n; i++) if ((mask[i >> 3] >> (i & 7)) & 1) present[found++] = i;
   if (found !== count) throw fault(ERROR_RANGE, offset, 'SPA-2', `a mask that names ${found} splats, not ${count}`);
   return { ...(await readSigned(tile, payload, attribute, count, exponent)), present };
 }

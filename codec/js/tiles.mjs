@@ -15,7 +15,10 @@ const AXES = [0, 1, 2];
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
  * @typedef {import('./payload.mjs').Payload} Payload
- * @typedef {Pick<ReturnType<typeof spec.unpackIndexHead>, 'tile_size' | 'layer_size'>} RecordSizes as the index head states them
+ *
+ * As the index head states them.
+ *
+ * @typedef {Pick<ReturnType<typeof spec.unpackIndexHead>, 'tile_size' | 'layer_size'>} RecordSizes
  */
 
 /**

@@ -10,7 +10,7 @@ from csplat import _spec
 from csplat.decoder.container import check_index_crc, check_reserved, read_file_header, view_of
 from csplat.decoder.header import SceneHeader
 from csplat.decoder.index_chunks import check_codebook_chunks, read_codebook_records, read_directory, read_extras
-from csplat.decoder.index_tiles import check_coverage, read_tiles
+from csplat.decoder.index_tiles import SINGLE_MAX, SINGLE_MIN, STEP_MIN, check_coverage, read_tiles
 from csplat.errors import FormatError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ _RECORD_SIZES: Final = {
     "tile_size": _spec.TILE_RECORD_SIZE,
     "layer_size": _spec.LAYER_RECORD_SIZE,
 }
-_STEP_MIN = 2.0**-1022
-_SINGLE_MIN, _SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104
 
 
 def read_header(data: Buffer) -> SceneHeader:
@@ -208,7 +206,7 @@ def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -
             raise FormatError(
                 _spec.ERROR_RESERVED, at + places["levels"], "ATT-5", "levels", found=record.levels, wanted=0
             )
-        if not _STEP_MIN <= record.step < math.inf:
+        if not STEP_MIN <= record.step < math.inf:
             raise FormatError(
                 _spec.ERROR_VALUE, at + places["step"], "ATT-6", "step", found=record.step, wanted="2^-1022 or more"
             )
@@ -226,7 +224,7 @@ def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -
 
 def _is_single(step: float) -> bool:
     """Whether a step > 0 is a normal binary32 value."""
-    if not _SINGLE_MIN <= step <= _SINGLE_MAX:
+    if not SINGLE_MIN <= step <= SINGLE_MAX:
         return False
     (nearest,) = struct.unpack("<f", struct.pack("<f", step))
     return bool(nearest == step)

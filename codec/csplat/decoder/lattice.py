@@ -8,7 +8,7 @@ from csplat import _spec
 from csplat.decoder.blocks import Columns
 from csplat.decoder.container import Cursor, check_reserved
 from csplat.decoder.header import SceneHeader
-from csplat.decoder.index_tiles import scaled_step
+from csplat.decoder.index_tiles import SINGLE_MAX, SINGLE_MIN, scaled_step
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError, UnsupportedError
 
@@ -21,8 +21,6 @@ __all__ = [
     "read_offsets",
     "read_signed",
 ]
-
-_STEP_MIN, _STEP_MAX = 2.0**-126, 2.0**128 - 2.0**104
 
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
@@ -101,8 +99,8 @@ def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool)
 
 def check_step(record: _spec.AttributeRecord, exponent: int, at: int) -> None:
     """LAT-1: step × 2^exponent is normal and finite in binary32; levels have no step."""
-    scaled = scaled_step(record.step, exponent, _STEP_MIN)
-    if record.step and (scaled is None or scaled > _STEP_MAX):
+    scaled = scaled_step(record.step, exponent, SINGLE_MIN)
+    if record.step and (scaled is None or scaled > SINGLE_MAX):
         raise FormatError(
             _spec.ERROR_VALUE,
             at,
