@@ -83,7 +83,7 @@ export function putRows(out, stride, start, first, columns, rows, n, s) {
  * @param {number} start place of the first value among them
  * @param {number} first splat
  * @param {Float32Array} values rows of the table
- * @param {number} width values of a row
+ * @param {number} width values of a row, a multiple of 3: of colours
  * @param {Uint32Array} index
  */
 export function copyRows(out, stride, start, first, values, width, index) {
@@ -93,7 +93,11 @@ export function copyRows(out, stride, start, first, values, width, index) {
   let at = first * stride + start;
   for (let i = 0; i < index.length; i++, at += stride) {
     const from = index[i] * width;
-    for (let j = 0; j < width; j++) to[at + j] = table[from + j];
+    for (let j = 0; j < width; j += 3) {
+      to[at + j] = table[from + j];
+      to[at + j + 1] = table[from + j + 1];
+      to[at + j + 2] = table[from + j + 2];
+    }
   }
 }
 
