@@ -22,7 +22,7 @@ from csplat_conformance.manifest import Vector
 from csplat_conformance.near import too_far
 from csplat_conformance.report import Outcome, Status
 
-__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name"]
+__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name", "whole_number"]
 
 #: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
@@ -159,6 +159,12 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
 def _gravity(status: Status) -> int:
     """Of several things that are wrong with the arrays of one vector the first of these gives the name."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
+
+
+def whole_number(text: str) -> float:
+    """Read a JSON number without fraction or exponent: beyond 2^53 as JavaScript has it, which writes 2^65 so."""
+    value = int(text)
+    return value if abs(value) <= 2**53 else float(value)
 
 
 def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[Status, str]:

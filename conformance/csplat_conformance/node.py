@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from csplat.errors import InputError
-from csplat_conformance.answers import Answer
+from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.report import Status
 
 __all__ = ["JsDecoder", "js_folder", "missing_javascript"]
@@ -113,7 +113,7 @@ class JsDecoder:
         if not line.endswith(b"\n"):
             self._end(process)
             return Answer(Status.CRASHED, f"the process ended with status {process.returncode}")
-        return _answer(json.loads(line), time.monotonic() - began)
+        return _answer(json.loads(line, parse_int=whole_number), time.monotonic() - began)
 
     def resident_bytes(self) -> int:
         """Return what the process holds in memory now; 0 where nobody can tell."""

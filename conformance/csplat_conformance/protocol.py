@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from csplat_conformance.answers import Answer
+from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Status
 
@@ -76,7 +76,7 @@ def _decoded(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool
         part, _, rest = name.partition(".")
         if name == "header.json":
             try:
-                header = json.loads(path.read_bytes())
+                header = json.loads(path.read_bytes(), parse_int=whole_number)
             except (ValueError, RecursionError, OSError):
                 header = {}
             if not isinstance(header, dict) or not header:

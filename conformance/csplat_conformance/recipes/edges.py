@@ -74,6 +74,12 @@ def edge_recipes() -> list[Recipe]:
             _codes(),
         ),
         _recipe(
+            "unit_of_2_65",
+            "a unit and an origin that some languages write as whole numbers of twenty digits",
+            "IDX-5 IDX-6",
+            scene(unit_metres=2.0**65, origin=(2.0**53 + 2.0, -(2.0**60), 0.0)),
+        ),
+        _recipe(
             "extra_names_with_mark",
             "a name that begins with U+FEFF, and the same without it: two names",
             "EXR-2",
