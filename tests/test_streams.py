@@ -88,7 +88,8 @@ CUT = np.where(np.repeat(RNG.random(20_000) < 0.6, 3), np.int8(0), NOISE)
 
 
 def test_short_runs_are_written_as_runs_where_that_is_smaller():
-    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(CUT, Coding(12)))[0].transforms
+    pairs = np.repeat(RNG.integers(-100, 100, 30_000).astype(np.int8), RNG.integers(1, 4, 30_000))
+    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, Coding(12)))[0].transforms
     assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, Coding(12)))[0].transforms
 
 

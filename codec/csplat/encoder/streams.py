@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ _QUICK_LEVEL = 1  # of DEFLATE: samples decide, and nothing is tried twice
 _SHORT_RUN = 1.5  # bytes, of the mean run, from which RUN_LENGTH may save more than it costs decoders
 _LONG_RUN = 32  # bytes, from which it is tried at that level
 _SAMPLE = 4096  # bytes of each of four samples
+_TRIAL_LEVEL = 6  # of DEFLATE: a tenth of the time of the highest, and seldom of another opinion
+_GAIN = 0.98  # of the bytes, from which runs are worth the time that they cost decoders
 
 
 @dataclass(frozen=True)
@@ -139,10 +141,11 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
         steps.append(_spec.TRANSFORM_BYTE_PLANES)
     planes = _byte_planes(values, width)
     runs = _run_length(planes, _LONG_RUN if coding.level <= _QUICK_LEVEL else _SHORT_RUN)
-    tried = [(data, *_code(data, coding)) for data in (planes, runs) if data is not None]
-    packed, coder, coded = min(tried, key=lambda one: len(one[2]))
-    if packed is runs:
+    packed = planes
+    if runs is not None and _is_smaller(runs, planes, coding):
+        packed = runs
         steps.append(_spec.TRANSFORM_RUN_LENGTH)
+    coder, coded = _code(packed, coding)
     head = _spec.StreamHead(
         width=width,
         coder=coder,
@@ -153,6 +156,12 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
         coded_size=len(coded),
     )
     return _spec.pack_stream_head(head) + coded
+
+
+def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], coding: Coding) -> bool:
+    """Whether runs take fewer bytes than what they stand for, by a quick trial: both in earnest take too long."""
+    trial = replace(coding, level=min(coding.level, _TRIAL_LEVEL))
+    return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
 
 def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
@@ -201,16 +210,13 @@ def _deflate(raw: bytes, coding: Coding) -> bytes:
         return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
     if coding.level <= _QUICK_LEVEL:
         return _quickest(raw)
-    return _libdeflate(raw, coding.level)
+    # Where nothing but runs repeats, matches that libdeflate finds by chance cost more than they save.
+    return min(_libdeflate(raw, coding.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
 
 
 def _quickest(raw: bytes) -> bytes:
     """Do on all what is smallest on samples: a fast search for matches, runs of one byte, Huffman codes alone."""
-    ways: tuple[Callable[[bytes], bytes], ...] = (
-        lambda data: _libdeflate(data, 1),
-        lambda data: _zlib(data, 1, zlib.Z_RLE),
-        lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
-    )
+    ways: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
     step = max(_SAMPLE, len(raw) // 4)
     sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
     return min(ways, key=lambda way: len(way(sample)))(raw)
@@ -225,3 +231,10 @@ def _libdeflate(raw: bytes, level: int) -> bytes:
 def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
     coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
     return coder.compress(raw) + coder.flush()
+
+
+#: Runs of one byte, and Huffman codes alone.
+_WITHOUT_MATCHES: tuple[Callable[[bytes], bytes], ...] = (
+    lambda data: _zlib(data, 1, zlib.Z_RLE),
+    lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
+)
