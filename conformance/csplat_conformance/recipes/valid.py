@@ -312,7 +312,7 @@ def _files() -> list[Recipe]:
         ),
         _recipe(
             "unknown_chunks",
-            "private and unknown chunks, twice the same, one empty, with ids and layers that mean nothing here: skipped",
+            "private and unknown chunks, twice the same, one empty, with any id and layer: skipped",
             "DIR-1 DIR-3 CHK-2",
             scene(
                 chunks=(
