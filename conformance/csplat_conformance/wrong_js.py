@@ -53,8 +53,8 @@ EDITS: Final = (
         "step × 2^exponent may be anything",
         "LAT-1",
         "codings.mjs",
-        "if (!(s >= SINGLE_MIN && s < 2 ** 128)) throw",
-        "if (false) throw",
+        "if (!(s >= SINGLE_MIN && s < 2 ** 128))",
+        "if (false)",
     ),
     Edit(
         "columns of chroma",
