@@ -92,7 +92,7 @@ def test_every_error_code_of_files_has_a_vector():
 
 
 def test_vectors_stay_well_below_five_megabytes():
-    assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 1_400_000
+    assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 1_600_000
 
 
 def test_repair_leaves_a_valid_file_as_it_is():
@@ -151,7 +151,7 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
 
 def test_an_accepted_broken_file_fails_the_run(monkeypatch):
     vector = named("valid/quats")
-    error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": False}
+    error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": ""}
     monkeypatch.setattr(runner, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
 
     (failure,) = runner.run_builtin().failures

@@ -25,7 +25,6 @@ UNBREAKABLE = {
     "AXI-1": "the width that STR-2 allows ensures it",
     "CBK-6": "its refusals name QUA-1, QUA-2 or LAT-4",
     "CBK-7": "its refusals name QUA-1, QUA-2 or LAT-5",
-    "LIM-1": "depends on the decoder's budgets; STR-8 is the one that a small file exceeds",
 }
 
 

@@ -12,17 +12,18 @@ L4, pictures, is `views`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat_conformance.manifest import Vector
 from csplat_conformance.near import too_far
 from csplat_conformance.report import Outcome, Status
 
-__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name", "whole_number"]
+__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name", "settle", "whole_number"]
 
 #: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
@@ -108,16 +109,18 @@ def judge(
 def _judge_refusal(vector: Vector, answer: Answer, exact: bool) -> Outcome:
     wanted = vector.error
     status, message = answer.status, answer.message
+    details = {}
+    if wanted["optional"] and wanted["code"] != _spec.ERROR_LIMIT and status in (Status.PASSED, Status.REFUSED):
+        details = {"payload": wanted["optional"], "accepted": status is Status.PASSED}  # budgets: others may have more
     if status is Status.PASSED:
         optional = wanted["optional"] and not exact
-        status = Status.PASSED if optional else Status.FAILED
-        message = "accepted, as a decoder does that leaves the payload unread (CHK-6)" if optional else "accepted"
+        status, message = (Status.PASSED, "") if optional else (Status.FAILED, "accepted")
     elif status is Status.REFUSED:
         status, message = _compare_refusal(answer, wanted, exact)
     clauses = tuple(vector.clauses)
     if status not in (Status.PASSED, Status.SKIPPED):
         clauses = (wanted["clause"], *(clause for clause in clauses if clause != wanted["clause"]))
-    return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds)
+    return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds, details)
 
 
 def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
@@ -133,6 +136,34 @@ def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> 
 def _words(code: str, clause: str | None, offset: int | None) -> str:
     where = "" if offset is None else f" at byte {offset}"
     return f"{code}{where}" + (f" by {clause}" if clause else "")
+
+
+def settle(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
+    """Hold a decoder to CHK-7: of each type of chunk it reads every payload by all clauses, or none (CHK-6).
+
+    Args:
+        outcomes: what `judge` returned for all vectors.
+
+    Returns:
+        The same, but that a broken payload which was accepted is a failure where others of its type were refused; and
+        for each type of which some were accepted a line.
+    """
+    result, notes = list(outcomes), []
+    for kind in sorted({one.details["payload"] for one in result if "payload" in one.details}):
+        places = [i for i, one in enumerate(result) if one.details.get("payload") == kind]
+        accepted = [i for i in places if result[i].details["accepted"]]
+        if len(accepted) == len(places):
+            notes.append(f"leaves {kind} unread (CHK-6)")
+        elif accepted:
+            names = ", ".join(result[i].name for i in accepted)
+            counts = f"{len(places) - len(accepted)} refused, {len(accepted)} accepted"
+            notes.append(
+                f"reads {kind}: {counts}: each accepted one is a mistake if your decoder reads {kind} (CHK-7): {names}"
+            )
+            message = f"accepted, and others of {kind} refused (CHK-7)"
+            for i in accepted:
+                result[i] = replace(result[i], status=Status.FAILED, message=message)
+    return result, notes
 
 
 # Arrays --------------------------------------------------------------------------------------------

@@ -56,7 +56,8 @@ def patched(
     """
     place = base.fields[at or next(iter(changes))].offset + within
     ids = tuple(clauses.split())
-    optional = all(map(_may_be_unread, changes))
+    payloads = {_unread(field) for field in changes}
+    optional = payloads.pop() if len(payloads) == 1 else ""
     return Recipe(f"invalid/{name}", why, ids, lambda: base.patched(changes), None, code, place, also, optional)
 
 
@@ -65,13 +66,13 @@ def whole(name: str, why: str, clauses: str, code: str, made: Scene, at: str, wi
     built = build(made)
     place = built.fields[at].offset + within
     ids = tuple(clauses.split())
-    return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=_may_be_unread(at))
+    return Recipe(f"invalid/{name}", why, ids, lambda: built.data, None, code, place, optional=_unread(at))
 
 
-def _may_be_unread(field: str) -> bool:
-    """Whether a field lies in the payload of an ancillary chunk: neither in its frame nor in its CRC."""
+def _unread(field: str) -> str:
+    """Return the ancillary chunk in whose payload a field lies, neither in its frame nor in its CRC; or nothing."""
     chunk, _, part = field.partition("/")
-    return chunk.encode() in _ANCILLARY and part != "crc" and not part.startswith("header.")
+    return chunk if chunk.encode() in _ANCILLARY and part != "crc" and not part.startswith("header.") else ""
 
 
 def cut(
@@ -108,7 +109,7 @@ def cut(
         return repair(base.patched((changes or {}) | sizes, repaired=False)[:-size])
 
     place = base.fields[at].offset + within
-    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, place, optional=_may_be_unread(at))
+    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, place, optional=_unread(at))
 
 
 def swapped(base: Built, one: str, other: str) -> dict[str, Any]:

@@ -34,7 +34,8 @@ class Vector:
         clauses: ids that the vector covers.
         since: version of the format.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
-        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (may be accepted: CHK-6).
+        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (type
+            of the chunk whose payload CHK-6 lets a decoder leave unread and so accept the file, or nothing).
         views: renderings: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (dB at least).
     """
 

@@ -31,7 +31,6 @@ class Mistake:
         clause: of the spec, that it breaks.
         apply: makes the decoder wrong until the stack is closed.
         by: class of decoders (spec 9.2) that it is judged as.
-        exact: it is judged as csplat's own, which read every payload (CHK-7).
     """
 
     name: str
@@ -39,7 +38,6 @@ class Mistake:
     clause: str
     apply: Callable[[ExitStack], None]
     by: str = EXACT
-    exact: bool = False
 
 
 @dataclass(frozen=True)

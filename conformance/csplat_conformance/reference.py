@@ -60,7 +60,7 @@ def _header(scene: Scene) -> dict[str, Any]:
         "sh_degree": scene.sh_degree,
         "scene_flags": [name for bit, name in _spec.SCENE_FLAG_NAMES.items() if scene.scene_flags & bit],
         "axes": "".join(_spec.DIRECTION_LETTER[axis] for axis in scene.axes),
-        "unit_metres": scene.unit_metres,
+        "unit_metres": scene.unit_metres or 0.0,  # 0 of either sign is 0
         "origin": list(scene.origin),
     }
 

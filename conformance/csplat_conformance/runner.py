@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from csplat.errors import InputError
 from csplat_conformance import adapter, views
-from csplat_conformance.answers import LEVELS, PARTS, FloatsOf, judge
+from csplat_conformance.answers import LEVELS, PARTS, FloatsOf, judge, settle
 from csplat_conformance.choosing import matching
 from csplat_conformance.manifest import VECTORS, Vector, load
 from csplat_conformance.near import CLASSES, EXACT, RENDERER
@@ -172,6 +172,7 @@ def _chosen(choice: Choice) -> list[Vector]:
 
 
 def _report(subject: str, results: Sequence[list[Outcome]], choice: Choice) -> Report:
-    outcomes = [outcome for result in results for outcome in result]
-    notes = () if choice.by == EXACT else (f"judged as a decoder of the class {choice.by}",)
+    outcomes, notes = settle(outcome for result in results for outcome in result)
+    if choice.by != EXACT:
+        notes.append(f"judged as a decoder of the class {choice.by}")
     return Report("decoder", subject, outcomes, notes)

@@ -88,7 +88,8 @@ class Recipe:
         code: error code where it must be refused.
         offset: the defect's byte, if a single one is to blame.
         also: further codes that a decoder may report.
-        optional: decoders that leave the chunk's payload unread (CHK-6) accept the file.
+        optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
+            accept the file. Empty where every decoder refuses it.
         views: how it has to look, for scenes that are rendered.
     """
 
@@ -100,7 +101,7 @@ class Recipe:
     code: str = ""
     offset: int | None = None
     also: tuple[str, ...] = ()
-    optional: bool = False
+    optional: str = ""
     views: tuple[View, ...] = ()
 
 

@@ -18,7 +18,7 @@ from contextlib import ExitStack
 
 from csplat.errors import InputError
 from csplat_conformance.adapter import answer
-from csplat_conformance.answers import PARTS, Answer, judge
+from csplat_conformance.answers import PARTS, Answer, judge, settle
 from csplat_conformance.manifest import Vector, load
 from csplat_conformance.mistakes import Caught, Mistake
 from csplat_conformance.near import RENDERER
@@ -38,14 +38,13 @@ _SHOWN_CLAUSES = 4
 
 def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
     """Run a wrong Python decoder over the vectors."""
-    failed = []
+    outcomes = []
     with ExitStack() as stack:
         mistake.apply(stack)
         for vector in load() if vectors is None else vectors:
             near = exact_floats if mistake.by == RENDERER else None
-            outcomes = judge(vector, _asked(vector.data), tuple(PARTS), exact=mistake.exact, near=near)
-            failed += [one for one in outcomes if not one.good]
-    return Caught("Python", mistake, failed)
+            outcomes += judge(vector, _asked(vector.data), tuple(PARTS), near=near)
+    return Caught("Python", mistake, [one for one in settle(outcomes)[0] if not one.good])
 
 
 def _asked(data: bytes) -> Answer:

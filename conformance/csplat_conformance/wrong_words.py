@@ -33,6 +33,13 @@ def _unread(stack: ExitStack) -> None:
 
 _COUNT = {"not 1 <= params.present_count <= count": "False"}
 _BITS = {"len(present) != params.present_count": "False"}
+_OF_THE_KIND = """context.first.get(params.codebook_id) or next(
+        (one for one in context.first.values() if one.book.record.kind == book.record.kind), None
+    )"""
+_UNESCAPED = "int(index[stages[0] != book.sizes[0]].max(initial=0) if stages else index.max())"
+_CHECKED = """block = Columns(elements.reshape(1, count), offsets, 0, at)
+    check_integers(block.lows, block.highs, context.header.attribute(attribute), at)
+    return block"""
 _NFC = "__import__('unicodedata').normalize('NFC', {})"
 
 MISTAKES: Final = (
@@ -81,5 +88,23 @@ MISTAKES: Final = (
             "read_extras", {"name in columns": f"{_NFC.format('name')} in [{_NFC.format('one')} for one in columns]"}
         ),
     ),
-    Mistake("JSON", "as the library reads it", "JSN-1", replaced("parse_json", _library_json), exact=True),
+    Mistake(
+        "codebooks of a kind",
+        "a later block takes the indices of another, where its own has none",
+        "CBK-4",
+        reworded("_indices", {"context.first.get(params.codebook_id)": _OF_THE_KIND}),
+    ),
+    Mistake(
+        "indices of escaped splats",
+        "later stages are looked at where they are used",
+        "CBK-2",
+        reworded("_read_indices", {"int(index.max())": _UNESCAPED}),
+    ),
+    Mistake(
+        "summands",
+        "LAT-4 holds for them, too",
+        "LAT-4",
+        reworded("_read_summand", {"return Columns(elements.reshape(1, count), offsets, 0, at)": _CHECKED}),
+    ),
+    Mistake("JSON", "as the library reads it", "JSN-1", replaced("parse_json", _library_json)),
 )

@@ -24,7 +24,7 @@ _WORDS = 100  # characters of an answer that are shown
 @cache
 def vectors() -> Sequence[tuple[Vector, bytes]]:
     """Return the vectors with their files. These decoders read every chunk: what another one may accept they refuse."""
-    wanted = [replace(one, error=one.error | {"optional": False}) if one.error else one for one in load()]
+    wanted = [replace(one, error=one.error | {"optional": ""}) if one.error else one for one in load()]
     return [(vector, vector.data) for vector in wanted]
 
 

@@ -15,6 +15,7 @@ from csplat_conformance.recipes.extreme_streams import extreme_stream_recipes
 from csplat_conformance.recipes.growth import invalid_growth_recipes, valid_growth_recipes
 from csplat_conformance.recipes.invalid_alone import alone_recipes
 from csplat_conformance.recipes.invalid_alone_blocks import alone_block_recipes
+from csplat_conformance.recipes.invalid_alone_books import alone_book_recipes
 from csplat_conformance.recipes.invalid_alone_streams import alone_stream_recipes
 from csplat_conformance.recipes.invalid_alone_tiles import alone_tile_recipes
 from csplat_conformance.recipes.invalid_blocks import block_recipes
@@ -66,6 +67,7 @@ def all_recipes() -> list[Recipe]:
         alone_tile_recipes,
         alone_stream_recipes,
         alone_block_recipes,
+        alone_book_recipes,
         invalid_growth_recipes,
         bad_text_recipes,
     )

@@ -62,6 +62,12 @@ def edge_recipes() -> list[Recipe]:
             _bounds(),
         ),
         _recipe(
+            "summands_beyond",
+            "summands of up to 2^32 + 2^22 whose sums with negative entries stay within 2^22",
+            "LAT-4 LAT-3 CBK-6",
+            _summands(),
+        ),
+        _recipe(
             "codebooks_of_many_splats",
             "more splats than a decoder may work on at a time, escapes where one run ends and another begins",
             "CBK-2 CBK-3 CBK-6",
@@ -87,6 +93,21 @@ def edge_recipes() -> list[Recipe]:
                 tiles=[tile(extras=tuple(Block(_spec.CODING_RAW, [[i], [i]]) for i in range(2)))],
                 extras=(Extra("\ufeffa", _spec.EXTRA_DTYPE_U8), Extra("a", _spec.EXTRA_DTYPE_U8)),
             ),
+        ),
+        _recipe(
+            "extra_names_of_c1",
+            "names of U+0080 to U+009F, which EXR-2 does not count as control characters",
+            "EXR-2",
+            scene(
+                tiles=[tile(extras=tuple(Block(_spec.CODING_RAW, [[i], [i]]) for i in range(3)))],
+                extras=tuple(Extra(name, _spec.EXTRA_DTYPE_U8) for name in ("\x80", "a\x85b", "\x9f")),
+            ),
+        ),
+        _recipe(
+            "unit_metres_minus_zero",
+            "−0 metres: the unit is not known",
+            "IDX-5",
+            scene(tiles=[], unit_metres=-0.0),
         ),
         _recipe(
             "chunk_types",
@@ -173,6 +194,21 @@ def _bounds() -> Scene:
     records = attributes() | {SCALES: fine, SH0: lifted}
     text = Chunk(_spec.CHUNK_METADATA, b"{}")  # whose id is 0, too
     return scene(tiles=tiles, codebooks=(colours, shapes), attributes=records, chunks=(text,))
+
+
+def _summands() -> Scene:
+    """One stage, and two; the entries of both as far below 0 as they can be."""
+    far, low = 2**31, [-(2**31)] * 3
+    one = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[*low, 1, 2, 3]]},), how=Stream(4))
+    two = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[*low, 1, 2, 3]]}, {0: [[*low, 4, 5, 6]]}), how=Stream(4))
+    tiles = []
+    for table, most in ((one, far + _COLUMN), (two, 2 * far + _COLUMN - 1)):
+        stages = tuple((0, 0) for _ in table.stages)
+        summands = (most, most - 2 * _COLUMN + 1)
+        first = replace(book(table.id, stages, summands=summands, offsets=(_COLUMN,)), how=Stream(4))
+        tiles.append(tile(changes={SCALES: first, QUATS: book(table.id)}))
+    fine = Attribute(_spec.MAPPING_LATTICE, 2.0**-30)
+    return scene(tiles=tiles, codebooks=(one, two), attributes=attributes() | {SCALES: fine})
 
 
 def _many() -> Scene:

@@ -38,13 +38,13 @@ def invalid_growth_recipes() -> list[Recipe]:
     return [
         whole("private_critical", "a critical private chunk", "DIR-6", "E_VALUE", private, "directory[priv].flags"),
         _short("record_tails_cut", "an index that ends within the tail of its last record", build(short)),
-        patched(
-            "layer_127",
-            "the last id that may not be skipped",
-            "RES-2",
-            "E_UNSUPPORTED",
-            layers,
-            {f"{first}.layer": 127},
+        *(
+            patched(f"layer_{number}", why, "RES-2 ANC-2", "E_UNSUPPORTED", layers, {f"{first}.layer": number})
+            for number, why in (
+                (9, "the first id behind those of this version"),
+                (100, "an id that no version lists and none may skip"),
+                (127, "the last id that may not be skipped"),
+            )
         ),
         patched(
             "ancillary_layers_descending",

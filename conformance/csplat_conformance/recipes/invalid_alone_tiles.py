@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from csplat import _spec
-from csplat_conformance.broken import cut, patched, small, swapped, whole
+from csplat_conformance.broken import cut, patched, rich, small, swapped, whole
 from csplat_conformance.builder import Built, build
 from csplat_conformance.samples import (
     MEANS,
     Recipe,
     attributes,
     axis,
+    rich_scene,
     rows_of,
     scene,
     sh_attribute,
@@ -29,7 +30,7 @@ _META = Chunk(_spec.CHUNK_METADATA, b"{}")
 
 def alone_tile_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_tiles(), *_cut()]
+    return [*_tiles(), *_upper_layers(), *_cut()]
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,37 @@ def _tiles() -> list[Recipe]:
         box("high", "a corner of 2^53 + 1", still, (0, 0, big + 1), 2),
         box("low", "a corner of −2^53 − 1, and splats at −2^53", moving, (-big - 1, 0, 0), 0),
         box("far", "a corner of 2^53, and splats at 2^53 + 1", moving, (0, big, 0), 1),
+    ]
+
+
+def _upper_layers() -> list[Recipe]:
+    """Payloads of the layers above 0."""
+    made, base = rich_scene(), rich()
+
+    def tail(name: str, why: str, layer: int) -> Recipe:
+        tiles = (replace(made.tiles[0], tails=((layer, b"\0"),)), made.tiles[1])
+        return whole(name, why, "TLE-3", "E_STREAM", replace(made, tiles=tiles), f"TILE.0.{layer}/tail")
+
+    return [
+        patched("tile_layer_of_extra", "the extra layer says 0", "TLE-1", "E_INDEX", base, {"TILE.0.8/head.layer": 0}),
+        tail("tile_tail_of_band", "a byte after the block of a band", 1),
+        tail("tile_tail_of_extra", "a byte after the last extra column", _spec.LAYER_EXTRA),
+        *(
+            patched(f"block_count_of_{name}", why, "TLE-2", "E_STREAM", base, {f"{chunk}/head.block_count": count})
+            for name, why, chunk, count in (
+                ("band", "two blocks of a band announced, one there", "TILE.0.1", 2),
+                ("extra", "two extra columns announced, one there", "TILE.0.8", 2),
+                ("extra_zero", "no extra column announced, one there", "TILE.0.8", 0),
+            )
+        ),
+        patched(
+            "attribute_of_extra",
+            "a block of the extra layer that names sh0",
+            "TLE-2",
+            "E_STREAM",
+            base,
+            {"TILE.0.8/extra[0].attribute": _spec.ATTRIBUTE_SH0},
+        ),
     ]
 
 

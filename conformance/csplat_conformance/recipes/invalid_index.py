@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 from csplat import _spec
 from csplat_conformance.broken import patched, small, whole
 from csplat_conformance.builder import build
-from csplat_conformance.samples import (
-    Recipe,
-    scene,
-)
+from csplat_conformance.samples import SCALES, SH0, Recipe, scene, signed, tile
+from csplat_conformance.scene import Block, Stream
 
 __all__ = ["index_recipes"]
 
@@ -19,7 +18,7 @@ _NAN, _INF = float("nan"), float("inf")
 
 def index_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_index(), *_attributes()]
+    return [*_index(), *_attributes(), _splats_beyond_budget()]
 
 
 def _index() -> list[Recipe]:
@@ -81,6 +80,7 @@ def _index() -> list[Recipe]:
             "E_INDEX",
             base,
             {"index.directory_count": 65535},
+            ("E_VALUE",),  # the records that follow, read as those of chunks, break DIR-1
             at="index.head_size",
         ),
         patched(
@@ -200,3 +200,32 @@ def _attributes() -> list[Recipe]:
             {"attribute[sh0].chroma_shift": 1},
         ),
     ]
+
+
+def _full_runs(block: Block) -> Stream:
+    """Return the stream of a full tile whose splats are all like the one of a block."""
+    (row,) = block.rows
+    return Stream(1, (_spec.TRANSFORM_RUN_LENGTH,), packed=bytes(q & 255 for q in row) + b"\xff\xff" * len(row))
+
+
+def _splats_beyond_budget() -> Recipe:
+    """Return a sound file of one splat more than the default budget; those of a tile are all the same."""
+    tiles = -(-_spec.BUDGET_SPLATS // _spec.TILE_SPLATS_MAX)
+    one = tile(1, 1, 0, {SCALES: signed([[-4, -5, -6]]), SH0: signed([[7, 8, 9]])})
+    run = {attribute: replace(block, how=_full_runs(block)) for attribute, block in one.blocks.items()}
+
+    @cache
+    def data() -> bytes:
+        built = build(scene(tiles=[*[replace(one, blocks=run)] * tiles, one]))
+        n = _spec.TILE_SPLATS_MAX
+        changes = {"index.splat_count": tiles * n + 1}
+        for i in range(tiles):
+            changes[f"tile[{i}].splat_count"] = n
+            for attribute, block in run.items():
+                stream = f"TILE.{i}.0/{_spec.ATTRIBUTE_NAMES[attribute]}.stream"
+                changes[f"{stream}.count"] = n * len(block.rows[0])
+        return built.patched(changes)
+
+    place = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
+    why = "2^25 + 1 splats, one beyond the default budget"
+    return Recipe("invalid/splats_beyond_budget", why, ("LIM-1",), data, None, "E_LIMIT", place)

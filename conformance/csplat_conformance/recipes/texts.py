@@ -116,12 +116,15 @@ def good_text_recipes() -> list[Recipe]:
     roots |= {_spec.MEASURE_SH2: math.sqrt(15.0), _spec.MEASURE_SH3: math.sqrt(21.0)}
     at_bounds = tuple((measure, 1.0, roots.get(measure, slack)) for measure in _spec.MEASURE_NAMES)
     zeros = tuple((measure, 0.0, 0.0) for measure in _spec.MEASURE_NAMES)
+    pairs = ((-0.0, -0.0), (-0.0, 0.0), (0.0, -0.0))
+    signs = tuple((measure, *pair) for measure, pair in zip(_spec.MEASURE_NAMES, pairs, strict=False))
     large = 2**64 - 1
     return [
         _good("json_grammar", "every production of JSON, numbers, escapes and characters at their limits", *texts),
         _good("json_deep_again", "the deepest nesting three times, one after the other", *deep),
         _stated("error_rms_at_bounds", "each rms as large as its max allows", StatedErrors(2, 0, 3, 0, at_bounds)),
         _stated("error_rms_zero", "an rms of 0 and a max of 0, of every measure", StatedErrors(2, 0, 3, 0, zeros)),
+        _stated("error_minus_zero", "max and rms of −0, together and beside 0", StatedErrors(2, 0, 3, 0, signs)),
         _stated("error_counts_large", "2^64 − 1 splats in the source", StatedErrors(large, large - 2), "SER-4"),
     ]
 
