@@ -57,12 +57,9 @@ def test_every_sh_coding_comes_back(make_model, coding, degree):
     assert coding == result.report.options["sh_coding"]
 
 
-@pytest.mark.parametrize("stages", [1, 2, 4])
 @pytest.mark.parametrize("escapes", [0.0, 0.1, 1.0])
-def test_codebooks_with_stages_and_escapes_come_back(make_model, stages, escapes):
-    round_trip(
-        make_model(300, 2), sh_coding="codebook", codebook_size=16, codebook_stages=stages, escape_fraction=escapes
-    )
+def test_codebooks_with_escapes_come_back(make_model, escapes):
+    round_trip(make_model(300, 2), sh_coding="codebook", codebook_size=16, escape_fraction=escapes)
 
 
 @pytest.mark.parametrize("means_coding", ["morton", "axis"])

@@ -59,12 +59,10 @@ def psnr(model, views):
     [
         COARSE,
         EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
-        EncodeOptions(
-            attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, codebook_stages=2, shape_codebook_size=32
-        ),
+        EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
         EncodeOptions(attribute_psnr=28.0, sh_coding="none", tile_splats=80),
     ],
-    ids=["codebook", "scalar", "shapes and stages", "no SH"],
+    ids=["codebook", "scalar", "shapes", "no SH"],
 )
 def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
     frozen = Draft.of(source, encoding).frozen()
@@ -138,7 +136,7 @@ def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     gradients = rasteriser.backward(slope.astype(np.float64))
     by_row = scene._by_row(gradients.shN.astype(np.float32))
     entry = int(np.argmax(np.abs(by_row[:16]).sum(axis=(1, 2))))
-    users, h = frozen.stages[0] == entry, 1e-3
+    users, h = frozen.book.index == entry, 1e-3
     assert users.sum() > 1
     for k in range(3):
         high, low = (seen.shN.astype(np.float64) for _ in range(2))

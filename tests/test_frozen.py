@@ -14,7 +14,7 @@ WAYS = {
     "scalar": {"sh_coding": "scalar"},
     "adaptive": {"sh_coding": "scalar", "adaptive": 0.7},
     "codebook": {"sh_coding": "codebook", "codebook_size": 16},
-    "two stages": {"sh_coding": "codebook", "codebook_size": 16, "codebook_stages": 2, "escape_fraction": 0.2},
+    "escapes": {"sh_coding": "codebook", "codebook_size": 16, "escape_fraction": 0.2},
     "all escaped": {"sh_coding": "codebook", "codebook_size": 16, "escape_fraction": 1.0},
     "no SH": {"sh_coding": "none"},
     "fewer bands": {"sh_degree": 1},
@@ -57,7 +57,7 @@ def test_what_is_seen_is_what_is_decoded(make_model, way, values):
     assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
-@pytest.mark.parametrize("way", ["scalar", "codebook", "two stages", "tiles, axis", "shapes"])
+@pytest.mark.parametrize("way", ["scalar", "codebook", "escapes", "tiles, axis", "shapes"])
 def test_a_scene_that_did_not_move_decodes_as_if_it_had_not_been_frozen(make_model, way):
     model, options = make_model(260, 3), EncodeOptions(**WAYS[way])
     plain, frozen = encode_with_report(model, options), Draft.of(model, options).frozen()
@@ -112,7 +112,7 @@ def test_entries_serve_all_their_users(make_model):
     frozen = Draft.of(make_model(260, 2), EncodeOptions(**WAYS["codebook"])).frozen()
     held = frozen.start()
     before = frozen.seen(held).shN
-    users = frozen.stages[0] == 3
+    users = frozen.book.index == 3
     held.sh[3] += np.float32(1.0)
     after = frozen.seen(held).shN
     assert users.any()

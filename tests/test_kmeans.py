@@ -10,7 +10,6 @@ from csplat.encoder import nearest
 from csplat.encoder.kmeans import (
     assign,
     cluster,
-    cluster_residual,
     rank_by_frequency,
 )
 from csplat.encoder.nearest import search
@@ -245,25 +244,9 @@ def test_rejects_what_is_out_of_range():
         assign(points, np.empty((0, 9), np.int32))
     with pytest.raises(InputError, match="entries"):
         assign(points, np.empty((4, 8), np.int32))
-    with pytest.raises(InputError, match="2\\*\\*30"):
-        cluster_residual(np.full((9, 2), 2**30, np.int32), ones(points)[:9], (1, 1), seed=0)
 
 
-# Residual stages, ranks.
-
-
-def test_residual_stages_add_up():
-    points, weights = blobs(spread=20.0)
-    stages = cluster_residual(points, weights, (32, 32), seed=0, iterations=4)
-    rest = points.astype(np.int32)
-    errors = []
-    for entries, index in stages:
-        check_clusters(points, entries, index, 32)
-        errors.append(distortion(rest, weights, entries, index))
-        rest = rest - entries[index]
-    one = cluster(points, weights, 32, seed=0, iterations=4)
-    np.testing.assert_array_equal(one[0], stages[0][0])
-    assert errors[1] < 0.9 * errors[0]
+# Ranks.
 
 
 def test_ranks_follow_frequency_and_keep_the_order_of_equals():
@@ -284,17 +267,9 @@ def digest(threads=None):
     points, weights = blobs(9000, 45, 300, 12.0)
     state = hashlib.sha256()
     for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
-        found = cluster_residual(
-            points.astype(np.int32) * scale,
-            weights,
-            (200, 50),
-            seed=7,
-            iterations=3,
-            near_groups=near_groups,
-            threads=threads,
-        )
-        for entries, index in found:
-            state.update(entries.tobytes() + index.tobytes())
+        scaled = points.astype(np.int32) * scale
+        entries, index = cluster(scaled, weights, 200, seed=7, iterations=3, near_groups=near_groups, threads=threads)
+        state.update(entries.tobytes() + index.tobytes())
     return state.hexdigest()
 
 

@@ -481,7 +481,7 @@ def test_small_scenes_without_sh_are_not_measured(scene):
     bare = replace(scene, shN=scene.shN[:, :0])
     report = within(bare, psnr=30.0, keep_all=True).report
     assert 0 == report.sensitivity_views
-    assert len(report.tried) == len({trial["size_bytes"] for trial in report.tried})
+    assert len(report.tried) == len({(trial["attribute_psnr"], trial["deflate_level"]) for trial in report.tried})
 
 
 # what is said

@@ -253,7 +253,7 @@ def test_extra_columns_are_part_of_the_proof(make_model):
     [
         EncodeOptions(),
         EncodeOptions(preset="fast", tile_splats=64),
-        EncodeOptions(sh_coding="codebook", codebook_size=16, codebook_stages=2, escape_fraction=0.1),
+        EncodeOptions(sh_coding="codebook", codebook_size=16, escape_fraction=0.1),
         EncodeOptions(sh_coding="none"),
         EncodeOptions(means_coding="axis", keep_extra=True),
     ],

@@ -63,7 +63,7 @@ def test_comes_back_smaller_and_within_stated_errors(make_model, matrices, tile_
     result, _ = encoded(model, importance, shape_codebook_size=64, shape_escape_fraction=escapes, **options)
     assert len(result.data) < len(plain.data)
     assert 1 <= result.report.options["shape_codebook_size"] <= 64
-    assert [result.report.options["shape_codebook_size"]] == [book.sizes[0] for book in books(result.data)]
+    assert [result.report.options["shape_codebook_size"]] == [book.size for book in books(result.data)]
 
 
 def test_stands_beside_codebooks_of_colour(make_model):
@@ -99,8 +99,8 @@ def test_no_entry_is_dead_and_frequent_ones_come_first(make_model):
     result, decoded = encoded(model, seen_more(model), shape_codebook_size=200, sh_coding="none")
     (book,) = books(result.data)
     shapes, counts = np.unique(decoded.quats, axis=0, return_counts=True)
-    assert book.sizes[0] <= 200
-    assert len(shapes) >= 0.5 * book.sizes[0]  # entries of one rotation may differ in scales
+    assert book.size <= 200
+    assert len(shapes) >= 0.5 * book.size  # entries of one rotation may differ in scales
     assert counts.max() > 1
 
 

@@ -225,7 +225,6 @@ CODINGS = [
     {"sh_coding": "scalar"},
     {"sh_coding": "scalar", "sh_step": 1e-6},  # wide integers
     {"sh_coding": "codebook", "codebook_size": 300, "escape_fraction": 0.2},
-    {"sh_coding": "codebook", "codebook_size": 64, "codebook_stages": 2, "escape_fraction": 0.0},
     {"sh_degree": 1},
     {"sh_degree": 0},
     {"tile_splats": 300},

@@ -23,8 +23,7 @@ QUAT_LEVELS_MIN: Final = 3  # smallest M of the rotations
 QUAT_LEVELS_MAX: Final = 32767  # largest M of the rotations
 CHROMA_SHIFT_MAX: Final = 16  # largest chroma shift
 SH_DEGREE_MAX: Final = 3  # largest SH degree; degree 4 is reserved
-STAGES_MAX: Final = 4  # stages of a codebook
-CODEBOOK_ENTRIES_MAX: Final = 65536  # entries of one stage
+CODEBOOK_ENTRIES_MAX: Final = 65536  # entries of a codebook
 TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
@@ -294,25 +293,25 @@ class CodebookRecord(NamedTuple):
     kind: int
     band_first: int
     band_last: int
-    stage_count: int
     reserved_0: int
-    sizes: tuple[int, int, int, int]
+    reserved_1: int
+    size: int
 
 
-CODEBOOK_RECORD_STRUCT: Final = struct.Struct("<HBBBBHIIII")
-CODEBOOK_RECORD_SIZE: Final = 24
-CODEBOOK_RECORD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "kind": 2, "band_first": 3, "band_last": 4, "stage_count": 5, "reserved_0": 6, "sizes": 8}
+CODEBOOK_RECORD_STRUCT: Final = struct.Struct("<HBBBBHI")
+CODEBOOK_RECORD_SIZE: Final = 12
+CODEBOOK_RECORD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "kind": 2, "band_first": 3, "band_last": 4, "reserved_0": 5, "reserved_1": 6, "size": 8}
 
 
 def unpack_codebook_record(data: bytes | bytearray | memoryview, offset: int = 0) -> CodebookRecord:
     """Read a CodebookRecord at a byte offset; struct.error where the data is too short."""
     v = CODEBOOK_RECORD_STRUCT.unpack_from(data, offset)
-    return CodebookRecord(v[0], v[1], v[2], v[3], v[4], v[5], (v[6], v[7], v[8], v[9]))
+    return CodebookRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6])
 
 
 def pack_codebook_record(r: CodebookRecord) -> bytes:
-    """Return the 24 bytes of a CodebookRecord."""
-    return CODEBOOK_RECORD_STRUCT.pack(r.codebook_id, r.kind, r.band_first, r.band_last, r.stage_count, r.reserved_0, *r.sizes)
+    """Return the 12 bytes of a CodebookRecord."""
+    return CODEBOOK_RECORD_STRUCT.pack(r.codebook_id, r.kind, r.band_first, r.band_last, r.reserved_0, r.reserved_1, r.size)
 
 
 class ExtraRecord(NamedTuple):
@@ -480,12 +479,12 @@ class CodebookHead(NamedTuple):
 
     codebook_id: int
     layer: int
-    stage_count: int
+    reserved_0: int
 
 
 CODEBOOK_HEAD_STRUCT: Final = struct.Struct("<HBB")
 CODEBOOK_HEAD_SIZE: Final = 4
-CODEBOOK_HEAD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "layer": 2, "stage_count": 3}
+CODEBOOK_HEAD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "layer": 2, "reserved_0": 3}
 
 
 def unpack_codebook_head(data: bytes | bytearray | memoryview, offset: int = 0) -> CodebookHead:
@@ -496,7 +495,7 @@ def unpack_codebook_head(data: bytes | bytearray | memoryview, offset: int = 0) 
 
 def pack_codebook_head(r: CodebookHead) -> bytes:
     """Return the 4 bytes of a CodebookHead."""
-    return CODEBOOK_HEAD_STRUCT.pack(r.codebook_id, r.layer, r.stage_count)
+    return CODEBOOK_HEAD_STRUCT.pack(r.codebook_id, r.layer, r.reserved_0)
 
 
 class BlockHead(NamedTuple):

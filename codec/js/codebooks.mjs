@@ -23,16 +23,14 @@ const ENTRY_WIDTH_MAX = 4; // STR-2
 const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
 
 /**
- * Entries of one chunk: per stage the columns one after the other, each `size` entries and a 0 (the place of the escape
- * index in stage 0), and what none of them exceeds in magnitude.
+ * Entries of one chunk: the columns one after the other, each `size` entries and a 0 (the place of the escape index), and
+ * what none of them exceeds in magnitude; the values of the entries, or their final integers, once they are needed.
  *
- * @typedef {{size: number, entries: Int32Array, bound: number}} Stage
- * @typedef {{stages: Stage[], values?: Float32Array, packed?: PackedColumns}} Table with the values of its entries, or
- *   their final integers, once they are needed
+ * @typedef {{size: number, entries: Int32Array, bound: number, values?: Float32Array, packed?: PackedColumns}} Table
  *
  * What a tile's blocks of one codebook have in common.
  *
- * @typedef {{indices: Uint32Array[], escapeCount: number, escaped: Uint32Array}} Indices
+ * @typedef {{index: Uint32Array, escapeCount: number, escaped: Uint32Array}} Indices
  * @typedef {import('./codings.mjs').Block} Block
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
@@ -69,7 +67,7 @@ export function tableBytes(directory, codebooks) {
   let bytes = 0;
   for (const { type, id, layer } of directory) {
     const codebook = type === spec.CHUNK_CODEBOOK ? codebooks.get(id) : undefined;
-    if (codebook) for (const size of codebook.sizes) bytes += 4 * size * tableColumns(codebook, layer);
+    if (codebook) bytes += 4 * codebook.size * tableColumns(codebook, layer);
   }
   return bytes;
 }
@@ -89,43 +87,36 @@ export async function readTable(bytes, { id, layer, offset }, codebook, attribut
   const { fields, offset: at } = payload.read(
     spec.unpackCodebookHead,
     spec.CODEBOOK_HEAD_SIZE,
-    {},
+    spec.CODEBOOK_HEAD_RESERVED,
     'the head of a codebook',
   );
-  const { codebook_id, layer: itsLayer, stage_count } = fields;
-  const stageCount = codebook.sizes.length;
+  const { codebook_id, layer: itsLayer } = fields;
   if (codebook_id !== id) throw fault(ERROR_INDEX, at, 'CDB-1', `codebook ${codebook_id} instead of ${id}`);
   if (itsLayer !== layer)
     throw fault(ERROR_INDEX, at + AT_HEAD.layer, 'CDB-1', `layer ${itsLayer} instead of ${layer}`);
-  if (stage_count !== stageCount)
-    throw fault(ERROR_INDEX, at + AT_HEAD.stage_count, 'CDB-1', `${stage_count} stages instead of ${stageCount}`);
+  const { size } = codebook;
   const count = tableColumns(codebook, layer);
-  /** @type {Stage[]} */
-  const stages = [];
-  for (const size of codebook.sizes) {
-    const stream = await readStream(payload, size * count, ENTRY_WIDTH_MAX, inflate);
-    const integers = signed(stream);
-    const entries = new Int32Array((size + 1) * count);
-    for (let c = 0; c < count; c++) entries.set(integers.subarray(c * size, (c + 1) * size), c * (size + 1));
-    let bound = 0;
-    for (let i = 0; i < integers.length; i++) bound = Math.max(bound, Math.abs(integers[i]));
-    stages.push({ size, entries, bound });
-    if (stageCount === 1) checkEntries({ integers, size, bound, offset: stream.offset }, codebook, layer, attributes);
-  }
+  const stream = await readStream(payload, size * count, ENTRY_WIDTH_MAX, inflate);
+  const integers = signed(stream);
+  const entries = new Int32Array((size + 1) * count);
+  for (let c = 0; c < count; c++) entries.set(integers.subarray(c * size, (c + 1) * size), c * (size + 1));
+  let bound = 0;
+  for (let i = 0; i < integers.length; i++) bound = Math.max(bound, Math.abs(integers[i]));
+  checkEntries({ integers, bound, offset: stream.offset }, codebook, layer, attributes);
   payload.finish();
-  return { stages };
+  return { size, entries, bound };
 }
 
 /**
- * CBK-7: each entry of a codebook of one stage obeys by itself what sums must.
+ * CBK-7: each entry obeys by itself what integers in a stream must.
  *
- * @param {{integers: Int32Array, size: number, bound: number, offset: number}} stage column after column, and where its
- *   stream begins
+ * @param {{integers: Int32Array, bound: number, offset: number}} table column after column, and where its stream begins
  * @param {CodebookRecord} codebook
  * @param {number} layer of the chunk
  * @param {AttributeRecord[]} attributes all of the file
  */
-function checkEntries({ integers, size, bound, offset }, codebook, layer, attributes) {
+function checkEntries({ integers, bound, offset }, codebook, layer, attributes) {
+  const { size } = codebook;
   let first = 0;
   for (const name of codebook.attributes) {
     const attribute = /** @type {AttributeRecord} */ (attributes.find((one) => one.name === name)); // by CBR-2
@@ -177,19 +168,18 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   const isSh = codebook.bandFirst > 0;
   const table = await tile.table(id, isSh ? attribute.id - spec.ATTRIBUTE_SH0 : 0);
   const offset = at - spec.BLOCK_HEAD_SIZE;
-  const isBound = codebook.sizes.length === 1; // CBK-7: nothing is left to check, but where a summand comes
-  if (!integers && isBound && attribute.id >= spec.ATTRIBUTE_SH0) {
-    const lookup = { id, table, index: shared.indices[0], escaped: shared.escaped };
+  if (!integers && attribute.id >= spec.ATTRIBUTE_SH0) {
+    const lookup = { id, table, index: shared.index, escaped: shared.escaped };
     if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
     return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
   }
   // Columns of the codebook's attributes before this one; a band has a chunk of its own.
   const before = isSh ? 0 : codebook.attributes.indexOf(attribute.name) * spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SCALES];
-  const block = sumEntries(tile.sums(attribute), table, before, shared.indices, attribute, offset);
+  const block = gatherEntries(tile.sums(attribute), table, before, shared.index, attribute, offset);
   const hasSummand = codebook.kind === KIND_SHAPE && isFirst;
   if (hasSummand) await addSummand(tile, payload, block);
   if (escapeCount) putEscapes(block, shared.escaped, await readEscapes(tile, payload, attribute, escapeCount));
-  if (!isBound || hasSummand) checkIntegers(block, tile.splatCount);
+  if (hasSummand) checkIntegers(block, tile.splatCount); // of other blocks CBK-7 has looked at the entries
   return block;
 }
 
@@ -205,20 +195,19 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
  */
 async function readIndices(tile, payload, codebook, escapeCount, at) {
   const n = tile.splatCount;
-  const indices = [];
-  for (const [stage, size] of codebook.sizes.entries()) {
-    const { low, offset } = await readStream(payload, n, spec.CODING_WIDTH_MAX[spec.CODING_CODEBOOK], tile.inflate);
-    const most = stage === 0 ? size : size - 1; // stage 0 has one more: the escape
-    for (let i = 0; i < n; i++) {
-      if (low[i] > most)
-        throw fault(ERROR_CODEBOOK, offset, 'CBK-2', `index ${low[i]} in stage ${stage} of ${size} entries`);
-    }
-    indices.push(low);
-  }
+  const { size } = codebook;
+  const { low: index, offset } = await readStream(
+    payload,
+    n,
+    spec.CODING_WIDTH_MAX[spec.CODING_CODEBOOK],
+    tile.inflate,
+  );
+  for (let i = 0; i < n; i++)
+    if (index[i] > size) throw fault(ERROR_CODEBOOK, offset, 'CBK-2', `index ${index[i]} of ${size} entries`);
   const escaped = new Uint32Array(Math.min(escapeCount, n));
   let found = 0;
   // Beyond its end nothing is written.
-  for (let i = 0; i < n; i++) if (indices[0][i] === codebook.sizes[0]) escaped[found++] = i;
+  for (let i = 0; i < n; i++) if (index[i] === size) escaped[found++] = i;
   if (found !== escapeCount) {
     throw fault(
       ERROR_CODEBOOK,
@@ -227,7 +216,7 @@ async function readIndices(tile, payload, codebook, escapeCount, at) {
       `${found} splats are escaped, ${escapeCount} announced`,
     );
   }
-  const shared = { indices, escapeCount, escaped };
+  const shared = { index, escapeCount, escaped };
   tile.indices.set(codebook.id, shared);
   return shared;
 }
@@ -286,35 +275,29 @@ export function tableValues(table, attribute) {
  * @param {AttributeRecord} attribute
  */
 export function entryColumns(table, { mapping, chromaShift }) {
-  const columns = new Float64Array(table.stages[0].entries);
+  const columns = new Float64Array(table.entries);
   if (mapping === spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) rgbFromYcocg(columns, columns.length / 3, chromaShift);
   return columns;
 }
 
 /**
- * Sum of the entries that the indices name, over the stages. At most 4 × 2^31: exact.
+ * The entries that the indices name.
  *
  * @param {Float64Array} columns to fill
  * @param {Table} table
  * @param {number} before columns of the table before the attribute's
- * @param {Uint32Array[]} indices
+ * @param {Uint32Array} index
  * @param {AttributeRecord} attribute
  * @param {number} offset of the block
  * @returns {Block}
  */
-function sumEntries(columns, table, before, indices, attribute, offset) {
+function gatherEntries(columns, { size, entries, bound }, before, index, attribute, offset) {
   const count = columnCount(attribute);
-  const n = indices[0].length;
-  let bound = 0;
-  for (const [stage, { size, entries, bound: most }] of table.stages.entries()) {
-    const index = indices[stage];
-    bound += most;
-    for (let c = 0; c < count; c++) {
-      const column = entries.subarray((before + c) * (size + 1), (before + c + 1) * (size + 1));
-      const at = c * n;
-      if (stage === 0) for (let i = 0; i < n; i++) columns[at + i] = column[index[i]];
-      else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];
-    }
+  const n = index.length;
+  for (let c = 0; c < count; c++) {
+    const column = entries.subarray((before + c) * (size + 1), (before + c + 1) * (size + 1));
+    const at = c * n;
+    for (let i = 0; i < n; i++) columns[at + i] = column[index[i]];
   }
   return { attribute, columns, exponent: 0, bound, offset };
 }
@@ -324,7 +307,7 @@ function sumEntries(columns, table, before, indices, attribute, offset) {
  *
  * @param {TileContext} tile
  * @param {Payload} payload
- * @param {Block} block changed: sums below 2^50 + 2^32 + 2^33
+ * @param {Block} block changed: sums below 2^33
  */
 async function addSummand(tile, payload, block) {
   const { attribute, columns } = block;

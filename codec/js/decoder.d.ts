@@ -47,8 +47,8 @@ export interface CodebookRecord {
   attributes: string[];
   bandFirst: number;
   bandLast: number;
-  /** Entries of each stage. */
-  sizes: number[];
+  /** How many entries it has. */
+  size: number;
 }
 
 export interface ExtraRecord {

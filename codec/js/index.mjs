@@ -247,7 +247,7 @@ function readCodebook(index, recordSize, before, shDegree) {
     spec.CODEBOOK_RECORD_RESERVED,
     'a codebook record',
   );
-  const { codebook_id: id, band_first: bandFirst, band_last: bandLast, stage_count: stages, sizes } = fields;
+  const { codebook_id: id, band_first: bandFirst, band_last: bandLast, size } = fields;
   if (id <= before) throw fault(ERROR_INDEX, offset, 'CBR-1', `codebook ${id} after ${before}`);
   const kind = nameOf(spec.CODEBOOK_KIND_NAMES, fields.kind);
   if (kind === undefined) throw fault(ERROR_UNSUPPORTED, offset + places.kind, 'RES-2', `codebook kind ${fields.kind}`);
@@ -260,18 +260,13 @@ function readCodebook(index, recordSize, before, shDegree) {
       `bands ${bandFirst} to ${bandLast} of the kind ${kind}`,
     );
   }
-  if (stages < 1 || stages > spec.STAGES_MAX)
-    throw fault(ERROR_VALUE, offset + places.stage_count, 'CBR-3', `${stages} stages`);
-  const bad = sizes.findIndex((size, i) => (i < stages ? size < 1 || size > spec.CODEBOOK_ENTRIES_MAX : size !== 0));
-  if (bad >= 0) {
-    const place = offset + places.sizes + spec.CODEBOOK_RECORD_STRIDES.sizes * bad;
-    throw fault(ERROR_VALUE, place, 'CBR-4', `a stage of ${sizes[bad]} entries`);
-  }
+  if (size < 1 || size > spec.CODEBOOK_ENTRIES_MAX)
+    throw fault(ERROR_VALUE, offset + places.size, 'CBR-4', `a codebook of ${size} entries`);
   /** @type {readonly string[]} */
   let attributes =
     spec.CODEBOOK_KIND_ATTRIBUTES[/** @type {keyof typeof spec.CODEBOOK_KIND_ATTRIBUTES} */ (fields.kind)];
   if (isSh) attributes = attributes.slice(bandFirst - 1, bandLast);
-  return { id, kind, attributes: [...attributes], bandFirst, bandLast, sizes: sizes.slice(0, stages) };
+  return { id, kind, attributes: [...attributes], bandFirst, bandLast, size };
 }
 
 /**

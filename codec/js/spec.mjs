@@ -15,8 +15,7 @@ export const QUAT_LEVELS_MIN = 3; // smallest M of the rotations
 export const QUAT_LEVELS_MAX = 32767; // largest M of the rotations
 export const CHROMA_SHIFT_MAX = 16; // largest chroma shift
 export const SH_DEGREE_MAX = 3; // largest SH degree; degree 4 is reserved
-export const STAGES_MAX = 4; // stages of a codebook
-export const CODEBOOK_ENTRIES_MAX = 65536; // entries of one stage
+export const CODEBOOK_ENTRIES_MAX = 65536; // entries of a codebook
 export const TRANSFORMS_MAX = 4; // transforms of a stream
 export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
@@ -255,10 +254,9 @@ export function unpackAttributeRecord(view, at) {
   };
 }
 
-export const CODEBOOK_RECORD_SIZE = 24;
-export const CODEBOOK_RECORD_OFFSETS = Object.freeze({ codebook_id: 0, kind: 2, band_first: 3, band_last: 4, stage_count: 5, reserved_0: 6, sizes: 8 });
-export const CODEBOOK_RECORD_STRIDES = Object.freeze({ sizes: 4 });
-export const CODEBOOK_RECORD_RESERVED = Object.freeze({ reserved_0: 6 });
+export const CODEBOOK_RECORD_SIZE = 12;
+export const CODEBOOK_RECORD_OFFSETS = Object.freeze({ codebook_id: 0, kind: 2, band_first: 3, band_last: 4, reserved_0: 5, reserved_1: 6, size: 8 });
+export const CODEBOOK_RECORD_RESERVED = Object.freeze({ reserved_0: 5, reserved_1: 6 });
 /**
  * Codebook record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -270,9 +268,9 @@ export function unpackCodebookRecord(view, at) {
     kind: view.getUint8(at + 2),
     band_first: view.getUint8(at + 3),
     band_last: view.getUint8(at + 4),
-    stage_count: view.getUint8(at + 5),
-    reserved_0: view.getUint16(at + 6, true),
-    sizes: [view.getUint32(at + 8, true), view.getUint32(at + 12, true), view.getUint32(at + 16, true), view.getUint32(at + 20, true)],
+    reserved_0: view.getUint8(at + 5),
+    reserved_1: view.getUint16(at + 6, true),
+    size: view.getUint32(at + 8, true),
   };
 }
 
@@ -389,7 +387,8 @@ export function unpackTileHead(view, at) {
 }
 
 export const CODEBOOK_HEAD_SIZE = 4;
-export const CODEBOOK_HEAD_OFFSETS = Object.freeze({ codebook_id: 0, layer: 2, stage_count: 3 });
+export const CODEBOOK_HEAD_OFFSETS = Object.freeze({ codebook_id: 0, layer: 2, reserved_0: 3 });
+export const CODEBOOK_HEAD_RESERVED = Object.freeze({ reserved_0: 3 });
 /**
  * Head of a CODB payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -399,7 +398,7 @@ export function unpackCodebookHead(view, at) {
   return {
     codebook_id: view.getUint16(at + 0, true),
     layer: view.getUint8(at + 2),
-    stage_count: view.getUint8(at + 3),
+    reserved_0: view.getUint8(at + 3),
   };
 }
 

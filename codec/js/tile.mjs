@@ -40,7 +40,7 @@ const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
  * @property {Inflate} inflate
  * @property {Map<number, Indices>} indices of the codebooks that blocks of the tile use so far
  * @property {(attribute: AttributeRecord, n: number) => Float64Array} columns an array for integers of n splats
- * @property {(attribute: AttributeRecord) => Float64Array} sums another one, for sums of entries
+ * @property {(attribute: AttributeRecord) => Float64Array} sums another one, for entries and their sums
  * @property {(id: number) => CodebookRecord | undefined} codebook one that the tile lists
  * @property {(id: number, layer: number) => Promise<Table>} table
  * @property {(layer: number) => Promise<void>} needLayer sees to it that the layer, if the tile has it, is decoded

@@ -153,11 +153,7 @@ def held(built: Built, rule: Rule) -> set[float]:
     """Return the values in the fields of a file that a rule is about."""
     values: set[float] = set()
     for name in _places(built, rule):
-        found = _holding(built, name)
-        if rule.of == "stages in use":
-            (stages,) = _holding(built, name.replace(".sizes", ".stage_count"))
-            found = found[:stages]
-        values |= set(found)
+        values |= set(_holding(built, name))
     return values
 
 
@@ -226,7 +222,7 @@ def _words(built: Built, structure: str, prefix: str) -> set[str]:
             "YCOCG" if is_shifted else "other mappings",
         }
     if structure == "codebook_record":
-        return {"stages in use", "SH" if number("kind") == _spec.CODEBOOK_KIND_SH else "other kinds"}
+        return {"SH" if number("kind") == _spec.CODEBOOK_KIND_SH else "other kinds"}
     block, _, part = prefix.rpartition(".")
     if structure == "lattice_params":
         return {block.rpartition("/")[2]}

@@ -148,9 +148,7 @@ def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> 
         facts = [attribute, record.mapping, record.chroma_shift, 0, record.levels, record.step]
         out.structure(name, "attribute_record", facts)
     for book in scene.codebooks:
-        sizes = [len(next(iter(stage.values()))) for stage in book.stages]
-        padded = tuple((sizes + [0] * _spec.STAGES_MAX)[: _spec.STAGES_MAX])
-        values = [book.id, book.kind, *book.bands, len(sizes), 0, padded]
+        values = [book.id, book.kind, *book.bands, 0, 0, len(next(iter(book.entries.values())))]
         out.structure(f"codebook[{book.id}]", "codebook_record", values)
     for i, extra in enumerate(scene.extras):
         encoded = extra.name.encode()
@@ -252,9 +250,8 @@ def _ancillary(chunk: Chunk) -> Writer:
 
 def _codebook(book: Codebook, layer: int) -> Writer:
     out = Writer()
-    out.structure("head", "codebook_head", [book.id, layer, len(book.stages)])
-    for i, stage in enumerate(book.stages):
-        _stream(out, f"stage[{i}]", transpose(stage[layer]), book.how)
+    out.structure("head", "codebook_head", [book.id, layer, 0])
+    _stream(out, "entries", transpose(book.entries[layer]), book.how)
     _tail(out, book.tail)
     return out
 
@@ -325,9 +322,8 @@ def _lattice(out: Writer, name: str, block: Block) -> None:
 def _codebook_block(out: Writer, name: str, scene: Scene, attribute: int, block: Block) -> None:
     escapes = len(block.escape.rows) if block.escape else 0
     out.structure(f"{name}.params", "codebook_params", [block.codebook, 0, escapes])
-    for i, indices in enumerate(block.indices):
-        how = block.index_how[i] if i < len(block.index_how) else Stream()
-        _stream(out, f"{name}.indices[{i}]", indices, how)
+    if block.indices:
+        _stream(out, f"{name}.indices", block.indices, block.index_how)
     if block.summands:
         (offset,) = block.offsets or (min(block.summands),)
         out.structure(f"{name}.summand", "lattice_params", [0, 0])

@@ -78,18 +78,15 @@ def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[l
     start = 0
     if book.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_QUATS:
         start = _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SCALES]
-    escape_index = len(book.stages[0][layer])
+    entries = book.entries[layer]
     escaped = iter(block.escape.rows if block.escape else ())
     result = []
-    for splat, index in enumerate(first.indices[0]):
-        if index == escape_index:
+    for splat, index in enumerate(first.indices):
+        if index == len(entries):
             result.append(list(next(escaped)))
             continue
-        row = [block.summands[splat] if block.summands else 0] * columns
-        for stage, table in enumerate(book.stages):
-            entry = table[layer][first.indices[stage][splat]]
-            row = [value + entry[start + i] for i, value in enumerate(row)]
-        result.append(row)
+        summand = block.summands[splat] if block.summands else 0
+        result.append([summand + value for value in entries[index][start : start + columns]])
     return result
 
 

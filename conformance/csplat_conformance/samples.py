@@ -166,14 +166,13 @@ def sparse(
 
 def book(
     codebook: int,
-    indices: tuple[tuple[int, ...], ...] = (),
+    indices: tuple[int, ...] = (),
     escape: Block | None = None,
     how: Stream = PLAIN,
     **rest: Any,
 ) -> Block:
     """Return a block coded CODEBOOK; without indices it is not the first of its codebook."""
-    ways = (how,) * len(indices)
-    return Block(_spec.CODING_CODEBOOK, codebook=codebook, indices=indices, index_how=ways, escape=escape, **rest)
+    return Block(_spec.CODING_CODEBOOK, codebook=codebook, indices=indices, index_how=how, escape=escape, **rest)
 
 
 def sh_attribute(band: int) -> int:
@@ -233,15 +232,12 @@ def coded(scene: Scene, how: Callable[[Stream], Stream]) -> Scene:
 
 
 def rich_scene() -> Scene:
-    """Return a scene of two tiles with codebooks, stages, escapes, an absent band, extras and all known chunks."""
-    shape = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(1, 3, 6, -40, 40)},))
+    """Return a scene of two tiles with codebooks, escapes, an absent band, extras and all known chunks."""
+    shape = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(1, 3, 6, -40, 40)})
     colours = Codebook(
         7,
         _spec.CODEBOOK_KIND_SH,
-        tuple(
-            {band: rows_of(9 * stage + band, 4 - stage, 3 * (2 * band + 1), -50, 50) for band in (1, 2)}
-            for stage in (0, 1)
-        ),
+        {band: rows_of(band, 4, 3 * (2 * band + 1), -50, 50) for band in (1, 2)},
         (1, 2),
     )
     escape1, escape2 = signed(rows_of(21, 1, 9, -500, 500), Stream(2)), offset(rows_of(22, 1, 15, -5, 5))
@@ -250,9 +246,9 @@ def rich_scene() -> Scene:
         3,
         0,
         {
-            SCALES: book(2, ((0, 2, 1),), summands=(-50, -40, -60)),
+            SCALES: book(2, (0, 2, 1), summands=(-50, -40, -60)),
             QUATS: book(2),
-            SH0 + 1: book(7, ((0, 4, 3), (2, 0, 1)), escape1),
+            SH0 + 1: book(7, (0, 4, 3), escape1),
             SH0 + 2: book(7, (), escape2),
         },
         extras=(Block(_spec.CODING_RAW, [[5], [0], [65535]], Stream(2)),),

@@ -73,8 +73,8 @@ class Block:
         mask_how: coding of its stream.
         bits: per axis, of MORTON.
         codebook: id, of CODEBOOK.
-        indices: for each stage n indices; empty in a block that is not the first of its codebook.
-        index_how: coding of each stage's indices.
+        indices: n of them; none in a block that is not the first of its codebook.
+        index_how: coding of their stream.
         summands: n common summands, of kind SHAPE in the block of the scales.
         escape: the block of the escaped splats.
         tail: bytes after the block.
@@ -89,8 +89,8 @@ class Block:
     mask_how: Stream = PLAIN
     bits: int = 0
     codebook: int = 0
-    indices: tuple[tuple[int, ...], ...] = ()
-    index_how: tuple[Stream, ...] = ()
+    indices: tuple[int, ...] = ()
+    index_how: Stream = PLAIN
     summands: tuple[int, ...] = ()
     escape: Block | None = None
     tail: bytes = b""
@@ -144,20 +144,20 @@ class Attribute:
 
 @dataclass(frozen=True)
 class Codebook:
-    """A codebook: for each stage and layer the entries as rows.
+    """A codebook: for each layer the entries as rows.
 
     Attributes:
         id: of the record.
         kind: registry value.
-        stages: for each stage a map from layer to rows [size, C].
+        entries: layer to rows [size, C].
         bands: first and last SH band; zeros for other kinds.
-        how: coding of the entries, the same for all streams.
-        tail: bytes after the last stream of each chunk.
+        how: coding of the entries, the same for all chunks.
+        tail: bytes after the stream of each chunk.
     """
 
     id: int
     kind: int
-    stages: tuple[Mapping[int, Rows], ...]
+    entries: Mapping[int, Rows]
     bands: tuple[int, int] = (0, 0)
     how: Stream = PAIRS
     tail: bytes = b""
@@ -165,7 +165,7 @@ class Codebook:
     @property
     def layers(self) -> list[int]:
         """Layers of its CODB chunks."""
-        return list(self.stages[0])
+        return list(self.entries)
 
 
 @dataclass(frozen=True)

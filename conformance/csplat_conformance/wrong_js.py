@@ -119,14 +119,6 @@ EDITS: Final = (
         "",
     ),
     Edit(
-        "stages",
-        "stages after the first are dropped",
-        "CBR-3",
-        "codebooks.mjs",
-        "else for (let i = 0; i < n; i++) columns[at + i] += column[index[i]];",
-        "",
-    ),
-    Edit(
         "mask",
         "bits from the highest on",
         "SPA-2",
@@ -139,8 +131,8 @@ EDITS: Final = (
         "entries of a codebook are believed",
         "CBK-7",
         "codebooks.mjs",
-        "if (stageCount === 1) checkEntries(",
-        "if (false) checkEntries(",
+        "  checkEntries({",
+        "  if (false) checkEntries({",
     ),
     Edit("quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("),
     Edit(

@@ -139,13 +139,6 @@ def _no_escapes(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
     return right(block, *args)
 
 
-def _one_stage(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
-    object.__setattr__(block, "entries", block.entries[:1])
-    first = SimpleNamespace(**{**vars(block.indices), "stages": block.indices.stages[:1]})
-    object.__setattr__(block, "indices", first)
-    return right(block, *args)
-
-
 def _no_summand(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
     object.__setattr__(block, "summand", None)
     return right(block, *args)
@@ -272,7 +265,6 @@ MISTAKES: Final = (
     Mistake("sign", "elements of SIGNED read as unsigned", "LAT-4", replaced("_as_signed", _as_unsigned)),
     Mistake("order", "Morton codes taken for sorted", "ORD-1", replaced("morton_axes", _sorted_codes)),
     Mistake("escapes", "escaped splats take the last entry", "CBK-3", method(blocks.Coded, "rows", _no_escapes)),
-    Mistake("stages", "stages after the first are dropped", "CBR-3", method(blocks.Coded, "rows", _one_stage)),
     Mistake("unused entries", "entries of a codebook are believed", "CBK-7", replaced("_check_entries", nothing)),
     Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", method(blocks.Coded, "rows", _no_summand)),
     Mistake("mask", "bits from the highest on", "SPA-2", replaced("read_sparse", _mask_from_the_top)),

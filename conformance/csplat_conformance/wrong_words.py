@@ -36,7 +36,6 @@ _BITS = {"len(present) != params.present_count": "False"}
 _OF_THE_KIND = """context.first.get(params.codebook_id) or next(
         (one for one in context.first.values() if one.book.record.kind == book.record.kind), None
     )"""
-_UNESCAPED = "int(index[stages[0] != book.sizes[0]].max(initial=0) if stages else index.max())"
 _CHECKED = """block = Columns(elements.reshape(1, count), offsets, 0, at)
     check_integers(block.lows, block.highs, context.header.attribute(attribute), at)
     return block"""
@@ -95,10 +94,10 @@ MISTAKES: Final = (
         reworded("_indices", {"context.first.get(params.codebook_id)": _OF_THE_KIND}),
     ),
     Mistake(
-        "indices of escaped splats",
-        "later stages are looked at where they are used",
+        "indices",
+        "beyond the escape index the last entry serves",
         "CBK-2",
-        reworded("_read_indices", {"int(index.max())": _UNESCAPED}),
+        reworded("_read_indices", {"largest > size": "False"}),
     ),
     Mistake(
         "summands",

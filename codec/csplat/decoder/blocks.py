@@ -72,19 +72,14 @@ class Codebook:
 
     Attributes:
         record: its record in the index.
-        entries: for each layer (0, or an SH band) the entries of each stage, [size, C] integers.
+        entries: for each layer (0, or an SH band) [size, C] integers.
         values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
-            on, for SH codebooks of one stage.
+            on, for SH codebooks.
     """
 
     record: _spec.CodebookRecord
-    entries: dict[int, tuple[Ints, ...]] = field(default_factory=dict)
+    entries: dict[int, Ints] = field(default_factory=dict)
     values: NDArray[np.float32] | None = None
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Entries of each stage."""
-        return self.record.sizes[: self.record.stage_count]
 
 
 @dataclass(frozen=True)
@@ -94,23 +89,23 @@ class Indices:
     Attributes:
         book: the codebook.
         attribute: of the first block.
-        stages: [n] for each stage.
+        places: [n], which entry; the size of the codebook where none serves.
         escaped: places of the splats that no entry serves, ascending.
     """
 
     book: Codebook
     attribute: int
-    stages: tuple[Ints, ...]
+    places: Ints
     escaped: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Coded:
-    """A block coded CODEBOOK: the integers are sums of entries (spec 6.4.5).
+    """A block coded CODEBOOK: the integers are entries, in scales of SHAPE plus a summand (spec 6.4.5).
 
     Attributes:
         indices: which entries.
-        entries: for each stage [size, C], the columns of this block's attribute.
+        entries: [size, C], the columns of this block's attribute.
         escapes: the integers of the escaped splats.
         summand: of the kind SHAPE, scales: one column, added to all three.
         at: where the block begins in the file.
@@ -119,7 +114,7 @@ class Coded:
     """
 
     indices: Indices
-    entries: tuple[Ints, ...]
+    entries: Ints
     escapes: Columns | None
     summand: Columns | None
     at: int
@@ -127,22 +122,15 @@ class Coded:
     bound: int = field(init=False)
 
     def __post_init__(self) -> None:
-        total = sum(max(abs(int(stage.min())), abs(int(stage.max()))) for stage in self.entries)
+        total = max(abs(int(self.entries.min())), abs(int(self.entries.max())))
         total += self.summand.bound if self.summand else 0
         object.__setattr__(self, "bound", max(total, self.escapes.bound if self.escapes else 0))
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
         """Return the integers of splats `start` to `stop`, as `Columns.rows` does."""
-        total: Ints | None = None
-        for entries, index in zip(self.entries, self.indices.stages, strict=True):
-            # An escaped splat's index is the size of stage 0: `clip` gives it the last entry for now.
-            part = np.take(entries, index[start:stop], axis=0, mode="clip")
-            if total is None:
-                total = part.astype(dtype)
-            else:
-                total += part
-        assert total is not None
-        out = np.ascontiguousarray(total.T)
+        # An escaped splat's index is the codebook's size: `clip` gives it the last entry for now.
+        rows = np.take(self.entries, self.indices.places[start:stop], axis=0, mode="clip")
+        out = np.ascontiguousarray(rows.T, dtype)
         if self.summand:
             out += self.summand.rows(start, stop, dtype)
         if self.escapes:

@@ -8,7 +8,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.decoder.blocks import Codebook, Columns
-from csplat.decoder.container import open_chunk
+from csplat.decoder.container import check_reserved, open_chunk
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.lattice import check_integers
 from csplat.decoder.reconstruct import check_values, quat_rows, write_colour
@@ -63,7 +63,7 @@ def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whol
     elements = 0
     for record in _codebook_chunks(header) if whole else _wanted(header, tiles, degree):
         book = books[record.id]
-        elements += sum(book.sizes) * layer_columns(book, record.layer)
+        elements += book.size * layer_columns(book, record.layer)
     return 4 * elements
 
 
@@ -75,7 +75,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
         book = books.setdefault(record.id, Codebook(records[record.id]))
         book.entries[record.layer] = _read_chunk(view, header, record, book.record)
     for book in books.values():
-        if book.record.kind == _spec.CODEBOOK_KIND_SH and book.record.stage_count == 1:
+        if book.record.kind == _spec.CODEBOOK_KIND_SH:
             _fill_values(book, header)
     return books
 
@@ -101,14 +101,14 @@ def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_sp
 
 def _read_chunk(
     view: memoryview, header: SceneHeader, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
-) -> tuple[Ints, ...]:
+) -> Ints:
     cursor = open_chunk(view, record, record.type, record.flags, "CDB-2")
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)
+    check_reserved(head, at, _spec.CODEBOOK_HEAD_OFFSETS)
     for name, found, wanted in (
         ("codebook_id", head.codebook_id, book.codebook_id),
         ("layer", head.layer, record.layer),
-        ("stage_count", head.stage_count, book.stage_count),
     ):
         if found != wanted:
             raise FormatError(
@@ -119,24 +119,18 @@ def _read_chunk(
                 found=found,
                 wanted=wanted,
             )
-    columns = layer_columns(book, record.layer)
-    stages = []
-    for size in book.sizes[: book.stage_count]:
-        stream_at = cursor.at
-        elements = read_stream(cursor, size * columns, _ENTRY_WIDTH_MAX, signed=True)
-        if book.stage_count == 1:
-            _check_entries(elements.reshape(columns, size), header, book, record.layer, stream_at)
-        # Rows of one entry: a gather then copies whole rows.
-        stages.append(np.ascontiguousarray(elements.reshape(columns, size).T))
+    columns, stream_at = layer_columns(book, record.layer), cursor.at
+    elements = read_stream(cursor, book.size * columns, _ENTRY_WIDTH_MAX, signed=True).reshape(columns, book.size)
+    _check_entries(elements, header, book, record.layer, stream_at)
     cursor.finish()
-    return tuple(stages)
+    return np.ascontiguousarray(elements.T)  # rows of one entry: a gather then copies whole rows
 
 
 def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecord, layer: int, at: int) -> None:
     """CBK-7.
 
     Args:
-        entries: [C, size], of the one stage.
+        entries: [C, size].
         header: the scene.
         book: the codebook's record.
         layer: of the chunk.
@@ -159,12 +153,11 @@ def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecor
 
 def _fill_values(book: Codebook, header: SceneHeader) -> None:
     """Compute the coefficients of each entry once, so that splats copy them."""
-    (size,) = book.sizes
     count = sum(2 * band + 1 for band in book.entries)
-    book.values = np.empty((size, count, 3), np.float32)
+    book.values = np.empty((book.record.size, count, 3), np.float32)
     row = 0
     for band in sorted(book.entries):
-        columns = Columns(book.entries[band][0].T, (0,) * (3 * (2 * band + 1)), 0, 0)
+        columns = Columns(book.entries[band].T, (0,) * (3 * (2 * band + 1)), 0, 0)
         record = header.attribute(_spec.ATTRIBUTE_SH0 + band)
         write_colour(columns, record, book.values[:, row : row + 2 * band + 1])
         row += 2 * band + 1

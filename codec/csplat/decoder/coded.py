@@ -69,9 +69,9 @@ def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) ->
         coding = read_block_head(cursor, attribute, legal)
         escapes = read_columns(cursor, context.header, attribute, coding, params.escape_count, escape=True)
     layer = _spec.ATTRIBUTE_LAYER[attribute]
-    entries = tuple(stage[:, columns] for stage in book.entries[layer])
-    block = Coded(indices, entries, escapes, summand, at)
-    _check_sums(block, context, attribute)
+    block = Coded(indices, book.entries[layer][:, columns], escapes, summand, at)
+    if summand is not None:
+        _check_sums(block, context)  # of other blocks CBK-7 has looked at the entries
     return block
 
 
@@ -110,22 +110,14 @@ def _read_indices(
     cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, at: int
 ) -> Indices:
     count = context.tile.splat_count
-    stages = []
-    for stage, size in enumerate(book.sizes):
-        stream_at = cursor.at
-        index = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
-        largest = int(index.max())
-        if largest >= size + (stage == 0):
-            raise FormatError(
-                _spec.ERROR_CODEBOOK,
-                stream_at,
-                "CBK-2",
-                f"index of stage {stage}",
-                found=largest,
-                wanted=f"{'at most' if stage == 0 else 'below'} {size}",
-            )
-        stages.append(index)
-    escaped = np.flatnonzero(stages[0] == book.sizes[0])
+    size, stream_at = book.record.size, cursor.at
+    places = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
+    largest = int(places.max())
+    if largest > size:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=f"at most {size}"
+        )
+    escaped = np.flatnonzero(places == size)
     if len(escaped) != escape_count:
         raise FormatError(
             _spec.ERROR_CODEBOOK,
@@ -135,7 +127,7 @@ def _read_indices(
             found=escape_count,
             wanted=len(escaped),
         )
-    return Indices(book, attribute, tuple(stages), escaped)
+    return Indices(book, attribute, places, escaped)
 
 
 def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Columns:
@@ -148,13 +140,11 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
     return Columns(elements.reshape(1, count), offsets, 0, at)
 
 
-def _check_sums(block: Coded, context: TileContext, attribute: int) -> None:
-    """CBK-6: the sums obey what QUA-1 and LAT-4 ask of integers that stand in a stream."""
-    record = context.header.attribute(attribute)
-    if len(block.entries) == 1 and block.summand is None:
-        return  # CBK-7: the entries do
-    if record.levels == 0 and block.bound << record.chroma_shift <= _spec.COLUMN_MAX:
+def _check_sums(block: Coded, context: TileContext) -> None:
+    """CBK-6: the sums of scales obey what LAT-4 asks of integers that stand in a stream."""
+    if block.bound <= _spec.COLUMN_MAX:
         return
+    record = context.header.attribute(_spec.ATTRIBUTE_SCALES)
     for start, stop in runs(context.tile.splat_count, 3):
         rows = block.rows(start, stop, _WIDE)
         lows = tuple(int(value) for value in rows.min(axis=1))

@@ -46,26 +46,15 @@ def _check_codebook(record: _spec.CodebookRecord, at: int, sh_degree: int) -> No
         legal = bands == (0, 0)
     if not legal:
         raise FormatError(_spec.ERROR_VALUE, at + places["band_first"], "CBR-2", "bands", found=bands)
-    if not 1 <= record.stage_count <= _spec.STAGES_MAX:
+    if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
         raise FormatError(
             _spec.ERROR_VALUE,
-            at + places["stage_count"],
-            "CBR-3",
-            "stage_count",
-            found=record.stage_count,
-            wanted=f"1 to {_spec.STAGES_MAX}",
+            at + places["size"],
+            "CBR-4",
+            "size of a codebook",
+            found=record.size,
+            wanted=f"1 to {_spec.CODEBOOK_ENTRIES_MAX}",
         )
-    for stage, size in enumerate(record.sizes):
-        high = _spec.CODEBOOK_ENTRIES_MAX if stage < record.stage_count else 0
-        if not min(1, high) <= size <= high:
-            raise FormatError(
-                _spec.ERROR_VALUE,
-                at + places["sizes"] + 4 * stage,
-                "CBR-4",
-                f"size of stage {stage}",
-                found=size,
-                wanted=f"{min(1, high)} to {high}",
-            )
 
 
 def read_extras(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[ExtraColumn, ...]:

@@ -158,7 +158,7 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
 
 
 def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
-    """Copy rows of float32 where one codebook of one stage serves all bands; False where not."""
+    """Copy rows of float32 where one codebook serves all bands; False where not."""
     first = blocks.get(1)
     if not isinstance(first, Coded) or len(blocks) != len(records):
         return False
@@ -168,7 +168,7 @@ def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRe
         return False
     if not all(isinstance(block, Coded) and block.indices is indices for block in blocks.values()):
         return False
-    np.take(values, indices.stages[0], axis=0, out=out, mode="clip")
+    np.take(values, indices.places, axis=0, out=out, mode="clip")
     return True
 
 

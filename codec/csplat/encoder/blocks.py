@@ -78,7 +78,7 @@ def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, co
 def codebook_block(
     attribute: int,
     codebook_id: int,
-    indices: list[Integers],
+    index: Integers | None,
     escape_count: int,
     escape: bytes,
     coding: Coding,
@@ -89,14 +89,14 @@ def codebook_block(
     Args:
         attribute: registry id.
         codebook_id: which codebook.
-        indices: [n] for each stage; empty for blocks that use those of the codebook's first block.
+        index: [n]; none for blocks that use that of the codebook's first block.
         escape_count: splats with the index "escaped".
         escape: their block, empty where there are none.
-        coding: how to code the indices.
+        coding: how to code the index.
         summand: [n], for scales of the kind SHAPE: what is added to all three.
     """
     params = _spec.pack_codebook_params(_spec.CodebookParams(codebook_id, 0, escape_count))
-    streams = b"".join(unsigned_stream(index, coding) for index in indices)
+    streams = b"" if index is None else unsigned_stream(index, coding)
     if summand is not None:
         streams += _offset_columns(summand[None], 0, coding)
     return _head(attribute, _spec.CODING_CODEBOOK) + params + streams + escape

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.encoder import blocks
-from csplat.encoder.colour import ShTables, quantise_rows
+from csplat.encoder.colour import ShBook, ShTables, quantise_rows
 from csplat.encoder.container import CodebookTable, FileChunk
-from csplat.encoder.kmeans import cluster, cluster_residual, rank_by_frequency
+from csplat.encoder.kmeans import cluster, rank_by_frequency
 from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
@@ -54,17 +54,17 @@ class Books:
 
 
 @dataclass(frozen=True)
-class _Stages:
+class _Trained:
     """A trained codebook.
 
     Attributes:
-        indices: by stage [N] int32; the size of the first stage says "escaped".
-        entries: by stage [size, 3K] int32, R, G, B of each coefficient.
+        index: [N] int32; the size says "escaped".
+        entries: [size, 3K] int32, R, G, B of each coefficient.
         error: weighted mean of the squared error that is left.
     """
 
-    indices: list[I32]
-    entries: list[I32]
+    index: I32
+    entries: I32
     error: float
 
 
@@ -93,9 +93,9 @@ def choose_sh(
     if plan.sh_coding == "auto" and (len(model) < _LEAST or not _escapes_fit(model.shN[:, :kept], fine)):
         return scalar
     judge = _Judge(weights, None if metric is None else metric.first(kept), draft.importance is not None)
-    stages = _train(model, judge, fine, options, report)
-    books = _books(tables, stages, fine)
-    if plan.sh_coding == "auto" and not _codebook_pays(model, judge, stages, books, sample[:_SAMPLE], plan):
+    trained = _train(model, judge, fine, options, report)
+    books = _books(tables, trained, fine)
+    if plan.sh_coding == "auto" and not _codebook_pays(model, judge, trained, books, sample[:_SAMPLE], plan):
         return scalar
     return fine, books
 
@@ -126,32 +126,26 @@ class _Judge:
         return np.asarray(squares * self.weights[rows])
 
 
-def _train(model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions, report: Progress) -> _Stages:
+def _train(model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions, report: Progress) -> _Trained:
     weights, threads = judge.weights, options.thread_count
     points = _lattice_points(model.shN, plan)
-    sizes = _sizes(len(model), plan, options)
-    effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if sizes[0] >= _MANY else {}
-    if len(sizes) == 1:
+    size = _size(len(model), plan, options)
+    effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if size >= _MANY else {}
 
-        def steps_done(done: int, steps: int) -> None:
-            report("codebook", done / steps)
+    def steps_done(done: int, steps: int) -> None:
+        report("codebook", done / steps)
 
-        first = cluster(points, weights, sizes[0], seed=options.seed, threads=threads, progress=steps_done, **effort)
-        found = [first if judge.metric is None else _refined(model.shN, points, judge.metric, first, plan, threads)]
-    else:
-        found = cluster_residual(points, weights, sizes, seed=options.seed, threads=threads, **effort)
-        report("codebook", 1.0)
-    ranked = [rank_by_frequency(index, entries) for entries, index in found]
-    indices = [index.astype(np.int32) for index, _ in ranked]
-    entries = [entry for _, entry in ranked]
-    errors = _errors(model.shN, indices, entries, plan, judge)
+    found = cluster(points, weights, size, seed=options.seed, threads=threads, progress=steps_done, **effort)
+    if judge.metric is not None:
+        found = _refined(model.shN, points, judge.metric, found, plan, threads)
+    ranked, entries = rank_by_frequency(found[1], found[0])
+    index = ranked.astype(np.int32)
+    errors = _errors(model.shN, index, entries, plan, judge)
     escaped = _escapes(model.shN, errors, plan, options, judge)
     errors[escaped] = 0.0
-    indices[0][escaped] = len(entries[0])
-    for stage in indices[1:]:
-        stage[escaped] = 0
+    index[escaped] = len(entries)
     total = float(weights.sum(dtype=np.float64)) or 1.0
-    return _Stages(indices, entries, float(errors.sum()) / total)
+    return _Trained(index, entries, float(errors.sum()) / total)
 
 
 def _refined(
@@ -176,13 +170,12 @@ def _lattice_points(shN: F32, plan: Plan) -> I16:
     return points
 
 
-def _sizes(count: int, plan: Plan, options: EncodeOptions) -> tuple[int, ...]:
-    """Choose entries per stage: an entry costs some 20 bytes, and saves error for the splats that use it."""
-    size = options.codebook_size
-    if size is None:
-        wanted = max(count * plan.codebook_share, min(_ENOUGH * plan.codebook_share, count / _USERS))
-        size = min(1 << max(round(math.log2(max(1.0, wanted))), 4), plan.codebook_most)
-    return (size,) * (options.codebook_stages or 1)
+def _size(count: int, plan: Plan, options: EncodeOptions) -> int:
+    """Choose how many entries: an entry costs some 20 bytes, and saves error for the splats that use it."""
+    if options.codebook_size is not None:
+        return options.codebook_size
+    wanted = max(count * plan.codebook_share, min(_ENOUGH * plan.codebook_share, count / _USERS))
+    return min(1 << max(round(math.log2(max(1.0, wanted))), 4), plan.codebook_most)
 
 
 def _escapes_fit(shN: F32, plan: Plan) -> bool:
@@ -190,17 +183,16 @@ def _escapes_fit(shN: F32, plan: Plan) -> bool:
     return 2.0 * float(max(shN.max(initial=0.0), -shN.min(initial=0.0))) < largest_exact(plan.sh_step)
 
 
-def _errors(shN: F32, indices: Sequence[I32], entries: Sequence[I32], plan: Plan, judge: _Judge) -> NDArray[np.float64]:
+def _errors(shN: F32, index: I32, entries: I32, plan: Plan, judge: _Judge) -> NDArray[np.float64]:
     """[N] weighted squared error of each splat; infinite where a coefficient was clipped."""
     kept = (plan.sh_degree + 1) ** 2 - 1
-    tables = [entry.astype(np.float32) * np.float32(plan.sh_step) for entry in entries]
+    table = entries.astype(np.float32) * np.float32(plan.sh_step)
     errors = np.empty(len(shN))
     for at in range(0, len(shN), _BLOCK):
         part = slice(at, at + _BLOCK)
         difference = shN[part, :kept].reshape(-1, 3 * kept).copy()
         clipped = np.abs(difference).max(axis=1) > (_CLIP - 1) * plan.sh_step
-        for table, index in zip(tables, indices, strict=True):
-            difference -= table[index[part]]
+        difference -= table[index[part]]
         errors[part] = judge.errors(difference, part)
         errors[part][clipped] = np.inf
     return errors
@@ -228,48 +220,42 @@ def _escapes(shN: F32, errors: NDArray[np.float64], plan: Plan, options: EncodeO
     return np.sort(tried[np.argsort(-gain, kind="stable")[:count]])
 
 
-def _books(tables: ShTables, stages: _Stages, plan: Plan) -> Books:
-    columns = []
-    for stage in stages.entries:
-        rgb = stage.reshape(len(stage), -1, 3).transpose(2, 1, 0).astype(np.float32)
-        columns.append(colour_integers(np.ascontiguousarray(rgb), plan.chroma_shift))
-    return books_of(replace(tables, index=stages.indices, entries=columns), plan)
+def _books(tables: ShTables, trained: _Trained, plan: Plan) -> Books:
+    rgb = trained.entries.reshape(len(trained.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
+    columns = colour_integers(np.ascontiguousarray(rgb), plan.chroma_shift)
+    return books_of(tables, ShBook(columns, trained.index), plan)
 
 
-def books_of(tables: ShTables, plan: Plan) -> Books:
-    """What a file says of a codebook, whose indices and entries the tables hold."""
-    columns = tables.entries
+def books_of(tables: ShTables, book: ShBook, plan: Plan) -> Books:
+    """What a file says of a codebook."""
     bands = range(1, plan.sh_degree + 1)
     chunks = []
     for band in bands:
-        head = _spec.pack_codebook_head(_spec.CodebookHead(_CODEBOOK_ID, band, len(columns)))
+        head = _spec.pack_codebook_head(_spec.CodebookHead(_CODEBOOK_ID, band, 0))
         span = slice(band * band - 1, (band + 1) ** 2 - 1)
-        streams = [signed_stream(np.ascontiguousarray(stage[:, span]).reshape(-1), plan.coding) for stage in columns]
-        chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + b"".join(streams), _CODEBOOK_ID, band))
-    record = CodebookTable(
-        _CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, plan.sh_degree), tuple(stage.shape[2] for stage in columns)
-    )
-    return Books(replace(tables, ids=(_CODEBOOK_ID,), layers=tuple(bands)), (record,), tuple(chunks))
+        stream = signed_stream(np.ascontiguousarray(book.entries[:, span]).reshape(-1), plan.coding)
+        chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + stream, _CODEBOOK_ID, band))
+    record = CodebookTable(_CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, plan.sh_degree), book.size)
+    return Books(replace(tables, book=book, ids=(_CODEBOOK_ID,), layers=tuple(bands)), (record,), tuple(chunks))
 
 
-def _codebook_pays(model: SplatModel, judge: _Judge, stages: _Stages, books: Books, sample: Rows, plan: Plan) -> bool:
+def _codebook_pays(model: SplatModel, judge: _Judge, trained: _Trained, books: Books, sample: Rows, plan: Plan) -> bool:
     """Compare bytes at equal error with scalar coding, tried on a sample at two steps.
 
     Between the two, scalar coding trades bytes for the logarithm of the error in a straight line.
     """
     count = len(model)
     spent = sum(len(chunk.payload) for chunk in books.chunks) / count
-    for index in stages.indices:
-        shares = np.bincount(index) / count
-        spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
+    shares = np.bincount(trained.index) / count
+    spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
     fine_bytes, fine_error = _try_scalar(model, judge, sample, plan)
     coarse_bytes, coarse_error = _try_scalar(model, judge, sample, replace(plan, sh_step=2 * plan.sh_step))
-    escaped = float((stages.indices[0] == len(stages.entries[0])).mean())
+    escaped = float((trained.index == len(trained.entries)).mean())
     spent += escaped * fine_bytes
     if not 0.0 < fine_error < coarse_error:
         return spent < fine_bytes
     per_halving = (fine_bytes - coarse_bytes) / math.log2(coarse_error / fine_error)
-    return spent + per_halving * math.log2(max(stages.error, 1e-30) / fine_error) < fine_bytes
+    return spent + per_halving * math.log2(max(trained.error, 1e-30) / fine_error) < fine_bytes
 
 
 def _try_scalar(model: SplatModel, judge: _Judge, sample: Rows, plan: Plan) -> tuple[float, float]:

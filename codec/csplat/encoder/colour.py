@@ -22,7 +22,7 @@ from csplat.encoder.quantise import (
 )
 from csplat.errors import InputError
 
-__all__ = ["Colour", "ShTables", "code_sh", "quantise_colour", "quantise_rows", "served_rows"]
+__all__ = ["Colour", "ShBook", "ShTables", "code_sh", "quantise_colour", "quantise_rows"]
 
 Integers = NDArray[Any]
 I32 = NDArray[np.int32]
@@ -41,6 +41,38 @@ class Colour:
     decoded: F32
 
 
+@dataclass(frozen=True, eq=False)
+class ShBook:
+    """SH by codebook.
+
+    Attributes:
+        entries: [3, K, size] Y, Co, Cg integers on the file's lattice.
+        index: [N] int32, entry of each splat; `size` says "escaped".
+    """
+
+    entries: I32
+    index: I32
+
+    @property
+    def size(self) -> int:
+        """Entries of the codebook."""
+        return int(self.entries.shape[2])
+
+    @property
+    def escaped(self) -> NDArray[np.intp]:
+        """Splats that bypass the codebook, ascending."""
+        return np.flatnonzero(self.index == self.size)
+
+    def select(self, order: NDArray[Any]) -> ShBook:
+        """The same for the splats `order`."""
+        return ShBook(self.entries, self.index[order])
+
+    def served(self, plan: Plan) -> F32:
+        """[N, K, 3] float32, what the entries decode to; nonsense for escaped splats."""
+        rgb = np.ascontiguousarray(colour_lifted(self.entries, plan.chroma_shift).transpose(2, 1, 0))
+        return np.take(lattice_values(rgb, plan.sh_step), self.index, axis=0, mode="clip")
+
+
 @dataclass(frozen=True)
 class ShTables:
     """What the SH stage decided for the whole file.
@@ -48,16 +80,14 @@ class ShTables:
     Attributes:
         weights: [N] importance, or None where splats are treated alike.
         reference: weight from which on a splat is quantised on the full lattice.
-        index: by stage [N], entry of each splat; the size of the first stage says "escaped".
-        entries: by stage [3, K, size] Y, Co, Cg integers on the file's lattice.
+        book: the codebook, if there is one.
         ids: codebook ids. layers: layers that use them.
         extras: names of the extra columns that are carried.
     """
 
     weights: F32 | None = None
     reference: float = 1.0
-    index: Sequence[Integers] = ()
-    entries: Sequence[I32] = ()
+    book: ShBook | None = None
     ids: Sequence[int] = ()
     layers: Sequence[int] = ()
     extras: Sequence[str] = ()
@@ -65,7 +95,7 @@ class ShTables:
     def select(self, order: NDArray[Any]) -> ShTables:
         """The same for the splats `order`."""
         weights = None if self.weights is None else self.weights[order]
-        return replace(self, weights=weights, index=[stage[order] for stage in self.index])
+        return replace(self, weights=weights, book=None if self.book is None else self.book.select(order))
 
 
 @dataclass(frozen=True)
@@ -103,8 +133,8 @@ def code_sh(shN: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, coar
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
     exponent = 0
-    if tables.entries:
-        layers = _code_by_codebook(source[:, :kept], rows, plan, tables, sums)
+    if tables.book is not None:
+        layers = _code_by_codebook(source[:, :kept], tables.book.select(rows), plan, tables.ids[0], sums)
     elif kept:
         columns, exponent, decoded = quantise_rows(source[:, :kept], plan, coarse)
         sums.add(source[:, :kept], decoded, 0)
@@ -146,13 +176,9 @@ def quantise_rows(source: F32, plan: Plan, coarse: I32 | None) -> tuple[Integers
     return columns, exponent, decoded
 
 
-def _code_by_codebook(
-    source: F32, rows: NDArray[np.intp], plan: Plan, tables: ShTables, sums: _BandSums
-) -> dict[int, bytes]:
-    """Write index streams in band 1, and the escaped splats' own values in every band."""
-    index = [stage[rows] for stage in tables.index]
-    decoded = served_rows(index, plan, tables)
-    escaped = np.flatnonzero(index[0] == tables.entries[0].shape[2])
+def _code_by_codebook(source: F32, book: ShBook, plan: Plan, id_: int, sums: _BandSums) -> dict[int, bytes]:
+    """Write the indices in band 1, and the escaped splats' own values in every band."""
+    decoded, escaped = book.served(plan), book.escaped
     coarse = np.full(len(escaped), plan.escape_coarse, np.int32)
     columns, exponent, own = quantise_rows(source[escaped], plan, coarse)
     if exponent:
@@ -166,24 +192,9 @@ def _code_by_codebook(
         if len(escaped):
             flat = columns[:, _span(band)].reshape(-1, len(escaped))
             escape = blocks.signed_block(attribute, flat, 0, plan.coding)
-        streams = index if band == 1 else []
-        layers[band] = blocks.codebook_block(attribute, tables.ids[0], streams, len(escaped), escape, plan.coding)
+        index = book.index if band == 1 else None
+        layers[band] = blocks.codebook_block(attribute, id_, index, len(escaped), escape, plan.coding)
     return layers
-
-
-def served_rows(index: Sequence[Integers], plan: Plan, tables: ShTables) -> F32:
-    """[n, K, 3] float32, what the codebook's entries decode to; nonsense for escaped splats."""
-    tables_rgb = []
-    for entries in tables.entries:
-        rgb = colour_lifted(entries, plan.chroma_shift).transpose(2, 1, 0)
-        tables_rgb.append(np.ascontiguousarray(rgb))
-    if len(index) == 1:
-        table = lattice_values(tables_rgb[0], plan.sh_step)
-        return np.take(table, index[0], axis=0, mode="clip")
-    total = np.take(tables_rgb[0], index[0], axis=0, mode="clip")
-    for stage, rgb in zip(index[1:], tables_rgb[1:], strict=True):
-        total += np.take(rgb, stage, axis=0)
-    return lattice_values(total, plan.sh_step)
 
 
 class _BandSums:

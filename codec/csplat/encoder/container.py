@@ -46,7 +46,7 @@ class CodebookTable:
     id: int
     kind: int
     bands: tuple[int, int]
-    sizes: tuple[int, ...]
+    size: int
 
 
 @dataclass(frozen=True)
@@ -155,10 +155,7 @@ def _index(
     parts = [_spec.pack_index_head(head)]
     parts += [_spec.pack_attribute_record(record) for record in scene.attributes]
     for book in scene.codebooks:
-        sizes = (*book.sizes, 0, 0, 0, 0)
-        record = _spec.CodebookRecord(
-            book.id, book.kind, *book.bands, len(book.sizes), 0, (sizes[0], sizes[1], sizes[2], sizes[3])
-        )
+        record = _spec.CodebookRecord(book.id, book.kind, *book.bands, 0, 0, book.size)
         parts.append(_spec.pack_codebook_record(record))
     parts += [_spec.pack_extra_record(record) for record in scene.extras]
     parts += [_spec.pack_directory_record(record) for record in directory]

@@ -7,7 +7,6 @@ see, by the functions that code the tiles; `Frozen.coded` codes these values.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from csplat.encoder.codebook import Books, books_of
 from csplat.encoder.coded import Coded
-from csplat.encoder.colour import ShTables, quantise_colour, quantise_rows, served_rows
+from csplat.encoder.colour import ShBook, ShTables, quantise_colour, quantise_rows
 from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
 from csplat.encoder.measure import measured_sums
 from csplat.encoder.plan import Plan, Progress
@@ -47,8 +46,8 @@ class FreeValues:
             entries and then one for each escaped splat.
         opacities: [N], alpha.
         sh0: [N, 3].
-        sh: [R, K, 3], the rows of SH that the file holds: one per splat; or, with a codebook, the entries of its
-            stages and then one for each escaped splat. K is that of the degree that is kept.
+        sh: [R, K, 3], the rows of SH that the file holds: one per splat; or, with a codebook, its entries and then one
+            for each escaped splat. K is that of the degree that is kept.
         sizes: [N], what a splat adds to the log scales of its entry, 0 if it is escaped; [0] without a codebook.
     """
 
@@ -116,24 +115,9 @@ class Frozen:
         return self.draft.origin.source_index
 
     @property
-    def stages(self) -> Sequence[I32]:
-        """By stage of the codebook [N], which row of its part of `sh` each splat uses; empty without a codebook.
-
-        The size of the first stage says "escaped".
-        """
-        return [np.asarray(index, np.int32) for index in self.tables.index]
-
-    @property
-    def stage_sizes(self) -> tuple[int, ...]:
-        """Entries of the codebook's stages."""
-        return tuple(int(stage.shape[2]) for stage in self.tables.entries)
-
-    @property
-    def escaped(self) -> I64:
-        """Splats that bypass the codebook, ascending."""
-        if not self.stage_sizes:
-            return np.zeros(0, np.int64)
-        return np.flatnonzero(self.stages[0] == self.stage_sizes[0])
+    def book(self) -> ShBook | None:
+        """The codebook of SH, if there is one."""
+        return self.tables.book
 
     @property
     def shapes(self) -> ShapeTables | None:
@@ -145,9 +129,8 @@ class Frozen:
         model, plan = self.draft.model, self.plan
         kept = (plan.sh_degree + 1) ** 2 - 1
         sh = np.ascontiguousarray(model.shN[:, :kept])
-        if self.stage_sizes:
-            entries = [_as_values(stage, plan) for stage in self.tables.entries]
-            sh = np.concatenate([*entries, sh[self.escaped]])
+        if self.book is not None:
+            sh = np.concatenate([_as_values(self.book.entries, plan), sh[self.book.escaped]])
         quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
         if self.shapes is not None:
             shared, own = self.shapes.entries, self.shapes.escaped
@@ -182,9 +165,9 @@ class Frozen:
         shapes, quats, scales = self._shapes(held)
         model, kept = self.draft.model, held.sh.shape[1]
         shN, books = np.zeros_like(model.shN), Books(self.tables)
-        if self.stage_sizes:
-            shN[self.escaped, :kept] = held.sh[sum(self.stage_sizes) :]
-            books = books_of(self._tables(held.sh), self.plan)
+        if self.book is not None:
+            shN[self.book.escaped, :kept] = held.sh[self.book.size :]
+            books = books_of(self.tables, self._moved(self.book, held.sh), self.plan)
         else:
             shN[:, :kept] = held.sh
         decoded = replace(model, **vars(self.seen(held)))
@@ -217,23 +200,22 @@ class Frozen:
 
     def seen_sh(self, sh: F32) -> F32:
         """SH of all splats [N, K, 3] as a decoder will see it, from the rows that the file holds."""
-        plan, tables = self.plan, self.tables
-        if self.stage_sizes:
-            tables = self._tables(sh)
-            seen = served_rows(list(tables.index), plan, tables)
-            seen[self.escaped] = self._seen_escapes(sh)
+        plan = self.plan
+        if self.book is not None:
+            seen = self._moved(self.book, sh).served(plan)
+            seen[self.book.escaped] = self._seen_escapes(self.book, sh)
             return seen
         seen = np.empty_like(sh)
         for tile in self.draft.tiles:
-            seen[tile.rows] = quantise_rows(sh[tile.rows], plan, coarseness(tile.rows, plan, tables))[2]
+            seen[tile.rows] = quantise_rows(sh[tile.rows], plan, coarseness(tile.rows, plan, self.tables))[2]
         return seen
 
     def seen_rows(self, sh: F32) -> F32:
         """The rows of SH that the file holds [R, K, 3] as a decoder will see them: entries by themselves."""
-        if not self.stage_sizes:
+        if self.book is None:
             return self.seen_sh(sh)
-        entries = [_as_values(stage, self.plan) for stage in self._tables(sh).entries]
-        return np.concatenate([*entries, self._seen_escapes(sh)])
+        entries = _as_values(self._moved(self.book, sh).entries, self.plan)
+        return np.concatenate([entries, self._seen_escapes(self.book, sh)])
 
     def seen_shape_rows(self, held: FreeValues, seen: DecodedValues) -> tuple[F32, F32, F32]:
         """Rotations, scales and sizes of `held` as their streams hold them; `seen` is what a decoder makes of them."""
@@ -249,9 +231,9 @@ class Frozen:
         shapes, quats, scales = self._shapes(held)
         return seen_shapes(quats, scales, self.draft.tiles, self.plan, shapes)
 
-    def _seen_escapes(self, sh: F32) -> F32:
-        coarse = np.full(len(self.escaped), self.plan.escape_coarse, np.int32)
-        return quantise_rows(sh[sum(self.stage_sizes) :], self.plan, coarse)[2]
+    def _seen_escapes(self, book: ShBook, sh: F32) -> F32:
+        own = sh[book.size :]
+        return quantise_rows(own, self.plan, np.full(len(own), self.plan.escape_coarse, np.int32))[2]
 
     def _shapes(self, held: FreeValues) -> tuple[ShapeTables | None, F32, F32]:
         """The codebook of shapes with these values, and rotations and scales by splat, which it stands in for."""
@@ -266,18 +248,14 @@ class Frozen:
         by_splat[0][own], by_splat[1][own] = held.quats[size:], held.scales[size:]
         return ShapeTables(entries, self.shapes.index, summand), *by_splat
 
-    def _tables(self, sh: F32) -> ShTables:
-        entries, first = [], 0
-        for size in self.stage_sizes:
-            entries.append(_as_integers(sh[first : first + size], self.plan))
-            first += size
-        return replace(self.tables, entries=entries)
+    def _moved(self, book: ShBook, sh: F32) -> ShBook:
+        return ShBook(_as_integers(sh[: book.size], self.plan), book.index)
 
 
 def _zeros(draft: Draft, tables: ShTables) -> NDArray[np.bool_] | None:
     plan = draft.plan
     kept = (plan.sh_degree + 1) ** 2 - 1
-    if tables.entries or not kept:
+    if tables.book is not None or not kept:
         return None
     zero = np.empty((len(draft.model), kept), np.bool_)
     for tile in draft.tiles:

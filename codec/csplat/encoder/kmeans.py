@@ -11,7 +11,6 @@ import numpy as np
 from csplat.encoder.nearest import F32, F64, I16, I32, I64, U32, search
 from csplat.errors import InputError
 
-_PART = 4096  # points that are float64 at a time
 _SEED_ROUNDS = 8
 
 
@@ -75,51 +74,6 @@ def cluster(
         progress(iterations + 2, iterations + 2)
     distinct, merged = _distinct(entries)
     return _drop_unused(distinct, merged[index])
-
-
-def cluster_residual(
-    points: I16 | I32,
-    weights: F32,
-    sizes: tuple[int, ...],
-    *,
-    seed: int,
-    iterations: int = 8,
-    sample_per_entry: int = 24,
-    near_groups: int = 0,
-    threads: int | None = None,
-) -> list[tuple[I32, U32]]:
-    """Cluster the points, then what each stage leaves: a point is the sum of its entries.
-
-    Arguments as in `cluster`, with one size per stage; stage s takes seed + s.
-
-    Returns:
-        Per stage entries [K, D] int32 and index [N] uint32, as `cluster` returns them.
-
-    Raises:
-        InputError: as `cluster`; or points whose residual could leave int32.
-    """
-    _check(points, weights)
-    if len(points) and max(abs(int(points.max())), abs(int(points.min()))) >= 2**30:
-        raise InputError("cluster_residual: points beyond +-2**30")
-    rest: I16 | I32 = points
-    stages = []
-    for stage, size in enumerate(sizes):
-        entries, index = cluster(
-            rest,
-            weights,
-            size,
-            seed=seed + stage,
-            iterations=iterations,
-            sample_per_entry=sample_per_entry,
-            near_groups=near_groups,
-            threads=threads,
-        )
-        stages.append((entries, index))
-        if stage + 1 < len(sizes):
-            rest = rest.astype(np.int32)
-            for a in range(0, len(rest), _PART):
-                rest[a : a + _PART] -= entries[index[a : a + _PART]]
-    return stages
 
 
 def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: int | None = None) -> U32:

@@ -35,8 +35,7 @@ class EncodeOptions:
         chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
         sh_degree: keep bands up to this one, 0 to 3; `None` keeps all.
         sh_coding: "auto", "codebook", "scalar" or "none".
-        codebook_size: entries of the SH codebook's first stage.
-        codebook_stages: residual stages, 1 to 4.
+        codebook_size: entries of the SH codebook.
         escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
         shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); 0,
             as by default: none. It is made only where the file becomes smaller.
@@ -72,7 +71,6 @@ class EncodeOptions:
     sh_degree: int | None = None
     sh_coding: str = "auto"
     codebook_size: int | None = None
-    codebook_stages: int | None = None
     escape_fraction: float | None = None
     shape_codebook_size: int | None = None
     shape_escape_fraction: float | None = None
@@ -168,7 +166,6 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "chroma_shift": (int, 0, _spec.CHROMA_SHIFT_MAX),
     "sh_degree": (int, 0, _spec.SH_DEGREE_MAX),
     "codebook_size": (int, 1, _spec.CODEBOOK_ENTRIES_MAX),
-    "codebook_stages": (int, 1, _spec.STAGES_MAX),
     "escape_fraction": (float, 0, 1),
     "shape_codebook_size": (int, 0, _spec.CODEBOOK_ENTRIES_MAX),
     "shape_escape_fraction": (float, 0, 1),

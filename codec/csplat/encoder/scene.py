@@ -46,7 +46,7 @@ def chosen_settings(draft: Draft, tables: ShTables) -> dict[str, Any]:
         "sh_coding": plan.sh_coding,
         "chroma_shift": plan.chroma_shift,
         "adaptive": plan.adaptive if plan.sh_coding == "scalar" else 0.0,
-        "codebook_sizes": [int(stage.shape[2]) for stage in tables.entries],
+        "codebook_size": 0 if tables.book is None else tables.book.size,
         **_of_shapes(draft.shapes),
         **({} if draft.grades is None else {"grades": draft.grades.as_json()}),
         "deflate_level": plan.coding.level,

@@ -82,9 +82,9 @@ class ShapeTables:
 
 def shape_book(tables: ShapeTables, coding: Coding) -> tuple[CodebookTable, FileChunk]:
     """What index and chunks say of the codebook."""
-    head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_BOOK, 0, 1))
+    head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_BOOK, 0, 0))
     stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), coding)
-    record = CodebookTable(SHAPE_BOOK, _spec.CODEBOOK_KIND_SHAPE, (0, 0), (tables.size,))
+    record = CodebookTable(SHAPE_BOOK, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)
     return record, FileChunk(_spec.CHUNK_CODEBOOK, head + stream, SHAPE_BOOK)
 
 
@@ -106,7 +106,7 @@ def shape_blocks(
         own_quats = blocks.signed_block(_spec.ATTRIBUTE_QUATS, quats[:, escaped], 0, coding)
     return [
         blocks.codebook_block(
-            _spec.ATTRIBUTE_SCALES, SHAPE_BOOK, [part.index], count, own_scales, coding, summand=part.summand
+            _spec.ATTRIBUTE_SCALES, SHAPE_BOOK, part.index, count, own_scales, coding, summand=part.summand
         ),
-        blocks.codebook_block(_spec.ATTRIBUTE_QUATS, SHAPE_BOOK, [], count, own_quats, coding),
+        blocks.codebook_block(_spec.ATTRIBUTE_QUATS, SHAPE_BOOK, None, count, own_quats, coding),
     ]

@@ -32,10 +32,9 @@ test('a budget of bytes counts four for each entry and column of a codebook', ()
   for (const { name } of manifest.filter(({ name }) => name.startsWith('valid/codebook_'))) {
     const { codebooks, directory } = readHeader(vector(name));
     let bytes = 0;
-    for (const { kind, bandFirst, bandLast, sizes } of codebooks) {
+    for (const { kind, bandFirst, bandLast, size } of codebooks) {
       kinds.add(kind);
-      const entries = sizes.reduce((sum, size) => sum + size);
-      for (let l = bandFirst; l <= bandLast; l++) bytes += 4 * entries * (columns[kind] ?? 3 * (2 * l + 1));
+      for (let l = bandFirst; l <= bandLast; l++) bytes += 4 * size * (columns[kind] ?? 3 * (2 * l + 1));
     }
     assert.equal(tableBytes(directory, new Map(codebooks.map((codebook) => [codebook.id, codebook]))), bytes, name);
   }

@@ -166,17 +166,17 @@ def _limits(band: int) -> Block:
 
 def _bounds() -> Scene:
     fine = Attribute(_spec.MAPPING_LATTICE, 2.0**-30)
-    shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]},))
-    colours = Codebook(0, _spec.CODEBOOK_KIND_SH0, ({0: [[1, -2, 3]]},))
+    shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})
+    colours = Codebook(0, _spec.CODEBOOK_KIND_SH0, {0: [[1, -2, 3]]})
     tiles = (
         tile(
             1,
             2,
             0,
             {
-                SCALES: book(2, ((0, 0),), summands=(_COLUMN, _COLUMN), escape=None),
+                SCALES: book(2, (0, 0), summands=(_COLUMN, _COLUMN), escape=None),
                 QUATS: book(2),
-                SH0: book(0, ((0, 1),), offset([[_COLUMN, 5, -5]], offsets=(_COLUMN, 0, -5))),
+                SH0: book(0, (0, 1), offset([[_COLUMN, 5, -5]], offsets=(_COLUMN, 0, -5))),
             },
         ),
         tile(
@@ -184,9 +184,9 @@ def _bounds() -> Scene:
             2,
             0,
             {
-                SCALES: book(2, ((1, 1),), summands=(-_COLUMN, -_COLUMN)),
+                SCALES: book(2, (1, 1), summands=(-_COLUMN, -_COLUMN)),
                 QUATS: book(2),
-                SH0: book(0, ((1, 0),), offset([[-_COLUMN, 0, 0]])),
+                SH0: book(0, (1, 0), offset([[-_COLUMN, 0, 0]])),
             },
         ),
     )
@@ -197,27 +197,23 @@ def _bounds() -> Scene:
 
 
 def _summands() -> Scene:
-    """One stage, and two; the entries of both as far below 0 as they can be."""
-    far, low = 2**31, [-(2**31)] * 3
-    one = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[*low, 1, 2, 3]]},), how=Stream(4))
-    two = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[*low, 1, 2, 3]]}, {0: [[*low, 4, 5, 6]]}), how=Stream(4))
-    tiles = []
-    for table, most in ((one, far + _COLUMN), (two, 2 * far + _COLUMN - 1)):
-        stages = tuple((0, 0) for _ in table.stages)
-        summands = (most, most - 2 * _COLUMN + 1)
-        first = replace(book(table.id, stages, summands=summands, offsets=(_COLUMN,)), how=Stream(4))
-        tiles.append(tile(changes={SCALES: first, QUATS: book(table.id)}))
+    """Entries as far below 0 as they can be."""
+    far = 2**31
+    table = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[-far, -far, -far, 1, 2, 3]]}, how=Stream(4))
+    summands = (far + _COLUMN, far - _COLUMN + 1)
+    first = replace(book(1, (0, 0), summands=summands, offsets=(_COLUMN,)), how=Stream(4))
     fine = Attribute(_spec.MAPPING_LATTICE, 2.0**-30)
-    return scene(tiles=tiles, codebooks=(one, two), attributes=attributes() | {SCALES: fine})
+    one = tile(changes={SCALES: first, QUATS: book(1)})
+    return scene(tiles=[one], codebooks=(table,), attributes=attributes() | {SCALES: fine})
 
 
 def _many() -> Scene:
     """16,400 splats; every index and escape in long runs."""
     n, border = 16_400, 16_384
     how = Stream(1, _RUNS)
-    colours = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[9, 8, 7], [-6, -5, 4]]}, {0: [[0, 0, 0], [50, -50, 5]]}))
-    shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]},))
-    bands = Codebook(3, _spec.CODEBOOK_KIND_SH, ({1: [[*range(9)], [*range(9, 0, -1)]]},), (1, 1))
+    colours = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[9, 8, 7], [-6, -5, 4]]})
+    shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})
+    bands = Codebook(3, _spec.CODEBOOK_KIND_SH, {1: [[*range(9)], [*range(9, 0, -1)]]}, (1, 1))
     escaped = {0, border - 1, border, n - 1}
 
     def indices(period: int) -> tuple[int, ...]:
@@ -230,14 +226,13 @@ def _many() -> Scene:
     blocks = {
         a: replace(b, rows=[list(b.rows[0])] * n, how=replace(b.how, transforms=_RUNS)) for a, b in same.blocks.items()
     }
-    later = tuple(i // 3000 % 2 for i in range(n))
     blocks |= {
         SCALES: replace(
-            book(2, (indices(7000),), signed(rows(3)), how, summands=tuple(-(i // 4000) for i in range(n))), how=how
+            book(2, indices(7000), signed(rows(3)), how, summands=tuple(-(i // 4000) for i in range(n))), how=how
         ),
         QUATS: book(2, (), signed(rows(3))),
-        SH0: book(1, (indices(5000), later), signed(rows(3)), how),
-        sh_attribute(1): book(3, (indices(6000),), signed(rows(9)), how),
+        SH0: book(1, indices(5000), signed(rows(3)), how),
+        sh_attribute(1): book(3, indices(6000), signed(rows(9)), how),
     }
     return scene(1, [replace(same, blocks=blocks)], codebooks=(colours, shapes, bands))
 

@@ -41,38 +41,26 @@ def extreme_stream_recipes() -> list[Recipe]:
 
 def _codebooks() -> list[Recipe]:
     n = _spec.CODEBOOK_ENTRIES_MAX
-    flat = Codebook(65535, _spec.CODEBOOK_KIND_SH0, ({0: [[3, -4, 5]] * (n - 1) + [[7, 7, 7]]},), how=Stream(1, _RUNS))
-    wide = book(65535, ((n - 1, n, 0),), signed([[1, 2, 3]]), Stream(3))
+    flat = Codebook(65535, _spec.CODEBOOK_KIND_SH0, {0: [[3, -4, 5]] * (n - 1) + [[7, 7, 7]]}, how=Stream(1, _RUNS))
+    wide = book(65535, (n - 1, n, 0), signed([[1, 2, 3]]), Stream(3))
     unused = (
-        Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3]]},)),
-        Codebook(2, _spec.CODEBOOK_KIND_SH, ({1: rows_of(1, 2, 9, -1, 1)},), (1, 1)),
+        Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]}),
+        Codebook(2, _spec.CODEBOOK_KIND_SH, {1: rows_of(1, 2, 9, -1, 1)}, (1, 1)),
     )
-    stages = tuple({0: rows_of(k, 2, 3, -9, 9)} for k in range(2))
-    two = Codebook(4, _spec.CODEBOOK_KIND_SH0, stages)
-    junk = book(4, ((2, 0, 2), (1, 1, 0)), signed([[9, 8, 7], [6, 5, 4]]))
-    low, high = {0: [[-(2**31), 2**31 - 1, 0]]}, {0: [[2**31 - 1, -(2**31), 0]]}
-    far = Codebook(6, _spec.CODEBOOK_KIND_SCALES, (low, low, high, high), how=Stream(4))
-    alone = Codebook(3, _spec.CODEBOOK_KIND_QUATS, ({0: [[-200, 0, 0]]}, {0: [[201, 3, 4], [190, 5, 6]]}))
-    shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(3, 2, 6, -9, 9)},))
+    two = Codebook(4, _spec.CODEBOOK_KIND_SH0, {0: rows_of(0, 2, 3, -9, 9)})
+    shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(3, 2, 6, -9, 9)})
     ignored = {
-        SCALES: book(9, ((2, 0, 1),), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
+        SCALES: book(9, (2, 0, 1), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
         QUATS: book(9, (), signed([[4, 5, 6]])),
     }
-    entries = ([[1, -2, 3], [2**30, 0, -(2**31)]], [[4, 5, 6], [0, 2**31 - 1, 0]])
-    wild = Codebook(8, _spec.CODEBOOK_KIND_SH0, tuple({0: stage} for stage in entries), how=Stream(4))
-    thrice = tuple({1: [entry * 3 for entry in stage]} for stage in entries)
-    far_sh = Codebook(8, _spec.CODEBOOK_KIND_SH, thrice, (1, 1), Stream(4))
-    bands = {SH0 + 1: book(8, ((0, 2, 0), (0, 0, 0)), signed([[5, -6, 7] * 3]))}
     largest = _spec.COLUMN_MAX
     at_bounds = (
-        Codebook(2, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3], [127, -127, 0], [0, 127, 127]]},)),
-        Codebook(3, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [largest, 0, -largest]]},), how=Stream(4)),
+        Codebook(2, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3], [127, -127, 0], [0, 127, 127]]}),
+        Codebook(3, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3], [largest, 0, -largest]]}, how=Stream(4)),
     )
     ids = {QUATS: 2, SH0: 3}
-    shifted = Codebook(
-        1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]},), how=Stream(4)
-    )
-    back = {SCALES: book(1, ((0, 0, 0),), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: book(1)}
+    shifted = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]}, how=Stream(4))
+    back = {SCALES: book(1, (0, 0, 0), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: book(1)}
     return [
         _recipe(
             "codebook_of_65536",
@@ -90,13 +78,7 @@ def _codebooks() -> list[Recipe]:
             "codebook_all_escaped",
             "no splat uses an entry",
             "CBK-3",
-            replace(_with({SH0: book(4, ((2, 2, 2), (0, 0, 0)), signed([[1, 2, 3]] * 3))}), codebooks=(two,)),
-        ),
-        _recipe(
-            "codebook_unused_indices",
-            "later indices of escaped splats are not 0: ignored",
-            "CBK-2",
-            replace(_with({SH0: junk}), codebooks=(two,)),
+            replace(_with({SH0: book(4, (2, 2, 2), signed([[1, 2, 3]] * 3))}), codebooks=(two,)),
         ),
         _recipe(
             "codebook_unused_summand",
@@ -105,31 +87,11 @@ def _codebooks() -> list[Recipe]:
             replace(_with(ignored), codebooks=(shape,)),
         ),
         _recipe(
-            "codebook_sums_beyond_32_bits",
-            "entries of ±2^31 that add up to −2, by way of −2^32",
-            "CBK-6 LAT-4",
-            replace(_with({SCALES: book(6, ((0, 0, 0),) * 4)}, records={SCALES: _lattice(2.0**-30)}), codebooks=(far,)),
-        ),
-        _recipe(
-            "codebook_unused_entries",
-            "entries of two stages beyond every limit that no splat uses",
-            "CBK-6 LAT-5",
-            replace(
-                _with({SH0: book(8, ((0, 0, 0), (0, 0, 0)))}, records={SH0: _lattice(2.0**100)}), codebooks=(wild,)
-            ),
-        ),
-        _recipe(
-            "codebook_unused_entries_sh",
-            "the same in an SH codebook, whose last entry stands where the escaped splat has none",
-            "CBK-6 LAT-5",
-            replace(_with(bands, records={SH0 + 1: _lattice(2.0**100)}), codebooks=(far_sh,), sh_degree=1),
-        ),
-        _recipe(
             "codebook_entries_at_bounds",
             "rotations and colours that no splat uses and that are just allowed",
             "CBK-7",
             replace(
-                _with({a: book(id, ((0, 0, 0),)) for a, id in ids.items()}, records={SH0: _lattice(2.0**105)}),
+                _with({a: book(id, (0, 0, 0)) for a, id in ids.items()}, records={SH0: _lattice(2.0**105)}),
                 codebooks=at_bounds,
             ),
         ),
@@ -138,12 +100,6 @@ def _codebooks() -> list[Recipe]:
             "scales of shapes beyond binary32, which the summands bring back",
             "CBK-7 CBK-6",
             replace(_with(back, records={SCALES: _lattice(2.0**106)}), codebooks=(shifted,)),
-        ),
-        _recipe(
-            "codebook_negative_entries",
-            "rotations that only the sum makes legal",
-            "CBK-6 QUA-1",
-            replace(_with({QUATS: book(3, ((0, 0, 0), (0, 1, 0)))}), codebooks=(alone,)),
         ),
     ]
 

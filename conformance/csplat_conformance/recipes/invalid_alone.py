@@ -1,7 +1,7 @@
 """Invalid files in which nothing but the one rule is broken: a decoder that does not check it finds all else right.
 
-Where a field is overwritten in a whole file, something else often refuses it, too: an index that says too many stages
-leads to a stream that is not there. Here sizes, counts and streams follow the defect.
+Where a field is overwritten in a whole file, something else often refuses it, too: an index that says too many entries
+leads to a stream that is too short. Here sizes, counts and streams follow the defect.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from dataclasses import replace
 
 from csplat import _spec
-from csplat_conformance.broken import cut, patched, small, whole
+from csplat_conformance.broken import patched, small, whole
 from csplat_conformance.builder import Built, build
 from csplat_conformance.repair import seal
 from csplat_conformance.samples import (
@@ -151,41 +151,20 @@ def _codebooks() -> list[Recipe]:
 
     def sh(bands: tuple[int, int], *layers: int) -> Codebook:
         entries = {layer: rows_of(layer, 2, 3 * (2 * layer + 1), -9, 9) for layer in layers}
-        return Codebook(3, _spec.CODEBOOK_KIND_SH, (entries,), bands)
+        return Codebook(3, _spec.CODEBOOK_KIND_SH, entries, bands)
 
-    def scales(number: int, stages: int = 1, *layers: int) -> Codebook:
-        stage = {layer: rows_of(layer, 2, 3, -9, 9) for layer in layers or (0,)}
-        return Codebook(number, _spec.CODEBOOK_KIND_SCALES, (stage,) * stages)
+    def scales(number: int, *layers: int) -> Codebook:
+        entries = {layer: rows_of(layer, 2, 3, -9, 9) for layer in layers or (0,)}
+        return Codebook(number, _spec.CODEBOOK_KIND_SCALES, entries)
 
-    four = build(scene(tiles=[], codebooks=(scales(3, 4),)))
     one = build(scene(tiles=[], codebooks=(scales(3),)))
-    no_stage = {"codebook[3].stage_count": 0, "codebook[3].sizes": (0, 0, 0, 0), "CODB.3.0/head.stage_count": 0}
-    one_stage = one.spans["CODB.3.0"][1] - _spec.CHUNK_HEADER_SIZE - _spec.CODEBOOK_HEAD_SIZE
     too_many = [[7] * 3] * (_spec.CODEBOOK_ENTRIES_MAX + 1)
-    many = Codebook(3, _spec.CODEBOOK_KIND_SH0, ({0: too_many},), how=Stream(1, _RUNS))
+    many = Codebook(3, _spec.CODEBOOK_KIND_SH0, {0: too_many}, how=Stream(1, _RUNS))
     shared = scene(tiles=[], codebooks=(scales(2), scales(3)), chunks=(_META,), order=("META", "CODB.2.0"))
     no_bands = scene(2, [], codebooks=(sh((2, 1), 1),), chunks=(_META,), order=("META",))
     bands = "codebook[3].band_first"
     return [
-        patched(
-            "codebook_of_five_stages",
-            "five stages in record and chunk, four sizes and streams",
-            "CBR-3",
-            "E_VALUE",
-            four,
-            {"codebook[3].stage_count": 5, "CODB.3.0/head.stage_count": 5},
-        ),
-        cut(
-            "codebook_of_no_stage",
-            "no stage in record and chunk, and no stream",
-            "CBR-3",
-            "E_VALUE",
-            one,
-            one_stage,
-            "codebook[3].stage_count",
-            no_stage,
-        ),
-        record("of_65537", "65,537 entries", "CBR-4", "sizes", many),
+        record("of_65537", "65,537 entries", "CBR-4", "size", many),
         patched(
             "codebook_ids_share_a_chunk",
             "two records of one id, and one chunk of that id",
@@ -217,7 +196,7 @@ def _codebooks() -> list[Recipe]:
             "bands 0 and 1 of a codebook of scales, with a chunk for each",
             "CBR-2",
             "band_first",
-            replace(scales(3, 1, 0, 1), bands=(0, 1)),
+            replace(scales(3, 0, 1), bands=(0, 1)),
         ),
         patched(
             "codebook_last_band_of_scales",
@@ -233,7 +212,7 @@ def _codebooks() -> list[Recipe]:
             "band 1 as the only one of a codebook of scales, with a chunk of layer 1",
             "CBR-2",
             "band_first",
-            replace(scales(3, 1, 1), bands=(1, 1)),
+            replace(scales(3, 1), bands=(1, 1)),
         ),
     ]
 
@@ -271,7 +250,7 @@ def _directory() -> list[Recipe]:
                     f"directory[{value.decode()}].type",
                 )
             )
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(0, 2, 3, -9, 9)},))
+    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
     payload = _payload(build(scene(tiles=[], codebooks=(table,))), "CODB.3.0")
 
     def surplus(name: str, why: str, number: int) -> Recipe:

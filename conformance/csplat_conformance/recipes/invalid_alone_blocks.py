@@ -189,8 +189,8 @@ def _coded() -> list[Recipe]:
     """Blocks of codebooks."""
 
     def shape(name: str, why: str, clause: str, summand: int, entry: int, at: str) -> Recipe:
-        table = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, ({0: [[entry] * 3 + [0] * 3]},))
-        blocks = {SCALES: book(2, ((0, 0),), summands=(summand,) * 2), QUATS: book(2)}
+        table = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[entry] * 3 + [0] * 3]})
+        blocks = {SCALES: book(2, (0, 0), summands=(summand,) * 2), QUATS: book(2)}
         made = scene(tiles=[tile(changes=blocks)], codebooks=(table,))
         made = replace(made, attributes=made.attributes | {SCALES: Attribute(_spec.MAPPING_LATTICE, 2.0**-30)})
         code = "E_VALUE" if clause == "LAT-3" else "E_RANGE"
@@ -201,18 +201,18 @@ def _coded() -> list[Recipe]:
         why = f"an escape block of {name} that says CODEBOOK and holds another coding"
         return patched(f"escape_of_{name}_by_codebook", why, "CBK-5", "E_STREAM", base, coding)
 
-    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3]]},))
-    shades = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3]]},))
+    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]})
+    shades = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3]]})
     elsewhere = (
-        (QUATS, turns, book(1, ((0, 1),), offset([[4, 5, 6]]))),
-        (SH0, shades, book(1, ((0, 1),), Block(_spec.CODING_LEVELS, [[4, 5, 6]]))),
+        (QUATS, turns, book(1, (0, 1), offset([[4, 5, 6]]))),
+        (SH0, shades, book(1, (0, 1), Block(_spec.CODING_LEVELS, [[4, 5, 6]]))),
     )
-    turn = tile(changes={QUATS: book(1, ((0, 1),), signed([[4, 5, 6]]))})
-    both = Codebook(4, _spec.CODEBOOK_KIND_SH, ({b: rows_of(b, 2, 6 * b + 3, -9, 9) for b in (1, 2)},), (1, 2))
-    first = book(4, ((0, 2),), signed(rows_of(7, 1, 9, -9, 9)))
+    turn = tile(changes={QUATS: book(1, (0, 1), signed([[4, 5, 6]]))})
+    both = Codebook(4, _spec.CODEBOOK_KIND_SH, {b: rows_of(b, 2, 6 * b + 3, -9, 9) for b in (1, 2)}, (1, 2))
+    first = book(4, (0, 2), signed(rows_of(7, 1, 9, -9, 9)))
     fewer = scene(2, [tile(degree=2, changes={sh_attribute(1): first, sh_attribute(2): book(4)})], codebooks=(both,))
-    bands = Codebook(4, _spec.CODEBOOK_KIND_SH, ({2: rows_of(2, 2, 15, -9, 9)},), (2, 2))
-    other = scene(2, [tile(degree=2, changes={sh_attribute(1): book(4, ((0, 1),))})], codebooks=(bands,))
+    bands = Codebook(4, _spec.CODEBOOK_KIND_SH, {2: rows_of(2, 2, 15, -9, 9)}, (2, 2))
+    other = scene(2, [tile(degree=2, changes={sh_attribute(1): book(4, (0, 1))})], codebooks=(bands,))
     return [
         shape(
             "summand_offset_high",
@@ -237,7 +237,7 @@ def _coded() -> list[Recipe]:
             "opacities by a codebook, which no kind is for",
             "BLK-1",
             "E_VALUE",
-            scene(tiles=[tile(changes={OPACITIES: book(1, ((0, 0),))})], codebooks=(shades,)),
+            scene(tiles=[tile(changes={OPACITIES: book(1, (0, 0))})], codebooks=(shades,)),
             "TILE.0.0/opacities.coding",
         ),
         escaped("quats", build(scene(tiles=[turn], codebooks=(turns,))), "TILE.0.0/quats"),

@@ -10,7 +10,6 @@ from csplat_conformance.builder import build
 from csplat_conformance.samples import (
     QUATS,
     SCALES,
-    SH0,
     Recipe,
     book,
     quat_rows,
@@ -33,12 +32,12 @@ def alone_book_recipes() -> list[Recipe]:
 
 
 def _shape(number: int) -> Codebook:
-    return Codebook(number, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(number, 2, 6, -40, 40)},))
+    return Codebook(number, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(number, 2, 6, -40, 40)})
 
 
 def _bands(number: int, first: int = 1, last: int = 2, layers: tuple[int, ...] = ()) -> Codebook:
     entries = {band: rows_of(band, 2, 6 * band + 3, -9, 9) for band in layers or range(first, last + 1)}
-    return Codebook(number, _spec.CODEBOOK_KIND_SH, (entries,), (first, last))
+    return Codebook(number, _spec.CODEBOOK_KIND_SH, entries, (first, last))
 
 
 def _later_blocks() -> list[Recipe]:
@@ -53,8 +52,8 @@ def _later_blocks() -> list[Recipe]:
     def colours(first: Block, second: Block, *books: Codebook) -> Scene:
         return scene(2, [tile(n=3, changes={_SH1: first, _SH2: second})], codebooks=books)
 
-    indices, sums = ((0, 1, 0),), (-50, -40, -60)
-    first = book(1, ((0, 2, 1),), signed(rows_of(7, 1, 3, -9, 9)), summands=sums)
+    indices, sums = (0, 1, 0), (-50, -40, -60)
+    first = book(1, (0, 2, 1), signed(rows_of(7, 1, 3, -9, 9)), summands=sums)
     unescaped = book(1, indices, summands=sums)
     quats, turn = "TILE.0.0/quats", signed(quat_rows(8, 1))
     return [
@@ -108,11 +107,9 @@ def _later_blocks() -> list[Recipe]:
 
 def _parts() -> list[Recipe]:
     """Indices, summands and escape blocks."""
-    two = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)}, {0: rows_of(5, 2, 3, -60, 60)}))
-    escaped = tile(changes={SH0: book(1, ((0, 3), (1, 2)), signed([[1, 2, 3]]))})
-    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[1, 2, 3]]},))
-    turn = build(scene(tiles=[tile(changes={QUATS: book(1, ((0, 1),), signed([[4, 5, 6]]))})], codebooks=(turns,)))
-    block = book(1, ((0, 1),), summands=(-50, -40))
+    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]})
+    turn = build(scene(tiles=[tile(changes={QUATS: book(1, (0, 1), signed([[4, 5, 6]]))})], codebooks=(turns,)))
+    block = book(1, (0, 1), summands=(-50, -40))
     wide = replace(block, how=Stream(5))
     summand, escape = "TILE.0.0/scales.summand", "TILE.0.1/sh1.escape"
 
@@ -127,14 +124,6 @@ def _parts() -> list[Recipe]:
         "tile_head_of_extra": ("the head of the extra layer", "TILE.0.8/head.reserved_0"),
     }
     return [
-        whole(
-            "codebook_index_later_escaped",
-            "an index of stage 1 that is its size, of an escaped splat",
-            "CBK-2",
-            "E_CODEBOOK",
-            scene(tiles=[escaped], codebooks=(two,)),
-            "TILE.0.0/sh0.indices[1].width",
-        ),
         patched(
             "escape_exponent_of_quats",
             "an exponent in an escape block of rotations, which have no step",

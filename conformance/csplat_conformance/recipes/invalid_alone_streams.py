@@ -34,9 +34,9 @@ def alone_stream_recipes() -> list[Recipe]:
         made = scene(tiles=[tile(changes={OPACITIES: levels(values, how)})])
         return whole(name, why, clause, "E_STREAM", made, f"{_STREAM}.{field}")
 
-    def entries(name: str, why: str, clause: str, field: str, sizes: int, how: Stream) -> Recipe:
-        table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(0, 2, 3, -9, 9)},), how=how)
-        changes = {"codebook[3].sizes": (sizes, 0, 0, 0)}
+    def entries(name: str, why: str, clause: str, field: str, size: int, how: Stream) -> Recipe:
+        table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)}, how=how)
+        changes = {"codebook[3].size": size}
         return patched(
             name,
             why,
@@ -44,7 +44,7 @@ def alone_stream_recipes() -> list[Recipe]:
             "E_STREAM",
             build(scene(tiles=[], codebooks=(table,))),
             changes,
-            at=f"CODB.3.0/stage[0].{field}",
+            at=f"CODB.3.0/entries.{field}",
         )
 
     deflated = build(scene(tiles=[tile(changes={OPACITIES: levels([7, 8], Stream(coder="deflate_fixed"))})]))
@@ -80,8 +80,8 @@ def alone_stream_recipes() -> list[Recipe]:
             "an index more than splats",
             "STR-1",
             "E_STREAM",
-            _scales_by(book(3, ((0, 1, 0),))),
-            "TILE.0.0/scales.indices[0].count",
+            _scales_by(book(3, (0, 1, 0))),
+            "TILE.0.0/scales.indices.count",
         ),
         opacities(
             "width_of_nothing", "elements of no bytes, and no bytes", "STR-2", "width", [7, 8], Stream(0, packed=b"")
@@ -99,8 +99,8 @@ def alone_stream_recipes() -> list[Recipe]:
             "indices of five bytes",
             "STR-2",
             "E_STREAM",
-            _scales_by(book(3, ((0, 1),), how=Stream(5))),
-            "TILE.0.0/scales.indices[0].width",
+            _scales_by(book(3, (0, 1), how=Stream(5))),
+            "TILE.0.0/scales.indices.width",
         ),
         entries("width_5_of_entries", "entries of five bytes", "STR-2", "width", 2, Stream(5)),
         whole(
@@ -162,5 +162,5 @@ def alone_stream_recipes() -> list[Recipe]:
 
 
 def _scales_by(block: Block) -> Scene:
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(0, 2, 3, -9, 9)},))
+    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
     return scene(tiles=[tile(changes={SCALES: block})], codebooks=(table,))

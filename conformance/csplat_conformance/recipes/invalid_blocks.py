@@ -254,8 +254,8 @@ def _sparse() -> list[Recipe]:
 
     made = one(sparse((1, 0, 1), rows))
     base, few, many = build(made), {f"{params}.present_count": 1}, {f"{params}.present_count": 4}
-    escape = one(book(1, ((0, 2, 1),), sparse((1,), rows[:1])))
-    table = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: rows_of(2, 2, 9, -9, 9)},), (1, 1))
+    escape = one(book(1, (0, 2, 1), sparse((1,), rows[:1])))
+    table = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: rows_of(2, 2, 9, -9, 9)}, (1, 1))
     far = one(sparse((1, 0, 1), [[2**20] * 9] * 2, Stream(4)))
     limit = far.attributes | {sh1: Attribute(_spec.MAPPING_LATTICE, 2.0**115)}
     return [

@@ -103,7 +103,7 @@ def _chunks() -> list[Recipe]:
             {"directory[SERR].crc": 7},
             at="SERR/header.type",
         ),
-        whole("codebook_tail", "a byte after the last stage", "CDB-2", "E_STREAM", _codebook_tail(), "CODB.2.0/tail"),
+        whole("codebook_tail", "a byte after the stream", "CDB-2", "E_STREAM", _codebook_tail(), "CODB.2.0/tail"),
         _unknown_crc(),
         patched(
             "chunk_type_differs",
@@ -180,14 +180,6 @@ def _chunks() -> list[Recipe]:
             "E_INDEX",
             base,
             {"CODB.7.1/head.layer": 2},
-        ),
-        patched(
-            "codebook_chunk_stages",
-            "the payload has another number of stages",
-            "CDB-1",
-            "E_INDEX",
-            base,
-            {"CODB.7.1/head.stage_count": 1},
         ),
     ]
 

@@ -35,7 +35,7 @@ def _codebooks() -> list[Recipe]:
     made = rich_scene()
     base = rich()
     first = made.tiles[0]
-    one = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)},))
+    one = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: rows_of(4, 3, 3, -60, 60)})
 
     def sh0(block: Block, *books: Codebook, tables: tuple[int, ...] | None = None) -> Scene:
         return scene(tiles=[tile(changes={SH0: block}, tables=tables)], codebooks=books or (one,))
@@ -43,33 +43,23 @@ def _codebooks() -> list[Recipe]:
     def tiled(blocks: dict[int, Block]) -> Scene:
         return replace(made, tiles=(replace(first, blocks=first.blocks | blocks), made.tiles[1]))
 
-    scales = Codebook(1, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(4, 3, 3, -60, 60)},))
+    scales = Codebook(1, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(4, 3, 3, -60, 60)})
     escape = signed([[1, 2, 3]])
-    nested = book(1, ((0, 0),))
+    nested = book(1, (0, 0))
     without = {a: b for a, b in first.blocks.items() if a != sh_attribute(1)}
     lone = replace(made, tiles=(replace(first, blocks=without), made.tiles[1]))
-    two = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(4, 3, 3, -60, 60)}, {0: rows_of(5, 2, 3, -60, 60)}))
-    quat_book = Codebook(
-        1, _spec.CODEBOOK_KIND_QUATS, ({0: [[0, 0, 0], [127, 127, 1], [127, 0, 0]]}, {0: [[0, 0, 0], [1, 0, 0]]})
-    )
-
-    def quats(name: str, why: str, clauses: str, indices: tuple[tuple[int, ...], ...]) -> Recipe:
-        made = scene(tiles=[tile(changes={QUATS: book(1, indices)})], codebooks=(quat_book,))
-        return whole(name, why, clauses, "E_RANGE", made, "TILE.0.0/quats.attribute")
-
     far = Attribute(_spec.MAPPING_LATTICE, 2.0**107)
-    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, ({1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]},), (1, 1), Stream(4))
-    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[1, 2, 3], [0, 2**21, 0]]},), how=Stream(4))
-    halves = Codebook(1, _spec.CODEBOOK_KIND_SH0, ({0: [[2**20, 0, 0]]},) * 2, how=Stream(4))
-    summed = {SCALES: replace(book(2, ((0, 2, 1),), summands=(0, 2**21, 0)), how=Stream(4))}
-    shape = {SCALES: book(2, ((0, 2, 1),), summands=(2**22, 2**22, 2**22))}
+    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]}, (1, 1), Stream(4))
+    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3], [0, 2**21, 0]]}, how=Stream(4))
+    summed = {SCALES: replace(book(2, (0, 2, 1), summands=(0, 2**21, 0)), how=Stream(4))}
+    shape = {SCALES: book(2, (0, 2, 1), summands=(2**22, 2**22, 2**22))}
     return [
         whole(
             "codebook_unlisted",
             "a codebook that the tile does not list",
             "CBK-1",
             "E_CODEBOOK",
-            sh0(book(1, ((0, 1),)), tables=()),
+            sh0(book(1, (0, 1)), tables=()),
             "TILE.0.0/sh0.params.codebook_id",
         ),
         whole(
@@ -77,7 +67,7 @@ def _codebooks() -> list[Recipe]:
             "sh0 by a codebook of scales",
             "CBK-1",
             "E_CODEBOOK",
-            sh0(book(1, ((0, 1),)), scales),
+            sh0(book(1, (0, 1)), scales),
             "TILE.0.0/sh0.params.codebook_id",
         ),
         whole(
@@ -85,23 +75,15 @@ def _codebooks() -> list[Recipe]:
             "an index above the escape index",
             "CBK-2",
             "E_CODEBOOK",
-            sh0(book(1, ((0, 4),))),
-            "TILE.0.0/sh0.indices[0].width",
-        ),
-        whole(
-            "codebook_index_later",
-            "an index of stage 1 that is its size",
-            "CBK-2",
-            "E_CODEBOOK",
-            sh0(book(1, ((0, 1), (2, 0))), two),
-            "TILE.0.0/sh0.indices[1].width",
+            sh0(book(1, (0, 4))),
+            "TILE.0.0/sh0.indices.width",
         ),
         whole(
             "codebook_escape_unasked",
             "an escaped splat, and none announced",
             "CBK-3",
             "E_CODEBOOK",
-            sh0(book(1, ((0, 3),))),
+            sh0(book(1, (0, 3))),
             "TILE.0.0/sh0.params.escape_count",
         ),
         whole(
@@ -109,7 +91,7 @@ def _codebooks() -> list[Recipe]:
             "no escaped splat, and one announced",
             "CBK-3",
             "E_CODEBOOK",
-            sh0(book(1, ((0, 1),), escape)),
+            sh0(book(1, (0, 1), escape)),
             "TILE.0.0/sh0.params.escape_count",
         ),
         patched(
@@ -150,7 +132,7 @@ def _codebooks() -> list[Recipe]:
             "an escape block coded CODEBOOK",
             "CBK-5",
             "E_STREAM",
-            sh0(book(1, ((0, 3),), replace(nested, rows=((0, 0, 0),)))),
+            sh0(book(1, (0, 3), replace(nested, rows=((0, 0, 0),)))),
             "TILE.0.0/sh0.escape.coding",
         ),
         patched(
@@ -166,29 +148,21 @@ def _codebooks() -> list[Recipe]:
             "an entry whose value leaves binary32",
             "LAT-5 CBK-7",
             "E_RANGE",
-            replace(sh0(book(1, ((0, 1),)), large), attributes=attributes() | {SH0: far}),
-            "CODB.1.0/stage[0].width",
+            replace(sh0(book(1, (0, 1)), large), attributes=attributes() | {SH0: far}),
+            "CODB.1.0/entries.width",
         ),
         whole(
             "codebook_sh_value_beyond_float32",
-            "the same in an SH codebook of one stage, whose values a decoder may compute once for all tiles",
+            "the same in an SH codebook, whose values a decoder may compute once for all tiles",
             "LAT-5 CBK-7",
             "E_RANGE",
             scene(
                 1,
-                [tile(degree=1, changes={sh_attribute(1): book(1, ((0, 1),))})],
+                [tile(degree=1, changes={sh_attribute(1): book(1, (0, 1))})],
                 codebooks=(large_sh,),
                 attributes=attributes(1) | {sh_attribute(1): far},
             ),
-            "CODB.1.1/stage[0].width",
-        ),
-        whole(
-            "codebook_value_in_stages",
-            "two entries whose sum leaves binary32",
-            "LAT-5 CBK-6",
-            "E_RANGE",
-            replace(sh0(book(1, ((0, 0), (0, 0))), halves), attributes=attributes() | {SH0: far}),
-            "TILE.0.0/sh0.attribute",
+            "CODB.1.1/entries.width",
         ),
         whole(
             "codebook_value_of_shape",
@@ -204,10 +178,8 @@ def _codebooks() -> list[Recipe]:
             "COD-2",
             "E_CODER",
             scene(codebooks=(replace(one, how=Stream(1, coder="deflate", coded=b"\xff\xff")),)),
-            "CODB.1.0/stage[0].coded",
+            "CODB.1.0/entries.coded",
         ),
-        quats("codebook_quat_radicand", "a sum whose R is below 0", "QUA-2 CBK-6", ((0, 1), (0, 0))),
-        quats("codebook_quat_component", "a sum beyond M", "QUA-1 CBK-6", ((0, 2), (0, 1))),
         whole(
             "codebook_summand_large",
             "entry plus summand beyond 2^22",
@@ -233,24 +205,24 @@ def _unused_entries() -> list[Recipe]:
     result = []
     for name, (why, clause, kind, attribute, entries) in kinds.items():
         made = scene(
-            tiles=[tile(changes={attribute: book(1, ((0, 0),))})],
-            codebooks=(Codebook(1, kind, ({0: entries},), how=four),),
+            tiles=[tile(changes={attribute: book(1, (0, 0))})],
+            codebooks=(Codebook(1, kind, {0: entries}, how=four),),
         )
         if clause == "LAT-5":
             made = replace(made, attributes=attributes() | {attribute: Attribute(_spec.MAPPING_LATTICE, far)})
         result.append(_unused(name, why, clause, made, "CODB.1.0"))
-    shape = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, ({0: [[1, 2, 3, 4, 5, 6], [1, 2, 3, 127, 127, -1]]},))
-    shapes = tile(changes={SCALES: book(1, ((0, 0),), summands=(5, 6)), QUATS: book(1)})
+    shape = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6], [1, 2, 3, 127, 127, -1]]})
+    shapes = tile(changes={SCALES: book(1, (0, 0), summands=(5, 6)), QUATS: book(1)})
     second = sh_attribute(2)
     lifted = [2 * 10**6] * 5 + [1, 15 * 10**5, 1, 1, 1] + [0] * 5  # red is 2 750 000 in the second coefficient
-    bands = ({1: [[1] * 9, [2] * 9], 2: [[1] * 15, lifted]},)
+    bands = {1: [[1] * 9, [2] * 9], 2: [[1] * 15, lifted]}
     colours = scene(
         2,
-        [tile(degree=2, changes={sh_attribute(1): book(1, ((0, 0),)), second: book(1)})],
+        [tile(degree=2, changes={sh_attribute(1): book(1, (0, 0)), second: book(1)})],
         codebooks=(Codebook(1, _spec.CODEBOOK_KIND_SH, bands, (1, 2), four),),
         attributes=attributes(2, ycocg=True) | {second: Attribute(_spec.MAPPING_YCOCG, far)},
     )
-    unnamed = Codebook(1, _spec.CODEBOOK_KIND_QUATS, ({0: [[127, 127, 127]]},))
+    unnamed = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[127, 127, 127]]})
     return [
         *result,
         _unused(
@@ -263,14 +235,14 @@ def _unused_entries() -> list[Recipe]:
             "QUA-2 CBK-7 CHK-2",
             "E_RANGE",
             scene(codebooks=(unnamed,)),
-            "CODB.1.0/stage[0].width",
+            "CODB.1.0/entries.width",
         ),
     ]
 
 
 def _unused(name: str, why: str, clause: str, made: Scene, chunk: str) -> Recipe:
     words = f"an entry that no splat uses: {why}" + (" beyond binary32" if clause == "LAT-5" else "")
-    return whole(f"codebook_unused_{name}", words, f"{clause} CBK-7", "E_RANGE", made, f"{chunk}/stage[0].width")
+    return whole(f"codebook_unused_{name}", words, f"{clause} CBK-7", "E_RANGE", made, f"{chunk}/entries.width")
 
 
 def _without_first(made: Scene) -> Scene:

@@ -50,15 +50,6 @@ def _codebooks_and_extras() -> list[Recipe]:
             at="codebook[7].band_first",
         ),
         patched(
-            "codebook_size_beyond",
-            "a size behind the last stage",
-            "CBR-4",
-            "E_VALUE",
-            base,
-            {"codebook[2].sizes": (3, 0, 1, 0)},
-            within=8,
-        ),
-        patched(
             "extra_name_latin",
             "a name that is not UTF-8",
             "EXR-2",

@@ -120,8 +120,7 @@ def _directory() -> list[Recipe]:
 
 def _without(made: Scene, name: str) -> Scene:
     codebooks = tuple(
-        replace(b, stages=tuple({k: v for k, v in stage.items() if f"CODB.{b.id}.{k}" != name} for stage in b.stages))
-        for b in made.codebooks
+        replace(b, entries={k: v for k, v in b.entries.items() if f"CODB.{b.id}.{k}" != name}) for b in made.codebooks
     )
     tiles = tuple(
         replace(t, blocks={a: b for a, b in t.blocks.items() if a != _spec.ATTRIBUTE_SH2}) for t in made.tiles

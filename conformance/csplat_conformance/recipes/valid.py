@@ -263,7 +263,7 @@ def _files() -> list[Recipe]:
         _recipe("two_tiles", "tiles with corners and exponents of their own", "TIL-7 TIL-9 IDX-7", two),
         _recipe(
             "rich",
-            "codebooks, stages, escapes, an absent layer, extras, chunks, all together",
+            "codebooks, escapes, an absent layer, extras, chunks, all together",
             "CBK-3 TIL-5 TIL-6 SER-4",
             rich,
         ),

@@ -61,7 +61,7 @@ def combined_recipes() -> list[Recipe]:
         *result,
         _recipe(
             "combined_codebooks",
-            "codebooks of every kind in one file, escapes of every coding, stages, extras and all known chunks",
+            "codebooks of every kind in one file, escapes of every coding, extras and all known chunks",
             "CBK-1 CBK-3 CBK-4 CBK-5 DIR-5 TIL-6",
             _all_codebooks(),
         ),
@@ -137,15 +137,15 @@ def _tile_of_widths(k: int, ways: Iterator[Stream]) -> Tile:
 
 def _all_codebooks() -> Scene:
     books = (
-        Codebook(2, _spec.CODEBOOK_KIND_SCALES, ({0: rows_of(2, 3, 3, -90, 0)},), how=Stream(2, (2, 3))),
-        Codebook(3, _spec.CODEBOOK_KIND_QUATS, ({0: rows_of(3, 2, 3, -40, 40)}, {0: rows_of(4, 2, 3, -9, 9)})),
-        Codebook(4, _spec.CODEBOOK_KIND_SHAPE, ({0: rows_of(5, 2, 6, -40, 40)}, {0: rows_of(6, 3, 6, -9, 9)})),
-        Codebook(5, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(7, 3, 3, -60, 60)},), how=Stream(4, (1, 2, 3, 4))),
-        Codebook(6, _spec.CODEBOOK_KIND_SH, ({1: rows_of(8, 3, 9, -50, 50)},), (1, 1), Stream(3)),
+        Codebook(2, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(2, 3, 3, -90, 0)}, how=Stream(2, (2, 3))),
+        Codebook(3, _spec.CODEBOOK_KIND_QUATS, {0: rows_of(3, 2, 3, -40, 40)}),
+        Codebook(4, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(5, 2, 6, -40, 40)}),
+        Codebook(5, _spec.CODEBOOK_KIND_SH0, {0: rows_of(7, 3, 3, -60, 60)}, how=Stream(4, (1, 2, 3, 4))),
+        Codebook(6, _spec.CODEBOOK_KIND_SH, {1: rows_of(8, 3, 9, -50, 50)}, (1, 1), Stream(3)),
         Codebook(
             7,
             _spec.CODEBOOK_KIND_SH,
-            tuple({b: rows_of(9 + s + b, 3, 3 * (2 * b + 1), -30, 30) for b in (2, 3)} for s in range(2)),
+            {b: rows_of(9 + b, 3, 3 * (2 * b + 1), -30, 30) for b in (2, 3)},
             (2, 3),
             Stream(1, (), "deflate_dynamic"),
         ),
@@ -162,13 +162,13 @@ def _all_codebooks() -> Scene:
 
 def _apart() -> Tile:
     """Return a tile whose scales and quats have codebooks of their own; each has an escape."""
-    i, wide = (0, 1, 1, 0), Stream(2)
+    wide = Stream(2)
     changes = {
-        SCALES: book(2, ((2, 3, 0, 3),), signed(rows_of(1, 2, 3, -300, 300), wide), Stream(4, (1, 3))),
-        QUATS: book(3, ((2, 1, 0, 1), i), signed(rows_of(2, 1, 3, -60, 60))),
-        SH0: book(5, ((3, 2, 1, 0),), offset(rows_of(3, 1, 3, -9, 9)), Stream(3)),
-        sh_attribute(1): book(6, ((3, 0, 3, 1),), offset(rows_of(4, 2, 9, -9, 900), wide)),
-        sh_attribute(2): book(7, ((0, 3, 1, 2), i), signed(rows_of(5, 1, 15, -99, 99))),
+        SCALES: book(2, (2, 3, 0, 3), signed(rows_of(1, 2, 3, -300, 300), wide), Stream(4, (1, 3))),
+        QUATS: book(3, (2, 1, 0, 1), signed(rows_of(2, 1, 3, -60, 60))),
+        SH0: book(5, (3, 2, 1, 0), offset(rows_of(3, 1, 3, -9, 9)), Stream(3)),
+        sh_attribute(1): book(6, (3, 0, 3, 1), offset(rows_of(4, 2, 9, -9, 900), wide)),
+        sh_attribute(2): book(7, (0, 3, 1, 2), signed(rows_of(5, 1, 15, -99, 99))),
         sh_attribute(3): book(7, (), offset(rows_of(6, 1, 21, -99, 99))),
     }
     return tile(60, _N, 0, changes, extras=(_raw(1),))
@@ -176,23 +176,22 @@ def _apart() -> Tile:
 
 def _together() -> Tile:
     """Return a tile whose scales and quats share one codebook; bands 2 and 3 are coded plainly."""
-    i, stages = (0, 1, 1, 0), ((1, 2, 0, 0), (2, 0, 1, 1))
     changes = {
-        SCALES: book(4, stages, offset(rows_of(7, 1, 3, -20, 20)), summands=(-40, 0, -60, -20), offsets=(-60,)),
+        SCALES: book(4, (1, 2, 0, 0), offset(rows_of(7, 1, 3, -20, 20)), summands=(-40, 0, -60, -20), offsets=(-60,)),
         QUATS: book(4, (), signed(rows_of(8, 1, 3, -50, 50))),
-        SH0: book(5, ((0, 1, 2, 2),)),
+        SH0: book(5, (0, 1, 2, 2)),
         sh_attribute(2): offset(rows_of(9, _N, 15, -20, 20)),
         sh_attribute(3): signed(rows_of(10, _N, 21, -20, 20)),
-        sh_attribute(1): book(6, (i,)),
+        sh_attribute(1): book(6, (0, 1, 1, 0)),
     }
     return tile(70, _N, 0, dict(sorted(changes.items())), exponent=-1, extras=(_raw(2),))
 
 
 def _escaped_bands() -> Scene:
-    stage = {band: rows_of(band, 2, 3 * (2 * band + 1), -99, 99) for band in (1, 2, 3)}
-    table = Codebook(1, _spec.CODEBOOK_KIND_SH, (stage,), (1, 3), Stream(1))
-    rows = {band: rows_of(band + 5, 2, 3 * (2 * band + 1), -120, 120) for band in stage}
-    changes = {sh_attribute(band): book(1, ((1, 2, 0, 2),) if band == 1 else (), signed(rows[band])) for band in rows}
+    entries = {band: rows_of(band, 2, 3 * (2 * band + 1), -99, 99) for band in (1, 2, 3)}
+    table = Codebook(1, _spec.CODEBOOK_KIND_SH, entries, (1, 3), Stream(1))
+    rows = {band: rows_of(band + 5, 2, 3 * (2 * band + 1), -120, 120) for band in entries}
+    changes = {sh_attribute(band): book(1, (1, 2, 0, 2) if band == 1 else (), signed(rows[band])) for band in rows}
     return replace(scene(3, [tile(80, _N, 0, changes)]), codebooks=(table,))
 
 
@@ -205,12 +204,12 @@ def _raw(seed: int) -> Block:
 
 def _different_tiles() -> Scene:
     """Return tiles of 1, 2, 9 and 40 splats, of other layers, exponents, codings and tables."""
-    shape = Codebook(4, _spec.CODEBOOK_KIND_SH0, ({0: rows_of(1, 5, 3, -60, 60)},))
+    shape = Codebook(4, _spec.CODEBOOK_KIND_SH0, {0: rows_of(1, 5, 3, -60, 60)})
     indices = tuple(integers(3, 40, 0, 4))
     tiles = (
         tile(1, 1, 0, {SCALES: signed(rows_of(1, 1, 3, -90, -1), exponent=-2)}, corner=(0, 0, 0)),
         tile(2, 2, 3, corner=(-(2**40), 2**40, 0), exponent=7),
         tile(3, 9, 0, {sh_attribute(2): offset(rows_of(2, 9, 15, -60, 60), exponent=4)}, tables=(4,)),
-        tile(4, 40, 1, {SH0: book(4, (indices,)), MEANS: morton(means_rows(4, 40, 500), 9, Stream(4, (1, 3, 4)))}),
+        tile(4, 40, 1, {SH0: book(4, indices), MEANS: morton(means_rows(4, 40, 500), 9, Stream(4, (1, 3, 4)))}),
     )
     return replace(scene(3, tiles), codebooks=(shape,), attributes=attributes(3, ycocg=True, chroma_shift=3))

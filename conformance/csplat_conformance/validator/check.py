@@ -11,7 +11,7 @@ from mmap import mmap
 from csplat import _spec
 from csplat_conformance.validator.ancillary import read_stated_errors, read_text
 from csplat_conformance.validator.chunks import Chunk, check_coverage, check_frame, read_directory
-from csplat_conformance.validator.codebooks import Entries, read_codebook
+from csplat_conformance.validator.codebooks import Books, read_codebook
 from csplat_conformance.validator.coded import read_coded
 from csplat_conformance.validator.findings import Findings, Placed, TooManyError, Validation
 from csplat_conformance.validator.index import Index, read_records
@@ -183,9 +183,9 @@ def _index_end(view: memoryview, header: Header, findings: Findings) -> int | No
 
 def _read_directory_chunks(
     view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, findings: Findings
-) -> dict[tuple[int, int], Entries]:
+) -> Books:
     """Read every chunk of the directory, used or not, known or not (CHK-2)."""
-    books: dict[tuple[int, int], Entries] = {}
+    books: Books = {}
     for chunk in directory:
         if not chunk.whole:
             continue
@@ -195,8 +195,7 @@ def _read_directory_chunks(
         elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
             _told_apart(payload, findings, partial(read_stated_errors, payload, index))
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
-            book = books[chunk.identity, chunk.layer] = []
-            _told_apart(payload, findings, partial(read_codebook, payload, chunk, index, book))
+            _told_apart(payload, findings, partial(read_codebook, payload, chunk, index, books))
     return books
 
 
@@ -204,7 +203,7 @@ def _read_tile_chunks(
     view: memoryview,
     tiles: list[Tile],
     index: Index,
-    books: dict[tuple[int, int], Entries],
+    books: Books,
     findings: Findings,
     progress: Callable[[str, float], None],
 ) -> None:

@@ -12,10 +12,10 @@ from csplat_conformance.validator.reading import Payload
 from csplat_conformance.validator.streams import read_stream
 from csplat_conformance.validator.values import I64, Place, check_integers
 
-__all__ = ["Entries", "attribute_columns", "first_attribute", "read_codebook"]
+__all__ = ["Books", "attribute_columns", "first_attribute", "read_codebook"]
 
-#: Entries of each stage, [size, C]; `None` for a stage that could not be read.
-Entries = list[I64 | None]
+#: By id and layer the entries, [size, C], of chunks that could be read and are sound.
+Books = dict[tuple[int, int], I64]
 
 _WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
 _ATTRIBUTES = {name: value for value, name in _spec.ATTRIBUTE_NAMES.items()}
@@ -46,14 +46,14 @@ def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
     return None
 
 
-def read_codebook(payload: Payload, chunk: Chunk, index: Index, entries: Entries) -> None:
+def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: Books) -> None:
     """Read the payload of a CODB chunk.
 
     Args:
         payload: of the chunk.
         chunk: its record.
         index: of the file.
-        entries: gets the stages; none where no sound record asks for the chunk.
+        books: gets the entries, if a sound record asks for the chunk.
 
     Raises:
         UnreadableError: the payload ends too early.
@@ -62,31 +62,30 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, entries: Entries
     book = index.codebooks.get(chunk.identity)
     layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
     head = payload.structure(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS, "head")
-    stages = None if book is None else book.record.stage_count
-    for key, wanted in (("codebook_id", chunk.identity), ("layer", chunk.layer), ("stage_count", stages)):
+    for key, wanted in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
         found = getattr(head.record, key)
-        if wanted is not None and found != wanted:
+        if found != wanted:
             findings.of("CDB-1", head, key, f"{found}, its records say {wanted}")
     if book is None or chunk.layer not in layers:
         findings.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
         return
     of_layer = [a for a in _attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
     columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
-    for i, size in enumerate(book.record.sizes[: book.record.stage_count]):
-        stream = read_stream(payload, f"stage[{i}]", size * columns, _WIDTH_MAX, signed=True)
-        table = None if stream.elements is None else stream.elements.astype(np.int64).reshape(columns, size).T
-        if table is not None and book.record.stage_count == 1:
-            where = (stream.head.offset, f"{payload.name}/stage[{i}]")
-            if not _check_entries(findings, index, book, of_layer, table, where):
-                table = None  # what splats make of it would be told once more for each tile
-        entries.append(table)
+    size = book.record.size
+    stream = read_stream(payload, "entries", size * columns, _WIDTH_MAX, signed=True)
+    if stream.elements is not None:
+        table = stream.elements.astype(np.int64).reshape(columns, size).T
+        where = (stream.head.offset, f"{payload.name}/entries")
+        # What splats make of unsound entries would be told once more for each tile.
+        if _check_entries(findings, index, book, of_layer, table, where):
+            books[chunk.identity, chunk.layer] = table
     payload.finish()
 
 
 def _check_entries(
     findings: Findings, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
 ) -> bool:
-    """CBK-7: entries of one stage, used or not; but for scales to which a summand comes."""
+    """CBK-7: entries, used or not; but for scales to which a summand comes."""
     sound = True
     for attribute in attributes:
         columns = attribute_columns(book, attribute)

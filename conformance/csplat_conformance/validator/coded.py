@@ -9,7 +9,7 @@ from csplat_conformance.validator.codebooks import attribute_columns, first_attr
 from csplat_conformance.validator.findings import Placed
 from csplat_conformance.validator.index import CodebookAt
 from csplat_conformance.validator.reading import Payload, UnreadableError
-from csplat_conformance.validator.streams import Elements, read_stream
+from csplat_conformance.validator.streams import read_stream
 from csplat_conformance.validator.tiles import (
     First,
     TileReader,
@@ -56,8 +56,7 @@ def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, 
         summands = _read_summands(reader, payload, name, attribute)
     escapes = _read_escapes(reader, payload, name, attribute, params) if params.record.escape_count else None
     entries = reader.books.get((identity, _spec.ATTRIBUTE_LAYER[attribute]))
-    known = None if entries is None else [None if table is None else table[:, columns] for table in entries]
-    rows = _sums(first, known)
+    rows = None if entries is None else _served(first, entries[:, columns])
     if rows is None or (has_summand and summands is None) or first.escaped is None:
         return
     if summands is not None:
@@ -87,28 +86,21 @@ def _find_book(reader: TileReader, params: Params, attribute: int) -> tuple[Code
 
 def _read_indices(reader: TileReader, payload: Payload, name: str, book: CodebookAt, params: Params) -> First:
     """CBK-2, CBK-3."""
-    findings, stages = reader.findings, list[Elements | None]()
-    for stage, size in enumerate(book.record.sizes[: book.record.stage_count]):
-        what = f"{name}.indices[{stage}]"
-        stream = read_stream(payload, what, reader.tile.count, _WIDTH_MAX)
-        indices = stream.elements
-        most = size if stage == 0 else size - 1
-        if indices is not None and int(indices.max()) > most:
-            message = f"an index of {int(indices.max())} into {size} entries, wanted {most} at most"
-            findings.add("CBK-2", stream.head.offset, f"{payload.name}/{what}", message)
-            indices = None
-        stages.append(indices)
-    escaped = None if stages[0] is None else np.asarray(stages[0] == book.record.sizes[0])
+    findings, size = reader.findings, book.record.size
+    stream = read_stream(payload, f"{name}.indices", reader.tile.count, _WIDTH_MAX)
+    indices = stream.elements
+    if indices is not None and int(indices.max()) > size:
+        message = f"an index of {int(indices.max())} into {size} entries, wanted {size} at most"
+        findings.add("CBK-2", stream.head.offset, f"{payload.name}/{name}.indices", message)
+        indices = None
+    escaped = None if indices is None else np.asarray(indices == size)
     count = params.record.escape_count
     if escaped is not None and int(escaped.sum()) != count:
         findings.of("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
         escaped = None
     elif escaped is None and count > reader.tile.count:
         findings.of("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
-    if escaped is not None and any(indices is not None and indices[escaped].any() for indices in stages[1:]):
-        text = f"{payload.name}/{name}: escaped splats have indices of later stages that are not 0 (6.4.5)"
-        findings.remarks.append(text)
-    return First(stages, escaped, count)
+    return First(indices, escaped, count)
 
 
 def _find_first(reader: TileReader, book: CodebookAt, params: Params) -> First:
@@ -121,11 +113,11 @@ def _find_first(reader: TileReader, book: CodebookAt, params: Params) -> First:
         if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
             message = f"codebook {identity}, and no block of {name} before it is coded with it"
             reader.findings.of("CBK-4", params, "codebook_id", message)
-        return First([], None, count)
+        return First(None, None, count)
     if first.escape_count != count:
         message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
         reader.findings.of("CBK-4", params, "codebook_id", message)
-        return First(first.stages, None, count)
+        return First(first.indices, None, count)
     return first
 
 
@@ -162,15 +154,9 @@ def _read_escapes(reader: TileReader, payload: Payload, name: str, attribute: in
     return rows
 
 
-def _sums(first: First, entries: list[I64 | None] | None) -> I64 | None:
-    """Sums of the entries of the splats that are not escaped, [C, n]; `None` where something is not known."""
-    if entries is None or first.escaped is None or len(first.stages) != len(entries):
+def _served(first: First, entries: I64) -> I64 | None:
+    """The entries of the splats that are not escaped, [C, n]; `None` where something is not known."""
+    if first.indices is None or first.escaped is None:
         return None
-    kept = ~first.escaped
-    total: I64 | None = None
-    for indices, table in zip(first.stages, entries, strict=True):
-        if indices is None or table is None:
-            return None
-        part: I64 = table[indices[kept].astype(np.intp)]
-        total = part.copy() if total is None else total + part
-    return None if total is None else total.T
+    rows: I64 = entries[first.indices[~first.escaped].astype(np.intp)].T
+    return rows

@@ -234,17 +234,8 @@ def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> 
             findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
     elif first or last:
         findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
-    stages = record.stage_count
-    if not 1 <= stages <= _spec.STAGES_MAX:
-        findings.of("CBR-3", placed, "stage_count", f"{stages}, wanted 1 to {_spec.STAGES_MAX}")
-        return False
-    for stage, size in enumerate(record.sizes):
-        high = _spec.CODEBOOK_ENTRIES_MAX if stage < stages else 0
-        if not min(1, high) <= size <= high:
-            wanted = f"1 to {high}" if high else "0"
-            findings.of(
-                "CBR-4", placed, "sizes", f"stage {stage} has {size} entries, wanted {wanted}", within=4 * stage
-            )
+    if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
+        findings.of("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
     return len(findings.violations) == before
 
 

@@ -44,7 +44,6 @@ CODES: Final[dict[str, str]] = {
     "ATT-9": _spec.ERROR_VALUE,
     "CBR-1": _spec.ERROR_INDEX,
     "CBR-2": _spec.ERROR_VALUE,
-    "CBR-3": _spec.ERROR_VALUE,
     "CBR-4": _spec.ERROR_VALUE,
     "EXR-1": _spec.ERROR_VALUE,
     "EXR-2": _spec.ERROR_VALUE,

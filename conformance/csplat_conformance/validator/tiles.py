@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat_conformance.validator.chunks import Chunk
-from csplat_conformance.validator.codebooks import Entries
+from csplat_conformance.validator.codebooks import Books
 from csplat_conformance.validator.findings import Findings, Placed
 from csplat_conformance.validator.index import Index, scaled
 from csplat_conformance.validator.reading import Payload, UnreadableError
@@ -31,12 +31,12 @@ class First:
     """The tile's first block of a codebook, which holds the indices for all.
 
     Attributes:
-        stages: [n] indices of each stage, `None` where they could not be read or name no entry.
+        indices: [n], `None` where they could not be read or name no entry.
         escaped: [n] bool, `None` likewise.
         escape_count: as the block says.
     """
 
-    stages: list[Elements | None]
+    indices: Elements | None
     escaped: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None
     escape_count: int
 
@@ -59,7 +59,7 @@ class TileReader:
     view: memoryview
     index: Index
     tile: Tile
-    books: Mapping[tuple[int, int], Entries]
+    books: Books
     findings: Findings
     read_coded: Callable[[TileReader, Payload, str, int, int], None]
     first: dict[int, First] = field(default_factory=dict)

@@ -134,8 +134,7 @@ def _coding(attribute: AttributeFacts) -> str:
 
 def _codebook(codebook: CodebookFacts) -> str:
     bands = f" bands {codebook.bands[0]} to {codebook.bands[-1]}" if codebook.bands else ""
-    stages = " + ".join(str(size) for size in codebook.stages)
-    return f"codebook {codebook.id}: {codebook.kind}{bands}, {stages} entries, {codebook.size_bytes} bytes"
+    return f"codebook {codebook.id}: {codebook.kind}{bands}, {codebook.entries} entries, {codebook.size_bytes} bytes"
 
 
 def _stated_errors(stated: StatedErrors) -> str:

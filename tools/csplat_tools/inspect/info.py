@@ -68,12 +68,12 @@ class LayerFacts:
 
 @dataclass(frozen=True)
 class CodebookFacts:
-    """A codebook: the SH bands that it serves, entries stage by stage, bytes of its chunks."""
+    """A codebook: the SH bands that it serves, how many entries, bytes of its chunks."""
 
     id: int
     kind: str
     bands: Sequence[int]
-    stages: Sequence[int]
+    entries: int
     size_bytes: int
 
 
@@ -249,7 +249,7 @@ def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookFact
         record.codebook_id,
         _spec.CODEBOOK_KIND_NAMES[record.kind],
         list(range(record.band_first, record.band_last + 1)) if record.band_first else [],
-        list(record.sizes[: record.stage_count]),
+        record.size,
         sum(chunk.size for chunk in chunks if chunk.id == record.codebook_id),
     )
 

@@ -88,6 +88,6 @@ def _coding(trial: Trial) -> str:
         return "no SH bands" if trial.part.model.sh_degree else "no SH to code"
     bands = f"SH degree {options['sh_degree']}"
     if options["sh_coding"] == "codebook":
-        return f"{bands} by a codebook of {'+'.join(map(str, options['codebook_sizes']))}"
+        return f"{bands} by a codebook of {options['codebook_size']}"
     adaptive = " by importance" if options["adaptive"] == 1.0 else ""
     return f"{bands} value by value{adaptive}"

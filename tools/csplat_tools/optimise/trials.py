@@ -198,7 +198,7 @@ class Trial:
             "deflate_level": options["deflate_level"],
             "sh_coding": options["sh_coding"],
             "sh_degree": options["sh_degree"],
-            "codebook_sizes": options["codebook_sizes"],
+            "codebook_size": options["codebook_size"],
             "grades": self.grades,
             "size_bytes": self.size_bytes,
             "decided_psnr": round(self.decided_psnr, 3),

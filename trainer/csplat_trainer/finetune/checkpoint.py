@@ -122,9 +122,9 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
 
 def fingerprint(frozen: Frozen) -> str:
     """A digest of all that was decided, and of the values that it was decided for."""
-    digest = hashlib.sha256(repr((frozen.plan, frozen.stage_sizes)).encode())
-    start = frozen.start()
-    for array in (frozen.source_index, *frozen.stages, *(getattr(start, name) for name in _HELD)):
+    digest, start = hashlib.sha256(repr(frozen.plan).encode()), frozen.start()
+    index = () if frozen.book is None else (frozen.book.index,)
+    for array in (frozen.source_index, *index, *(getattr(start, name) for name in _HELD)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

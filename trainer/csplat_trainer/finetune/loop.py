@@ -219,7 +219,7 @@ class _Run:
             "sizes": options.lr_scales * share,
             "logits": options.lr_opacities * share,
             "sh0": options.lr_sh0 * share,
-            "shN": (options.lr_entries if self._scene.frozen.stage_sizes else options.lr_shN) * share,
+            "shN": (options.lr_shN if self._scene.frozen.book is None else options.lr_entries) * share,
         }
 
     def _render(self, seen: DecodedValues, view: View) -> F32:

@@ -39,9 +39,9 @@ class TunedScene:
     def __init__(self, frozen: Frozen, parameters: Parameters | None = None) -> None:
         self.frozen = frozen
         self.parameters = parameters or Parameters.starting_at(_values(frozen.start()))
-        values, shapes = self.parameters.values, frozen.shapes
-        self._users = [_users(stage, size) for stage, size in zip(frozen.stages, frozen.stage_sizes, strict=True)]
-        self._escaped = frozen.escaped
+        values, book, shapes = self.parameters.values, frozen.book, frozen.shapes
+        self._users = None if book is None else _users(book.index, book.size)
+        self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
         self._rows_gradient = np.zeros_like(values["shN"])
         self._shape_users = None if shapes is None else _users(shapes.index, shapes.size)
         self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
@@ -62,7 +62,7 @@ class TunedScene:
 
     def stored(self, seen: DecodedValues) -> Stored:
         """What the streams of the file hold, as a decoder will see it."""
-        sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self._users else seen.shN
+        sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
         if self.frozen.shapes is None:
             return Stored(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
         quats, scales, sizes = self.frozen.seen_shape_rows(self._held(seen.opacities), seen)
@@ -100,13 +100,12 @@ class TunedScene:
 
     def _by_row(self, by_splat: F32) -> F32:
         """Gradients of the rows of SH that the file holds, of those of all splats [N, K, 3]."""
-        if not self._users:
+        book = self.frozen.book
+        if book is None or self._users is None:
             return by_splat
-        rows, first = self._rows_gradient, 0
-        for (order, starts), size in zip(self._users, self.frozen.stage_sizes, strict=True):
-            rows[first : first + size] = _summed(by_splat, order, starts, size)
-            first += size
-        rows[first:] = by_splat[self._escaped]
+        rows, (order, starts) = self._rows_gradient, self._users
+        rows[: book.size] = _summed(by_splat, order, starts, book.size)
+        rows[book.size :] = by_splat[self._escaped]
         return rows
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:

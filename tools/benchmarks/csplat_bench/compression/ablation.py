@@ -65,11 +65,11 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
 def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
     """The scene before quantisation, SH by codebook where one serves."""
     model = frozen.draft.model
-    if not frozen.stage_sizes:
+    if frozen.book is None:
         return model
     served = np.zeros_like(model.shN)  # bands that are not kept are gone
     served[:, : shN.shape[1]] = shN
-    served[frozen.escaped] = model.shN[frozen.escaped]
+    served[frozen.book.escaped] = model.shN[frozen.book.escaped]
     return replace(model, shN=served)
 
 

@@ -25,7 +25,7 @@ class Unquantised(Frozen):
     @classmethod
     def freeing(cls, frozen: Frozen) -> Unquantised:
         """The same scene; it must have no codebooks."""
-        assert not frozen.stage_sizes
+        assert frozen.book is None
         assert frozen.shapes is None
         return cls(**{**vars(frozen), "zero": None})
 

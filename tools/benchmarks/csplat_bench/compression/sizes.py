@@ -36,9 +36,11 @@ class Book:
 
 def books_of(frozen: Frozen) -> tuple[Book | None, Book | None]:
     """The codebooks of a frozen scene, of SH and of shapes; `None` where the encoder made none."""
-    colours = Book(sum(frozen.stage_sizes), len(frozen.escaped)) if frozen.stage_sizes else None
-    shapes = frozen.shapes
-    return colours, None if shapes is None else Book(shapes.size, int(np.count_nonzero(shapes.escaped)))
+    colours, shapes = frozen.book, frozen.shapes
+    return (
+        None if colours is None else Book(colours.size, len(colours.escaped)),
+        None if shapes is None else Book(shapes.size, int(np.count_nonzero(shapes.escaped))),
+    )
 
 
 def ply_bytes(splats: int) -> int:
@@ -104,11 +106,9 @@ def integer_columns(frozen: Frozen, held: FreeValues) -> Sequence[NDArray[np.int
         np.rint(np.sqrt(seen.opacities[:, None].astype(np.float64)) * plan.opacity_levels).astype(np.int64),
         colour_integers_of(seen.sh0[:, None], plan.sh0_step, plan.chroma_shift).reshape(-1, 3).astype(np.int64),
         colour_integers_of(sh, plan.sh_step, plan.chroma_shift).reshape(len(sh), -1).astype(np.int64),
-        *(index[:, None].astype(np.int64) for index in frozen.stages),
     ]
-    if frozen.shapes is not None:
-        columns.append(frozen.shapes.index[:, None].astype(np.int64))
-    return columns
+    books = (frozen.book, frozen.shapes)
+    return columns + [book.index[:, None].astype(np.int64) for book in books if book is not None]
 
 
 def _lattice(values: NDArray[np.float32], step: float) -> NDArray[np.int64]:
