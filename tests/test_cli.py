@@ -17,7 +17,7 @@ from interrupts import heed_interrupts
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from csplat import decode, read_ply, write_ply
+from csplat import _spec, decode, read_ply, write_ply
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.cli.app import app
@@ -457,7 +457,8 @@ def test_a_damaged_file_is_not_verified(csplat_file):
 def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     data = bytearray(csplat_file.read_bytes())
     data[13] = 1  # a reserved field of the header
-    data[52] |= 0x80  # and a reserved flag of the scene
+    at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["scene_flags"]
+    data[at] |= 0x08  # and a reserved flag of the scene
     csplat_file.write_bytes(data)
     result = invoke("verify", csplat_file, "--source", ply)
     assert result.exit_code == 1
@@ -465,7 +466,7 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     assert ["RES-1 E_RESERVED", "HDR-3 E_CRC", "RES-1 E_RESERVED", "IDX-1 E_CRC"] == [
         " ".join(line.split()[:2]) for line in lines
     ]
-    assert "at byte 52, index.scene_flags: bits 0x80 are reserved" in lines[2]
+    assert f"at byte {at}, index.scene_flags: bits 0x08 are reserved" in lines[2]
     assert result.stderr.splitlines() == [
         f"error: {csplat_file}: 4 violations of HDR-3, IDX-1, RES-1",
         "error: the stated errors were not looked at",
