@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from csplat import _spec
 from csplat_conformance import coders, deflate
@@ -18,18 +18,18 @@ from csplat_conformance.reference import max_scale
 from csplat_conformance.repair import CHUNK_RECORDS, repair, seal
 from csplat_conformance.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
 
-__all__ = ["Built", "build", "chunk_names"]
+__all__ = ["SIZED", "Built", "build", "chunk_names"]
 
-#: Structures whose sizes the index head states, in its order.
-_SIZED = (
-    "index_head",
-    "attribute_record",
-    "codebook_record",
-    "extra_record",
-    "directory_record",
-    "tile_record",
-    "layer_record",
-)
+#: Structures whose sizes the index head states, in its order, by the names that `Scene.tails` has for them.
+SIZED: Final = {
+    "head": "index_head",
+    "attribute": "attribute_record",
+    "codebook": "codebook_record",
+    "extra": "extra_record",
+    "directory": "directory_record",
+    "tile": "tile_record",
+    "layer": "layer_record",
+}
 _CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
 
 
@@ -118,26 +118,21 @@ class _Records(Writer):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
-        self.tails = dict(scene.tails)
+        self.tails = {SIZED[kind]: tail for kind, tail in scene.tails}
 
     def structure(self, name: str, structure: str, values: Iterable[Any]) -> None:
         super().structure(name, structure, values)
-        tail = self.tails.get(_kind(structure), b"")
+        tail = self.tails.get(structure, b"")
         if tail:
             self.raw(f"{name}.tail", tail)
 
     def size_of(self, structure: str) -> int:
-        return int(getattr(_spec, f"{structure.upper()}_SIZE")) + len(self.tails.get(_kind(structure), b""))
-
-
-def _kind(structure: str) -> str:
-    """`head` of `index_head`, `tile` of `tile_record`."""
-    return structure.removeprefix("index_").removesuffix("_record")
+        return int(getattr(_spec, f"{structure.upper()}_SIZE")) + len(self.tails.get(structure, b""))
 
 
 def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> Writer:
     out = _Records(scene)
-    sizes = [out.size_of(name) for name in _SIZED]
+    sizes = [out.size_of(name) for name in SIZED.values()]
     directory = scene.directory or tuple(n for n in scene.order or chunks if not n.startswith("TILE."))
     counts = [len(directory), len(scene.codebooks), len(scene.extras), len(scene.attributes)]
     splats = sum(tile.splat_count for tile in scene.tiles)

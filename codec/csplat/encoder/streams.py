@@ -18,7 +18,7 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 
 Integers = NDArray[Any]
 
-_QUICK_LEVEL = 1  # of DEFLATE: samples decide, and nothing is tried twice
+_QUICK_LEVEL = 1  # of DEFLATE: samples decide
 _SHORT_RUN = 1.5  # bytes, of the mean run, from which RUN_LENGTH may save more than it costs decoders
 _LONG_RUN = 32  # bytes, from which it is tried at that level
 _SAMPLE = 4096  # bytes of each of four samples

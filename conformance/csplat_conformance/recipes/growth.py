@@ -6,13 +6,12 @@ from dataclasses import replace
 
 from csplat import _spec
 from csplat_conformance.broken import patched, whole
-from csplat_conformance.builder import Built, build
+from csplat_conformance.builder import SIZED, Built, build
 from csplat_conformance.samples import Recipe, rich_scene, scene, tile
 from csplat_conformance.scene import Block, Chunk, Extra, Scene, Stream
 
 __all__ = ["invalid_growth_recipes", "valid_growth_recipes"]
 
-_KINDS = ("head", "attribute", "codebook", "extra", "directory", "tile", "layer")
 _LONGEST = 255
 
 
@@ -32,7 +31,7 @@ def valid_growth_recipes() -> list[Recipe]:
 def invalid_growth_recipes() -> list[Recipe]:
     """Return files that go beyond what may be skipped."""
     layers, extras, flags = build(_layers()), build(_extras()), build(_flags())
-    short = scene(tails=tuple((kind, bytes(3)) for kind in _KINDS))
+    short = scene(tails=tuple((kind, bytes(3)) for kind in SIZED))
     private = scene(chunks=(Chunk(b"priv", payload=b"x", flags=_spec.CHUNK_FLAG_CRITICAL | 0x100),))
     first, other = "tile[0].layer[128]", "tile[0].layer[255]"
     return [
@@ -161,20 +160,12 @@ def _valid(name: str, why: str, clauses: str, made: Scene) -> Recipe:
 
 
 def _tails() -> Scene:
-    tails = tuple((kind, bytes(range(_LONGEST, _LONGEST - 1 - i, -1))) for i, kind in enumerate(_KINDS))
+    tails = tuple((kind, bytes(range(_LONGEST, _LONGEST - 1 - i, -1))) for i, kind in enumerate(SIZED))
     return replace(rich_scene(), tails=tails)
 
 
 def _longest() -> Scene:
-    sizes = {
-        "head": _spec.INDEX_HEAD_SIZE,
-        "attribute": _spec.ATTRIBUTE_RECORD_SIZE,
-        "codebook": _spec.CODEBOOK_RECORD_SIZE,
-        "extra": _spec.EXTRA_RECORD_SIZE,
-        "directory": _spec.DIRECTORY_RECORD_SIZE,
-        "tile": _spec.TILE_RECORD_SIZE,
-        "layer": _spec.LAYER_RECORD_SIZE,
-    }
+    sizes = {kind: int(getattr(_spec, f"{name.upper()}_SIZE")) for kind, name in SIZED.items()}
     return replace(rich_scene(), tails=tuple((kind, bytes([165]) * (_LONGEST - size)) for kind, size in sizes.items()))
 
 
