@@ -246,7 +246,7 @@ MISTAKES = {
         "w is the last component", ("L3", "SER-5"), scene=changed(quats=lambda m: np.roll(m.quats, 1, axis=1))
     ),
     "last_splat_dropped": Mistake(
-        "the header counts one splat too many", ("L2", "SER-5"), scene=lambda model: model.select(slice(0, -1))
+        "the header counts one splat too many", ("L2", "SRC-1"), scene=lambda model: model.select(slice(0, -1))
     ),
     "logit_as_alpha": Mistake("the column opacity holds alpha", ("L3", "SER-5"), scene=changed(opacities=logits)),
     "scale_not_log": Mistake(
@@ -276,7 +276,7 @@ MISTAKES = {
         "ordinary/strong_colours",
         scene=changed(sh0=lambda m: np.clip(m.sh0, -2, 2)),
     ),
-    "duplicates_merged": Mistake("equal splats are one", ("L2", "SER-5"), "nasty/duplicates", scene=merged),
+    "duplicates_merged": Mistake("equal splats are one", ("L2", "SRC-1"), "nasty/duplicates", scene=merged),
     # stages
     "morton_axes_reversed": Mistake(
         "bit 0 of a Morton code is that of z",
@@ -347,7 +347,7 @@ MISTAKES = {
     "rms_too_generous": Mistake(
         "a bound may be generous", ("L3", "SER-5"), data=stated(lambda r: r._replace(max=r.max * 1.5))
     ),
-    "pruned_invented": Mistake("counts are decoration", ("L2", "SER-5"), data=counts(3, 3)),
+    "pruned_invented": Mistake("counts are decoration", ("L2", "SRC-1"), data=counts(3, 3)),
     "coarse": Mistake(
         "honest errors may be of any size", ("L4", ""), options={"attribute_psnr": 16.0, "sh_coding": "none"}
     ),

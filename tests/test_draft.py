@@ -12,8 +12,8 @@ from csplat.decoder import decode_scene, read_options, read_stated_errors
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
+from csplat_conformance.stated import Source, prove
 from csplat_tools.inspect.info import describe_file
-from csplat_tools.inspect.proof import prove
 
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -106,15 +106,15 @@ def test_the_geometry_of_a_refitted_file_is_proved(make_model):
     draft = Draft.of(source.select(rows), origin=Origin(len(source), rows))
     result = draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN).coded().write()
     scene = decode_scene(result.data)
-    whole = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
+    whole = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
     assert whole.holds
     assert whole.rms_proved
-    assert ["means", "covariance", "opacities"] == [measure.name for measure in whole.measures]
-    assert "fitted anew" in whole.notes[-1]
-    assert prove(source, scene.model, scene.header, scene.stated_errors).holds
+    assert ["means", "covariance", "opacities"] == [one.name for one in whole.measures if one.holds]
+    assert ("sh0", "sh1", "sh2", "sh3") == whole.unproved
+    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(moved, scene.model, scene.header, scene.stated_errors, result.source_index).holds
-    other = prove(source.select(slice(0, 399)), scene.model, scene.header, scene.stated_errors)
+    assert not prove(Source.of(moved), scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    other = prove(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.stated_errors)
     assert "source of 400 splats" in other.failures[0]
 
 
@@ -124,10 +124,10 @@ def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
     result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
     scene = decode_scene(result.data)
     assert ["means"] == [record.measure for record in scene.stated_errors.records]
-    assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
-    assert prove(source, scene.model, scene.header, scene.stated_errors).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(moved, scene.model, scene.header, scene.stated_errors).holds
+    assert not prove(Source.of(moved), scene.model, scene.header, scene.stated_errors).holds
 
 
 def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):

@@ -24,10 +24,10 @@ from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError, LimitError
 from csplat.ply import lint_ply
+from csplat_conformance.stated import Source, prove
 from csplat_render import render
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.inspect.proof import prove
 
 pytestmark = pytest.mark.extremes
 
@@ -45,7 +45,7 @@ def assert_proved(name, result):
     """The stated errors hold, rms and counts too."""
     source, decoded = scene(name)[0], decode(result.data)
     stated = read_stated_errors(result.data)
-    proof = prove(source, decoded, read_header(result.data), stated, result.source_index)
+    proof = prove(Source.of(source), decoded, read_header(result.data), stated, result.source_index)
     assert ((), True) == (proof.failures, proof.rms_proved)
     return decoded
 
@@ -85,7 +85,7 @@ def test_what_is_decoded_lies_within_the_stated_errors(name, preset):
 @pytest.mark.parametrize("name", DRAWN)
 def test_the_stated_maxima_are_proved_without_an_index_too(name):
     source, result = scene(name)[0], encoded(name, "balanced")
-    proof = prove(source, decode(result.data), read_header(result.data), read_stated_errors(result.data))
+    proof = prove(Source.of(source), decode(result.data), read_header(result.data), read_stated_errors(result.data))
     assert () == proof.failures
 
 

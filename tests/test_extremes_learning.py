@@ -30,8 +30,8 @@ from csplat import EncodeOptions, decode, encode
 from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
+from csplat_conformance.stated import Source, prove
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.inspect.proof import prove
 from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.optimise.simplify import simplify
 from csplat_tools.optimise.target import Target
@@ -78,7 +78,9 @@ def test_a_simplified_file_states_what_holds(name):
     result = optimise(source, Target(keep=0.5), views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
-    proof = prove(source, decoded, read_header(result.data), read_stated_errors(result.data), result.source_index)
+    proof = prove(
+        Source.of(source), decoded, read_header(result.data), read_stated_errors(result.data), result.source_index
+    )
     assert () == proof.failures
     assert_finite(decoded)
 

@@ -20,10 +20,10 @@ from csplat.encoder import PRESETS
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_conformance.stated import Source, prove
 from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
-from csplat_tools.inspect.proof import prove
 from csplat_tools.optimise import optimiser
 from csplat_tools.optimise.optimiser import expected_seconds, optimise
 from csplat_tools.optimise.removal import Removal
@@ -272,7 +272,7 @@ def test_a_share_of_the_splats_has_its_colours_fitted_and_proves_what_it_states(
     assert 180 == found.report.splats == len(decoded.model) == len(np.unique(found.result.source_index))
     distances = np.linalg.norm(decoded.model.means - scene.means[found.result.source_index], axis=1)
     assert distances.max() <= found.result.report.errors["means"][0]
-    proof = prove(scene, decoded.model, decoded.header, decoded.stated_errors, found.result.source_index)
+    proof = prove(Source.of(scene), decoded.model, decoded.header, decoded.stated_errors, found.result.source_index)
     assert proof.holds
     assert decoded.stated_errors.refitted
     assert found.report.psnr > 20.0

@@ -11,10 +11,25 @@ from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
+from csplat_conformance.stated import Source, prove
+from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED
+from csplat_conformance.stated.matching import match as match_source
+from csplat_conformance.stated.pairs import differences as differences_of
+from csplat_conformance.stated.pairs import measure_pairs as measured
 from csplat_tools.inspect.info import describe_file
-from csplat_tools.inspect.matching import UNDECIDED, UNMATCHED, match
-from csplat_tools.inspect.pairs import differences, measure_pairs
-from csplat_tools.inspect.proof import prove
+
+
+def differences(source, *rest):
+    return differences_of(Source.of(source), *rest)
+
+
+def match(source, *rest, **options):
+    return match_source(Source.of(source), *rest, **options)
+
+
+def measure_pairs(source, *rest, **options):
+    """(max, rms) by measure."""
+    return {name: found[:2] for name, found in measured(Source.of(source), *rest, **options).items()}
 
 
 def moved(model, rng, sigma=1e-3):
@@ -196,10 +211,10 @@ def test_what_the_encoder_states_is_proved(make_model, preset):
     source = make_model(3000, 3)
     result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=700))
     scene = decode_scene(result.data)
-    proof = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
     assert proof.failures == ()
     assert proof.rms_proved
-    proof = prove(source, scene.model, scene.header, scene.stated_errors)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors)
     assert proof.failures == ()
     assert not proof.rms_proved
 
@@ -214,34 +229,76 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
         records = list(scene.stated_errors.records)
         records[number] = replace(record, max=record.max * 0.99)
         stated = replace(scene.stated_errors, records=tuple(records))
-        assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
-        assert not prove(source, scene.model, scene.header, stated).holds
+        assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
+        assert not prove(Source.of(source), scene.model, scene.header, stated).holds
         for wrong in (
-            replace(record, rms=record.rms * 0.99999),
+            replace(record, rms=record.rms * 0.999),
             replace(record, rms=record.rms * 1.001),
             replace(record, max=record.max * 1.001),
         ):
             records[number] = wrong
             stated = replace(scene.stated_errors, records=tuple(records))
-            assert not prove(source, scene.model, scene.header, stated, result.source_index).holds
+            assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
 
-def test_a_refitted_or_silent_file_is_not_proved(make_model):
+def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
+    # SER-6
     source = make_model(50, 0)
     scene = decode_scene(encode(source))
     assert scene.stated_errors is not None
-    refitted = replace(scene.stated_errors, refitted=True)
-    assert "renders" in prove(source, scene.model, scene.header, refitted).failures[0]
-    assert "states no errors" in prove(source, scene.model, scene.header, None).failures[0]
+    fewer = replace(scene.stated_errors, records=scene.stated_errors.records[:2])
+    refitted = prove(Source.of(source), scene.model, scene.header, replace(fewer, refitted=True))
+    assert refitted.holds
+    assert refitted.unproved == ("opacities", "sh0")
+    assert "renders" in refitted.notes[-1]
+    silent = prove(Source.of(source), scene.model, scene.header, fewer)
+    assert silent.failures == ("the file states no error of opacities", "the file states no error of sh0")
+    nothing = prove(Source.of(source), scene.model, scene.header, None)
+    assert nothing.failures == ("the file states no errors",)
+
+
+def test_what_a_refitted_file_states_has_to_hold(make_model):
+    # SER-5
+    source = make_model(50, 0)
+    result = encode_with_report(source)
+    scene = decode_scene(result.data)
+    halved = tuple(replace(one, max=one.max / 2, rms=one.rms / 2) for one in scene.stated_errors.records)
+    stated = replace(scene.stated_errors, refitted=True, records=halved)
+    assert not prove(Source.of(source), scene.model, scene.header, stated).holds
+    assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
+    source = make_model(1500, 1)
+    result = encode_with_report(source, EncodeOptions(tile_splats=400))
+    scene = decode_scene(result.data)
+    sh0 = scene.model.sh0.copy()
+    sh0[700] += np.float32(5.0)
+    index = result.source_index if indexed else None
+    decoded = replace(scene.model, sh0=sh0)
+    proof = prove(Source.of(source), decoded, scene.header, scene.stated_errors, index)
+    wrong = [one for one in proof.measures if one.holds is False]
+
+    assert ["sh0"] == [one.name for one in wrong]
+    worst = wrong[0].worst
+    tile = scene.header.tiles[worst.tile]
+    assert (700, result.source_index[700]) == (worst.splat, worst.source_splat)
+    assert tile.start <= 700 < tile.start + tile.splat_count
+    assert worst.found == pytest.approx(5.0, rel=0.1)
+    line = next(line for line in proof.failures if line.startswith("sh0: "))
+    assert f"splat 700 (tile {worst.tile})" in line
+    assert f"source splat {worst.source_splat}" in line
+    assert f"above the stated {wrong[0].stated_max:.9g}" in line
 
 
 def test_extra_columns_are_part_of_the_proof(make_model):
     source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
-    assert prove(source, scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
     other = replace(source, extra={"label": np.zeros(50, np.int16)})
-    proof = prove(other, scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(other), scene.model, scene.header, scene.stated_errors, result.source_index)
     assert proof.failures == ("the extra column 'label' is not the source's",)
 
 

@@ -11,7 +11,7 @@ from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.measure import covariance_errors, measure_errors
 from csplat.errors import InputError
-from csplat_tools.inspect.proof import prove
+from csplat_conformance.stated import Source, prove
 from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
@@ -43,7 +43,7 @@ def shell():
 def stored(source, result):
     """Prove what a file states against the source; return what it decodes to."""
     scene = decode_scene(result.data)
-    proof = prove(source, scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
     assert () == proof.failures
     assert proof.rms_proved
     assert (len(source), source.sh_degree) == (scene.stated_errors.source_count, scene.stated_errors.source_sh_degree)

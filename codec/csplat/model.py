@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 #: Highest spherical-harmonics degree of a model.
 MAX_SH_DEGREE = 3
@@ -59,6 +60,8 @@ class SplatModel:
             Left out: none, K = 0.
         origin: what to add to `means`, three float64, scene units. A scene at geographic
             coordinates keeps its float32 precision this way.
+        means_double: [N, 3] float64, the centres as the source has them, origin included, where
+            `means` are these less the origin, rounded; `None` where `origin` and `means` say all.
         coordinate_system: `"unspecified"`, or the directions of +x, +y and +z for a person who
             looks at the scene, as three letters of R/L, U/D and F/B: `"RDF"`.
         unit_metres: length of one scene unit in metres; `None` where it is not known.
@@ -89,6 +92,7 @@ class SplatModel:
     cameras: Sequence[Mapping[str, Any]] | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    means_double: F64 | None = None
 
     def __post_init__(self) -> None:
         n = len(self.means) if getattr(self.means, "ndim", 0) else 0
@@ -105,6 +109,8 @@ class SplatModel:
         _check_quats(self.quats)
         _check_extra(self.extra, n)
         object.__setattr__(self, "origin", _checked_origin(self.origin))
+        if self.means_double is not None:
+            _check_doubles(self.means, self.means_double, self.origin)
         _check_coordinate_system(self.coordinate_system)
         unit = self.unit_metres
         if unit is not None and not (math.isfinite(unit) and unit > 0):
@@ -139,6 +145,7 @@ class SplatModel:
             sh0=self.sh0[index],
             shN=self.shN[index],
             extra={name: column[index] for name, column in self.extra.items()},
+            means_double=None if self.means_double is None else self.means_double[index],
         )
 
 
@@ -243,6 +250,13 @@ def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
     if not all(math.isfinite(value) for value in (x, y, z)):
         raise InputError(f"origin is {origin!r}, wanted finite numbers")
     return x, y, z
+
+
+def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float]) -> None:
+    """A model whose means were changed has to let go of the doubles."""
+    fits = isinstance(doubles, np.ndarray) and doubles.dtype == np.float64 and doubles.shape == means.shape
+    if not fits or not np.array_equal((doubles - np.array(origin)).astype(np.float32), means):
+        raise InputError("means_double is not the centres of which means are the float32 less the origin")
 
 
 def _check_coordinate_system(letters: str) -> None:

@@ -108,7 +108,7 @@ def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool
     findings += more
     if len(rows) == 0:
         findings.append(Finding("empty", 0, "the file holds no splats", "note"))
-    means, origin = relative_to_origin(arrays.means, facts)
+    means, origin, doubles = relative_to_origin(arrays.means, facts)
     if columns.double:
         text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
         findings.append(Finding("double-means", len(means), text, "note"))
@@ -126,6 +126,7 @@ def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool
         flat=facts.flat or len(columns.scales) == 2,
         metadata=facts.metadata,
         extra=arrays.extra,
+        means_double=doubles,
     )
 
 

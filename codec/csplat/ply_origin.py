@@ -18,7 +18,7 @@ __all__ = ["relative_to_origin"]
 _NEAR_SPREADS = 16.0
 
 
-def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tuple[float, float, float]]:
+def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tuple[float, float, float], F64 | None]:
     """Split the positions of a PLY into float32 means and the origin they are relative to.
 
     Args:
@@ -26,15 +26,18 @@ def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tup
         facts: what the comments of the file say about an origin.
 
     Returns:
-        [N, 3] float32 and three float64, in scene units.
+        [N, 3] float32 and three float64, in scene units; and the positions in doubles, where float32 does not hold
+        what is left of them.
     """
     with np.errstate(over="ignore"):  # the model refuses what leaves float32
         if facts.origin is not None and not facts.origin_is_added:
-            return means.astype(np.float32, copy=False), facts.origin
+            return means.astype(np.float32, copy=False), facts.origin, None
         if means.dtype == np.float32:
-            return means, (0.0, 0.0, 0.0)
+            return means, (0.0, 0.0, 0.0), None
         origin = facts.origin if facts.origin is not None else _origin_for(means)
-        return (means - np.array(origin)).astype(np.float32), origin
+        rounded = (means - np.array(origin)).astype(np.float32)
+        exact = np.array_equal(rounded + np.array(origin), means)
+        return rounded, origin, None if exact else means
 
 
 def _origin_for(positions: F64) -> tuple[float, float, float]:

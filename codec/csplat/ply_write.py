@@ -104,7 +104,8 @@ def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
 def _fill(block: NDArray[Any], model: SplatModel, part: slice, *, absolute: bool) -> None:
     """Copy splats `part` of a model into rows; the normals are zero already."""
     if absolute:
-        block["means"] = model.means[part].astype(np.float64) + np.array(model.origin)
+        doubles = model.means_double
+        block["means"] = model.means[part] + np.array(model.origin) if doubles is None else doubles[part]
     else:
         block["means"] = model.means[part]
     block["sh0"] = model.sh0[part]

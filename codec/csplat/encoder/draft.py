@@ -141,7 +141,7 @@ class Draft:
         model, tiles, plan = self.model, self.tiles, self.plan
         quats, scales = seen_shapes(model.quats, model.scales, tiles, plan, self.shapes)
         means, opacities = seen_means(model.means, tiles, plan), seen_opacities(model.opacities, tiles, plan)
-        return replace(model, means=means, quats=quats, scales=scales, opacities=opacities)
+        return replace(model, means=means, quats=quats, scales=scales, opacities=opacities, means_double=None)
 
     def with_colours(self, sh0: F32, shN: F32) -> Draft:
         """The same geometry with colours that were fitted anew.

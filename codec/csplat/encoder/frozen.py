@@ -170,6 +170,7 @@ class Frozen:
             books = books_of(self.tables, self._moved(self.book, held.sh), self.plan)
         else:
             shN[:, :kept] = held.sh
+        model = replace(model, means_double=None)
         decoded = replace(model, **vars(self.seen(held)))
         model = replace(
             model, means=held.means, quats=quats, scales=scales, opacities=held.opacities, sh0=held.sh0, shN=shN

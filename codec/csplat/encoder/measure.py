@@ -23,6 +23,7 @@ __all__ = [
     "distance_errors",
     "measure_errors",
     "measured_sums",
+    "true_means",
     "value_errors",
 ]
 
@@ -73,6 +74,14 @@ class ErrorSums:
                 largest[name] = max(largest.get(name, 0.0), part.largest[name])
                 squares[name] = squares.get(name, 0.0) + part.squares[name]
         return ErrorSums(count, largest, squares)
+
+
+def true_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
+    """Return the centres of some splats relative to the origin, [n, 3]: float64 where the model has doubles."""
+    if model.means_double is None:
+        return np.take(model.means, rows, axis=0)
+    relative: F64 = np.take(model.means_double, rows, axis=0) - np.array(model.origin)
+    return relative
 
 
 def distance_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
@@ -166,7 +175,7 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
 
 def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any], part: slice) -> ErrorSums:
     pairs = {
-        "means": distance_errors(source.means[rows].T, decoded.means[part].T),
+        "means": distance_errors(true_means(source, rows).T, decoded.means[part].T),
         "covariance": covariance_errors(
             source.quats[rows].T, source.scales[rows].T, decoded.quats[part].T, decoded.scales[part].T
         ),

@@ -13,7 +13,7 @@ from csplat.encoder import blocks
 from csplat.encoder.colour import ShTables, code_sh, quantise_colour
 from csplat.encoder.container import FileTile
 from csplat.encoder.geometry import quantise_shape
-from csplat.encoder.measure import ErrorSums, covariance_errors, distance_errors, value_errors
+from csplat.encoder.measure import ErrorSums, covariance_errors, distance_errors, true_means, value_errors
 from csplat.encoder.morton import morton_codes
 from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import (
@@ -178,7 +178,7 @@ def _means(
         work.blocks.append(blocks.morton_block(codes, bits, coding))
     decoded = lattice_values(q + corner[:, None], step)
     check_finite("means", decoded)
-    work.note("means", distance_errors(np.ascontiguousarray(_take(model.means, rows).T), decoded))
+    work.note("means", distance_errors(np.ascontiguousarray(true_means(model, rows).T), decoded))
 
 
 def _sh0(work: _Work, sh0: F32, coarse: Coarse) -> None:

@@ -1,4 +1,4 @@
-"""Reference inputs for encoders: PLY files made by recipe, and the scenes that they stand for.
+"""Reference inputs for encoders: PLY files made by recipe, and the sources that they stand for.
 
 `ordinary/` an encoder must take; `nasty/` it may refuse, with status 1 and a line that says why, but must not get
 wrong; `broken/` it must refuse. Splats keep a distance of `apart` from one another, so that a decoded splat has one
@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from csplat.model import SplatModel
 from csplat_conformance.encoders.plyfile import Splats, meaning, write
+from csplat_conformance.stated import Source
 
 __all__ = ["Input", "all_inputs"]
 
@@ -33,10 +33,9 @@ class Input:
         name: group and name, `ordinary/degree_3`.
         why: one line: what it shows, why it hurts.
         make: gives the bytes of the PLY.
-        scene: gives what it stands for; `None` where there is nothing to encode.
+        source: gives what it stands for; `None` where there is nothing to encode.
         apart: no two different splats are nearer to each other than this.
         may_refuse: status 1 and a line are as good as a file.
-        unreadable: rows that hold NaN, which `scene` leaves out; a count of the source may hold them or not.
         renders: whether pictures of it say something.
         psnr_room: dB by which the pictures may fall below what is wanted of the others.
     """
@@ -44,17 +43,16 @@ class Input:
     name: str
     why: str
     make: Callable[[], bytes]
-    scene: Callable[[], SplatModel] | None
+    source: Callable[[], Source] | None
     apart: float = _APART
     may_refuse: bool = False
-    unreadable: int = 0
     renders: bool = True
     psnr_room: float = 0.0
 
     @property
     def must_refuse(self) -> bool:
         """Whether there is nothing to encode."""
-        return self.scene is None
+        return self.source is None
 
 
 def all_inputs() -> list[Input]:
@@ -81,15 +79,11 @@ def cloud(count: int, degree: int, seed: int = 0) -> Splats:
     )
 
 
-def _made(
-    name: str, why: str, splats: Callable[[], Splats], *, truth: Callable[[], Splats] | None = None, **rest: Any
-) -> Input:
+def _made(name: str, why: str, splats: Callable[[], Splats], **rest: Any) -> Input:
     """Return an input of rows; `rest` is for `Input` and for `write`."""
-    fields = {
-        key: rest.pop(key) for key in ("apart", "may_refuse", "unreadable", "renders", "psnr_room") if key in rest
-    }
+    fields = {key: rest.pop(key) for key in ("apart", "may_refuse", "renders", "psnr_room") if key in rest}
     kept = cache(splats)
-    return Input(name, why, lambda: write(kept(), **rest), lambda: meaning((truth or kept)()), **fields)
+    return Input(name, why, lambda: write(kept(), **rest), lambda: meaning(kept()), **fields)
 
 
 # Ordinary ------------------------------------------------------------------------------------------
@@ -189,7 +183,7 @@ def _nasty() -> list[Input]:
         _made("nasty/duplicates", "every third splat four times", _duplicates, **seen),
         _made("nasty/tiny_scene", "a scene of a millionth of a unit", _tiny, apart=_APART * 1e-6, **seen),
         _made("nasty/huge_colours", "coefficients of ±1e6 beside small ones", _huge_colours, **nasty),
-        _made("nasty/not_a_number", "NaN in three rows", _with_nan, truth=_without_nan, unreadable=3, **nasty),
+        _made("nasty/not_a_number", "NaN in three rows", _with_nan, **nasty),
     ]
 
 
@@ -246,10 +240,6 @@ def _with_nan() -> Splats:
     splats = cloud(64, 1, 29)
     splats.means[3, 1], splats.logits[17], splats.shN[40, 2, 2] = np.nan, np.nan, np.nan
     return splats
-
-
-def _without_nan() -> Splats:
-    return _with_nan().select(np.setdiff1d(np.arange(64), (3, 17, 40)))
 
 
 # Broken --------------------------------------------------------------------------------------------

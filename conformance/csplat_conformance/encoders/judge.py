@@ -12,10 +12,10 @@ from csplat import _spec
 from csplat.decoder import Scene, decode_scene
 from csplat.errors import CsplatError
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat_conformance.encoders.errors import contradictions, measured
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.encoders.matching import Pairs, pair
 from csplat_conformance.report import Status
+from csplat_conformance.stated import Source, prove
 from csplat_conformance.validator import validate
 
 __all__ = ["PictureJudge", "Verdict", "judge_content", "judge_errors", "judge_pictures", "judge_stream"]
@@ -68,13 +68,13 @@ def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
     return Verdict(Status.PASSED, "; ".join(validation.remarks), details={"bytes": len(data)}), scene
 
 
-def judge_content(one: Input, source: SplatModel, scene: Scene) -> tuple[Verdict, Pairs]:
+def judge_content(one: Input, source: Source, scene: Scene) -> tuple[Verdict, Pairs]:
     """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated."""
     decoded = scene.model
     centres = decoded.means.astype(np.float64) + np.subtract(decoded.origin, source.origin)
     pairs = pair(source.means.astype(np.float64), centres, one.apart)
     details = {"splats": len(decoded), "source_splats": len(source), "missing": pairs.missing}
-    wrong = [*_wrong_splats(one, pairs), *_wrong_counts(one, source, scene, pairs), *_wrong_facts(source, decoded)]
+    wrong = [*_wrong_splats(one, pairs), *_wrong_counts(source, scene, pairs), *_wrong_facts(source, decoded)]
     if pairs.strays == pairs.surplus == 0:
         wrong += _wrong_extras(source, decoded, pairs)
     if wrong:
@@ -94,17 +94,15 @@ def _wrong_splats(one: Input, pairs: Pairs) -> list[tuple[str, str]]:
     return wrong
 
 
-def _wrong_counts(one: Input, source: SplatModel, scene: Scene, pairs: Pairs) -> list[tuple[str, str]]:
+def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[tuple[str, str]]:
     stated = scene.stated_errors
     if stated is None:
         text = f"{pairs.missing} splats of the source are missing, and nothing says so"
         return [("SER-5", text)] if pairs.missing else []
     wrong = []
-    # Rows with NaN may be counted or not: they are no splats that anybody can decode.
-    unreadable = stated.source_count - len(source)
-    if not 0 <= unreadable <= one.unreadable:
-        wrong.append(("SER-5", f"a source of {stated.source_count} splats is stated, it has {len(source)}"))
-    elif stated.pruned_count - unreadable != pairs.missing:
+    if stated.source_count != len(source):
+        wrong.append(("SRC-1", f"a source of {stated.source_count} splats is stated, it has {len(source)}"))
+    elif stated.pruned_count != pairs.missing:
         wrong.append(("SER-5", f"{stated.pruned_count} pruned splats are stated, {pairs.missing} are missing"))
     if stated.source_sh_degree != source.sh_degree:
         text = f"a source of SH degree {stated.source_sh_degree} is stated, it has {source.sh_degree}"
@@ -112,7 +110,7 @@ def _wrong_counts(one: Input, source: SplatModel, scene: Scene, pairs: Pairs) ->
     return wrong
 
 
-def _wrong_facts(source: SplatModel, decoded: SplatModel) -> list[tuple[str, str]]:
+def _wrong_facts(source: Source, decoded: SplatModel) -> list[tuple[str, str]]:
     """A PLY says nothing of axes, unit and filters: a file that does has guessed."""
     facts = {
         "axes": (decoded.coordinate_system, UNSPECIFIED),
@@ -130,7 +128,7 @@ def _wrong_facts(source: SplatModel, decoded: SplatModel) -> list[tuple[str, str
     return wrong
 
 
-def _wrong_extras(source: SplatModel, decoded: SplatModel, pairs: Pairs) -> list[tuple[str, str]]:
+def _wrong_extras(source: Source, decoded: SplatModel, pairs: Pairs) -> list[tuple[str, str]]:
     wrong = []
     for name, column in decoded.extra.items():
         other = source.extra.get(name)
@@ -139,37 +137,24 @@ def _wrong_extras(source: SplatModel, decoded: SplatModel, pairs: Pairs) -> list
     return wrong
 
 
-def judge_errors(source: SplatModel, scene: Scene, pairs: Pairs) -> Verdict:
+def judge_errors(source: Source, scene: Scene, pairs: Pairs) -> Verdict:
     """L3: the stated errors hold (SER-5)."""
-    stated = scene.stated_errors
-    if stated is None:
-        return Verdict(Status.SKIPPED, "the file states no errors")
-    if stated.refitted:
-        return Verdict(Status.SKIPPED, "the file says that attributes were fitted anew")
     if pairs.strays or pairs.surplus:
         return Verdict(Status.SKIPPED, "which splat is which is not known")
-    found = measured(source, scene.model, pairs.source_index)
-    bounds = {record.measure: (record.max, record.rms) for record in stated.records}
-    details = {
-        name: {"max": _finite(largest), "rms": _finite(rms), "stated": list(bounds.get(name, ()))}
-        for name, (largest, rms) in found.items()
-    }
-    lines = contradictions(found, bounds)
-    if lines:
-        return Verdict(Status.FAILED, "; ".join(lines), ("SER-5",), details=details)
-    silent = [name for name in found if name not in bounds and len(scene.model)]
-    return Verdict(Status.PASSED, f"not stated: {', '.join(silent)}" if silent else "", details=details)
+    if scene.stated_errors is None:
+        return Verdict(Status.SKIPPED, "the file states no errors")
+    proof = prove(source, scene.model, scene.header, scene.stated_errors, pairs.source_index)
+    details = proof.as_json()["measures"]
+    if not proof.holds:
+        return Verdict(Status.FAILED, "; ".join(proof.failures), ("SER-5",), details=details)
+    return Verdict(Status.PASSED, "; ".join(proof.notes), details=details)
 
 
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def judge_pictures(one: Input, source: SplatModel, scene: Scene, pictures: PictureJudge, psnr_min: float) -> Verdict:
+def judge_pictures(one: Input, source: Source, scene: Scene, pictures: PictureJudge, psnr_min: float) -> Verdict:
     """L4: renders of the file look like those of the source."""
     if not one.renders:
         return Verdict(Status.SKIPPED, "pictures of this scene say nothing")
-    psnr = pictures(source, scene.model)
+    psnr = pictures(source.model(scene.model.origin), scene.model)
     details = {"psnr": psnr}
     wanted = psnr_min - one.psnr_room
     if psnr < wanted:

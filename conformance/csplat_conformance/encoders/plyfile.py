@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.model import SplatModel
+from csplat_conformance.stated import Source
 
 __all__ = ["Splats", "meaning", "write"]
 
@@ -29,7 +29,7 @@ class Splats:
     """Rows of a PLY, as they stand in it.
 
     Attributes:
-        means: [N, 3].
+        means: [N, 3], float32 or float64.
         quats: [N, 4], w x y z, of any length.
         scales: [N, 3], natural logarithms.
         logits: [N], of the opacity.
@@ -38,7 +38,7 @@ class Splats:
         extra: further columns by name.
     """
 
-    means: F32
+    means: NDArray[Any]
     quats: F32
     scales: F32
     logits: F32
@@ -59,15 +59,24 @@ class Splats:
         )
 
 
-def meaning(splats: Splats) -> SplatModel:
-    """Return the scene that the rows stand for: alpha of the logits, unit quaternions, the zero one as identity."""
-    logits = splats.logits.astype(np.float64)
+def is_splat(splats: Splats) -> NDArray[np.bool_]:
+    """Tell which rows are splats of the source (SRC-1): all numbers finite in binary32, logits may be infinite."""
+    good = ~np.isnan(splats.logits)
     with np.errstate(over="ignore"):
-        alpha = 1.0 / (1.0 + np.exp(-logits))  # ±Inf are alpha 1 and 0
+        for array in (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN):
+            good &= np.isfinite(array.astype(np.float32)).all(axis=tuple(range(1, array.ndim)))
+    return good
+
+
+def meaning(splats: Splats) -> Source:
+    """Return the source that the rows stand for (spec SRC-1, SRC-2): alpha of the logits, unit quaternions."""
+    splats = splats.select(np.flatnonzero(is_splat(splats)))
+    with np.errstate(over="ignore"):
+        alpha = 1.0 / (1.0 + np.exp(-splats.logits.astype(np.float64)))  # ±Inf are alpha 1 and 0
     quats = splats.quats.astype(np.float64)
     lengths = np.sqrt(np.square(quats).sum(axis=1, keepdims=True))
     quats = np.where(lengths > 0.0, quats / np.where(lengths > 0.0, lengths, 1.0), [[1.0, 0.0, 0.0, 0.0]])
-    return SplatModel(
+    return Source(
         means=splats.means,
         quats=quats.astype(np.float32),
         scales=splats.scales,

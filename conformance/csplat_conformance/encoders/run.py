@@ -162,10 +162,10 @@ def _judge(
         return
     stream, scene = judge_stream(out.read_bytes())
     yield outcome("L1", stream, ended.seconds)
-    if scene is None or one.scene is None:
+    if scene is None or one.source is None:
         yield from skipped("L1", "L1 failed")
         return
-    source = one.scene()
+    source = one.source()
     content, pairs = judge_content(one, source, scene)
     yield outcome("L2", content)
     yield outcome("L3", judge_errors(source, scene, pairs))

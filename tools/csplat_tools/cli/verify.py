@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from csplat.errors import CsplatError
+from csplat_conformance.stated import MeasureProof, Proof
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.options import Output, command
 from csplat_tools.files.console import format_table, note
-from csplat_tools.inspect.proof import MeasureProof, Proof
 from csplat_tools.inspect.verify import Verified, verify_file
 
 __all__ = ["verify"]
@@ -89,11 +89,12 @@ def _table(proof: Proof) -> str:
             for one in proof.measures
         ]
         return format_table(header, rows)
-    return format_table(("error", "stated max"), [(one.name, _number(one.stated_max)) for one in proof.measures])
+    rows = [(one.name, _number(one.stated_max), _word(one)) for one in proof.measures]
+    return format_table(("error", "stated max", ""), rows)
 
 
 def _word(measure: MeasureProof) -> str:
-    return "holds" if measure.holds else "FAILS"
+    return "not proved" if measure.holds is None else "holds" if measure.holds else "FAILS"
 
 
 def _number(value: float | None) -> str:

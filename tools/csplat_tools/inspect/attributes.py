@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs
 from csplat_tools.files.console import Progress, finite
 from csplat_tools.files.scenes import LoadedModel
-from csplat_tools.inspect.matching import match
-from csplat_tools.inspect.pairs import measure_pairs
-from csplat_tools.inspect.proof import lattice_radii
 
 __all__ = ["AttributeErrors", "attribute_errors"]
 
@@ -73,13 +71,13 @@ def attribute_errors(
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of `other`.
     """
-    ours, theirs = source.model, other.model
+    ours, theirs = Source.of(source.model), other.model
     if source_index is not None:
-        return AttributeErrors("index", len(theirs), 0, measure_pairs(ours, theirs, source_index))
-    if _same_order(ours, theirs):
-        return AttributeErrors("order", len(theirs), 0, measure_pairs(ours, theirs, np.arange(len(theirs))))
+        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
+    if _same_order(source.model, theirs):
+        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
     stated, header = other.stated_errors, other.header
-    if header is None or stated is None or stated.refitted or ours.origin != theirs.origin or not len(theirs):
+    if header is None or stated is None or stated.refitted or not len(theirs):
         return None
     bounds = {record.measure: record.max for record in stated.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
@@ -88,8 +86,12 @@ def attribute_errors(
     matched = np.flatnonzero(found >= 0)
     if not len(matched):
         return None
-    errors = measure_pairs(ours, theirs.select(matched), found[matched])
+    errors = _errors(ours, theirs.select(matched), found[matched])
     return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
+
+
+def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
+    return {name: (found.max, found.rms) for name, found in measure_pairs(source, other, index).items()}
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:

@@ -7,11 +7,11 @@ from typing import Any
 
 from csplat.decoder import decode_scene
 from csplat.ply import read_ply
+from csplat_conformance.stated import Proof, Source, prove
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import limits_for
 from csplat_tools.files.streams import mapped_csplat, ply_path, read_array
-from csplat_tools.inspect.proof import Proof, prove
 
 __all__ = ["Verified", "verify_file"]
 
@@ -82,4 +82,5 @@ def verify_file(
         scene = decode_scene(data, limits=limits_for(max_splats))
     with ply_path(source) as ply:
         model = read_ply(ply, keep_extra=bool(scene.header.extras))
-    return Verified(validation, prove(model, scene.model, scene.header, scene.stated_errors, rows, progress=progress))
+    proof = prove(Source.of(model), scene.model, scene.header, scene.stated_errors, rows, progress=progress)
+    return Verified(validation, proof)

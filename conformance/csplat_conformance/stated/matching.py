@@ -7,17 +7,24 @@ a splat's partner lies in its own cell or, along each axis, in the nearer neighb
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
+from csplat.decoder import SceneHeader
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress
-from csplat_tools.inspect.pairs import differences
+from csplat_conformance.stated.pairs import differences
+from csplat_conformance.stated.room import room
+from csplat_conformance.stated.source import Source
 
-__all__ = ["UNDECIDED", "UNMATCHED", "allowed", "match"]
+__all__ = ["UNDECIDED", "UNMATCHED", "Progress", "lattice_radii", "match"]
+
+#: Is told a stage's name and how far it has come, 0 to 1.
+Progress = Callable[[str, float], None]
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -33,13 +40,8 @@ _CANDIDATES_MAX = 1000  # of one cell: scenes of equals would take for ever
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
-def allowed(measure: str, bound: float) -> float:
-    """What a measured error may reach: the bound, and what float64 rounding adds to it."""
-    return bound * (1.0 + 1e-9) + (1e-12 if measure == "covariance" else 0.0)
-
-
 def match(
-    source: SplatModel,
+    source: Source,
     decoded: SplatModel,
     bounds: Mapping[str, float],
     radii: F64,
@@ -50,9 +52,9 @@ def match(
     """Find partners.
 
     Args:
-        source: M splats, with the origin of `decoded`.
-        decoded: N splats.
-        bounds: largest error by measure, `means` and `opacities` and `sh0` among them; measures that are
+        source: M splats.
+        decoded: N splats; its origin may be another one.
+        bounds: largest error by measure, to which comes what SER-7 allows. `means` is among them; measures that are
             not named are not looked at.
         radii: [N], how near the partner's centre is expected; where there is none, the search goes on up to the bound.
         candidates_max: how many splats of one cell are looked at for one partner.
@@ -64,7 +66,10 @@ def match(
     found = np.full(len(decoded), UNMATCHED, np.int64)
     if not len(source):
         return found
-    bound = allowed("means", bounds["means"])
+    reach, source = source.reach(decoded.origin), source.about(decoded.origin)
+    bounds = {name: bound + room(name, bound, reach) for name, bound in bounds.items()}
+    bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
+    bound = bounds["means"]
     levels = _levels(radii, bound)
     for radius in [*np.unique(levels[levels < bound]), bound]:
         rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
@@ -89,10 +94,10 @@ def _levels(radii: F64, bound: float) -> F64:
 class _Grid:
     """The source splats sorted by the hash of their cells."""
 
-    def __init__(self, source: SplatModel, radius: float, bounds: Mapping[str, float]) -> None:
+    def __init__(self, source: Source, radius: float, bounds: Mapping[str, float]) -> None:
         margin = 1.0 + 1e-6  # rounding of the cells
         self.widths = [2.0 * radius * margin] * 3
-        self.widths += [2.0 * allowed(name, bounds[name]) * margin for name in ("opacities", "sh0")]
+        self.widths += [2.0 * bounds[name] * margin for name in ("opacities", "sh0")]
         keys = np.empty(len(source), np.uint64)
         for start in range(0, len(source), _BLOCK):
             rows = slice(start, start + _BLOCK)
@@ -101,7 +106,7 @@ class _Grid:
         self.order: I64 = np.argsort(keys, kind="stable")
         self.keys: U64 = keys[self.order]
 
-    def cells(self, model: SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
+    def cells(self, model: Source | SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
         """Per axis: the cell of each splat, and the neighbour that is nearer."""
         columns = [*model.means[rows].T, model.opacities[rows], model.sh0[rows, 1]]
         return [_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)]
@@ -129,7 +134,7 @@ def _hash(cells: list[F64]) -> U64:
 
 def _search(
     grid: _Grid,
-    source: SplatModel,
+    source: Source,
     decoded: SplatModel,
     rows: I64,
     bounds: Mapping[str, float],
@@ -160,22 +165,31 @@ def _search(
 
 
 def _within(
-    source: SplatModel, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
+    source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
     """Which pairs lie within the bounds; SH and covariance are looked at only where the rest does."""
     near = np.abs(decoded.opacities[decoded_rows].astype(np.float64) - source.opacities[source_rows])
-    good = near <= allowed("opacities", bounds["opacities"])
+    good = near <= bounds["opacities"]
     moved = decoded.means[decoded_rows].astype(np.float64) - source.means[source_rows]
-    good &= np.einsum("ij,ij->i", moved, moved) <= allowed("means", bounds["means"]) ** 2 * (1.0 + 1e-9)
-    good &= (
-        np.abs(decoded.sh0[decoded_rows].astype(np.float64) - source.sh0[source_rows]).max(axis=1)
-        <= allowed("sh0", bounds["sh0"])
-    )  # fmt: skip
+    good &= np.einsum("ij,ij->i", moved, moved) <= bounds["means"] ** 2 * (1.0 + 1e-12)
+    colour = np.abs(decoded.sh0[decoded_rows].astype(np.float64) - source.sh0[source_rows]).max(axis=1)
+    good &= colour <= bounds["sh0"]
     pairs = np.flatnonzero(good)
     for start in range(0, len(pairs), _PAIR_BLOCK):
         part = pairs[start : start + _PAIR_BLOCK]
         errors = differences(source, decoded, source_rows[part], decoded_rows[part])
         for name, bound in bounds.items():
             if name in errors:
-                good[part] &= np.abs(errors[name]).max(axis=1) <= allowed(name, bound)
+                good[part] &= np.abs(errors[name]).max(axis=1) <= bound
     return good
+
+
+def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
+    """Half the diagonal of each splat's lattice cell, and what rounding to float32 adds: how near its source lies."""
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+    radii = np.empty(len(decoded))
+    for tile in header.tiles:
+        rows = slice(tile.start, tile.start + tile.splat_count)
+        radii[rows] = 0.87 * math.ldexp(step, tile.exponent)
+        radii[rows] += np.abs(decoded.means[rows]).max(axis=1).astype(np.float64) * 2.0**-22
+    return radii

@@ -1,6 +1,6 @@
-"""How far decoded splats lie from those of their source (spec 5.5), for `verify`.
+"""How far decoded splats lie from those of their source (spec 5.5).
 
-Written apart from what the encoder measures with, so that each finds the other's mistakes. Everything is
+Written apart from what our encoder measures with, so that each finds the other's mistakes. Everything is
 float64, in blocks that stay in the cache; sums do not depend on the number of threads.
 """
 
@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.model import SplatModel
+from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat_conformance.stated.source import Source
 
-__all__ = ["differences", "measure_names", "measure_pairs"]
+__all__ = ["Measured", "differences", "measure_names", "measure_pairs"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -25,56 +26,71 @@ Rows = NDArray[Any]  # integers that name splats
 _BLOCK = 4096  # splats: 45 float64 SH coefficients of each are 1.5 MB
 
 
-def measure_names(source: SplatModel, decoded: SplatModel) -> list[str]:
-    """Name the measures of a pair of models, in the order of the registry."""
-    degree = max(source.sh_degree, decoded.sh_degree)
-    bands = [f"sh{band}" for band in range(1, degree + 1)]
-    return ["means", "covariance", "opacities", "sh0", *bands]
+class Measured(NamedTuple):
+    """The errors of one measure.
+
+    Attributes:
+        max: the largest.
+        rms: root of the mean square over the splats.
+        worst: the decoded splat that has the largest; 0 where there is none.
+    """
+
+    max: float
+    rms: float
+    worst: int
+
+
+def measure_names(source: Source, decoded: SplatModel) -> list[str]:
+    """Name the measures of a source and what came of it, in the order of the registry."""
+    return ["means", "covariance", "opacities", "sh0", *(f"sh{band}" for band in _bands(source, decoded))]
+
+
+def _bands(source: Source, decoded: SplatModel) -> range:
+    """Bands that one of the two has and the registry too."""
+    return range(1, min(MAX_SH_DEGREE, max(source.sh_degree, decoded.sh_degree)) + 1)
 
 
 def measure_pairs(
-    source: SplatModel, decoded: SplatModel, source_index: Rows, *, threads: int | None = None
-) -> dict[str, tuple[float, float]]:
+    source: Source, decoded: SplatModel, source_index: Rows, *, threads: int | None = None
+) -> dict[str, Measured]:
     """Measure the errors of decoded splats against the splats that they stand for.
 
     Args:
-        source: the model that was handed to the encoder.
+        source: what was encoded.
         decoded: what its file decodes to, N splats.
         source_index: [N] integers; decoded splat i stands for source splat `source_index[i]`.
         threads: how many to use, one per core by default. The result does not depend on it.
 
     Returns:
-        Maximum and rms by measure. The maximum is over components, a vector's square the sum over
-        them. A band that one of the models has not is zero there.
+        The errors by measure. The maximum is over components, a vector's square the sum over
+        them. A band that one of the two has not is zero there.
 
     Raises:
         InputError: `source_index` is not one valid index for each decoded splat.
     """
     _check_index(source_index, len(source), len(decoded))
 
-    def measure_block(start: int) -> dict[str, tuple[float, float]]:
+    def measure_block(start: int) -> dict[str, tuple[float, float, int]]:
         rows = slice(start, min(start + _BLOCK, len(decoded)))
         errors = differences(source, decoded, source_index[rows], rows)
-        return {name: _reduce(values) for name, values in errors.items()}
+        return {name: _reduce(values, start) for name, values in errors.items()}
 
     with ThreadPoolExecutor(threads) as pool:
         blocks = list(pool.map(measure_block, range(0, len(decoded), _BLOCK)))
-    return {
-        name: (
-            max((block[name][0] for block in blocks), default=0.0),
-            math.sqrt(math.fsum(block[name][1] for block in blocks) / max(1, len(decoded))),
-        )
-        for name in measure_names(source, decoded)
-    }
+    return {name: _together([block[name] for block in blocks], len(decoded)) for name in measure_names(source, decoded)}
 
 
-def differences(
-    source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice
-) -> dict[str, F64]:
+def _together(blocks: list[tuple[float, float, int]], count: int) -> Measured:
+    largest, _, worst = max(blocks, key=lambda block: block[0], default=(0.0, 0.0, 0))
+    return Measured(largest, math.sqrt(math.fsum(squares for _, squares, _ in blocks) / max(1, count)), worst)
+
+
+def differences(source: Source, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> dict[str, F64]:
     """Differences of pairs of splats, by measure.
 
     Args:
-        source, decoded: the models.
+        source: what was encoded.
+        decoded: what came of it; its origin may be another one.
         source_rows, decoded_rows: n splats each; pair k is splat k of both.
 
     Returns:
@@ -88,7 +104,7 @@ def differences(
         "opacities": _subtract(decoded.opacities[decoded_rows], source.opacities[source_rows])[:, None],
         "sh0": _subtract(decoded.sh0[decoded_rows], source.sh0[source_rows]),
     }
-    for band in range(1, max(source.sh_degree, decoded.sh_degree) + 1):
+    for band in _bands(source, decoded):
         ours, theirs = _band(decoded, decoded_rows, band), _band(source, source_rows, band)
         values = _subtract(ours, theirs)
         result[f"sh{band}"] = values.reshape(len(values), -1)
@@ -107,25 +123,27 @@ def _check_index(source_index: Rows, source_count: int, decoded_count: int) -> N
             raise InputError(f"the source index reaches from {low} to {high}, the source holds {source_count} splats")
 
 
-def _reduce(values: F64) -> tuple[float, float]:
-    """Return the largest magnitude and the sum of squares. No BLAS: its sums depend on threads."""
-    largest = max(float(values.max()), -float(values.min()))
+def _reduce(values: F64, start: int) -> tuple[float, float, int]:
+    """Return the largest magnitude, the sum of squares, and whose it is. No BLAS: its sums depend on threads."""
+    magnitudes = np.abs(values)
+    place = int(magnitudes.argmax())
     with np.errstate(over="ignore"):
-        return largest, float(np.square(values).sum())
+        squares = float(np.square(values).sum())
+    return float(magnitudes.flat[place]), squares, start + place // values.shape[1]
 
 
-def _subtract(a: F32, b: F32) -> F64:
+def _subtract(a: NDArray[Any], b: NDArray[Any]) -> F64:
     result: F64 = np.subtract(a, b, dtype=np.float64)
     return result
 
 
-def _band(model: SplatModel, rows: Rows | slice, band: int) -> F32:
+def _band(model: Source | SplatModel, rows: Rows | slice, band: int) -> F32:
     if band > model.sh_degree:
         return np.zeros((1, 2 * band + 1, 3), np.float32)
     return model.shN[rows, band * band - 1 : (band + 1) ** 2 - 1]
 
 
-def _distances(source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
+def _distances(source: Source, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
     moved = _subtract(decoded.means[decoded_rows], source.means[source_rows])
     shift = np.subtract(decoded.origin, source.origin)
     if shift.any():
@@ -135,7 +153,7 @@ def _distances(source: SplatModel, decoded: SplatModel, source_rows: Rows, decod
     return distances
 
 
-def _covariance_errors(source: SplatModel, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
+def _covariance_errors(source: Source, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> F64:
     """Compute |S' - S| / |S|, both over the source's largest variance; logarithms beyond ± 88 count as 88 (SER-5)."""
     scales = source.scales[source_rows].clip(-88.0, 88.0)
     largest = scales.max(axis=1).astype(np.float64)

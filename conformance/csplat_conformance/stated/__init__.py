@@ -1,0 +1,17 @@
+"""Stated errors: what they are measured against, how, and how far a checker lets them be off (spec 5.5).
+
+    >>> from csplat_conformance.stated import Source, prove
+    >>> prove(Source.of(model), scene.model, scene.header, scene.stated_errors).holds     # doctest: +SKIP
+    True
+
+`csplat verify` and the encoder suite judge by this package; our encoder measures apart from it.
+"""
+
+from __future__ import annotations
+
+from csplat_conformance.stated.matching import lattice_radii, match
+from csplat_conformance.stated.pairs import measure_pairs
+from csplat_conformance.stated.proof import MeasureProof, Proof, Worst, prove
+from csplat_conformance.stated.source import Source
+
+__all__ = ["MeasureProof", "Proof", "Source", "Worst", "lattice_radii", "match", "measure_pairs", "prove"]

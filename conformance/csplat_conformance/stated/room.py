@@ -1,0 +1,36 @@
+"""How far a statement of an error may lie from what it speaks of (spec SER-5, SER-7)."""
+
+from __future__ import annotations
+
+__all__ = ["may_be_stated", "room"]
+
+_EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
+_ROUNDING = 1e-9  # SER-7: relative, sums in binary64 in another order
+_COORDINATE = 2.0**-50  # SER-7: of the largest coordinate, which is added and subtracted in binary64
+#: SER-7: whether alpha and unit quaternions are rounded to binary32 before they are compared is left open.
+_OPEN = {"opacities": 2e-7, "covariance": 2e-6}
+
+
+def room(measure: str, error: float, reach: float) -> float:
+    """Return how far two right computations of an error may lie apart (SER-7).
+
+    Args:
+        measure: of the registry of stated errors.
+        error: the error, in the measure's unit.
+        reach: largest magnitude of a coordinate of the source or of the file's origin, scene units.
+    """
+    open_ = reach * _COORDINATE if measure == "means" else _OPEN.get(measure, 0.0)
+    return open_ + _ROUNDING * error
+
+
+def may_be_stated(measure: str, stated: float, found: float, reach: float) -> bool:
+    """Whether a file may state this of an error: no less than was found, and hardly more (SER-5).
+
+    Args:
+        measure: of the registry of stated errors.
+        stated: maximum or rms, as the file has it.
+        found: the same, as a checker found it.
+        reach: as of `room`.
+    """
+    open_ = room(measure, found, reach)
+    return found - open_ <= stated <= found * (1.0 + _EXCESS) + _EXCESS_FLOOR + open_
