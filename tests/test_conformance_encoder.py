@@ -153,7 +153,7 @@ def run_here(command, places, _seconds):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_our_encoder_passes_at_every_preset(preset):
-    # CNF-5, CNF-6
+    # CNF-5, CNF-6, SRC-3
     report = run_encoder(f"{OURS} --preset {preset}", EncoderChoice(None, INTEGRITY, jobs=1), run=run_here)
 
     assert [] == report.failures

@@ -39,9 +39,28 @@ def round_trip(model: SplatModel, importance: np.ndarray | None = None, **option
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_comes_back_within_stated_errors(make_model, preset, degree):
-    # CNF-5
+    # CNF-5, SRC-4
     decoded, _ = round_trip(make_model(500, degree), preset=preset)
     assert degree >= decoded.sh_degree
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_errors_of_far_doubles_are_stated_against_the_doubles(make_model, preset):
+    # 5.5: the distance of origin + mean from the source's centre; float32 leaves off what shows in the sixth digit
+    origin = (481_250.0, 5_467_100.0, 310.0)
+    doubles = np.random.default_rng(1).normal(0, 40, (400, 3)) + np.array(origin)
+    means = (doubles - np.array(origin)).astype(np.float32)
+    result = encode_with_report(
+        make_model(400, 0, means=means, origin=origin, means_double=doubles), EncodeOptions(preset=preset)
+    )
+    decoded = csplat.decode(result.data)
+    away = np.linalg.norm(decoded.means + np.array(decoded.origin) - doubles[result.source_index], axis=1)
+    rounded = np.linalg.norm(decoded.means.astype(np.float64) - means[result.source_index], axis=1)
+    largest, rms = result.report.errors["means"]
+
+    assert largest == pytest.approx(away.max(), rel=1e-6)
+    assert rms == pytest.approx(np.sqrt(np.square(away).mean()), rel=1e-6)
+    assert away.max() != pytest.approx(rounded.max(), rel=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 99, 100, 101, 300])
@@ -245,6 +264,7 @@ def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
 
 @pytest.mark.parametrize("coding", ["scalar", "codebook"])
 def test_bytes_do_not_depend_on_threads(make_model, coding):
+    # CNF-10
     model = make_model(2000, 2)
     options = {"sh_coding": coding, "tile_splats": 500, "codebook_size": 64}
     one, two, four = (encode(model, EncodeOptions(threads=n, **options)) for n in (1, 2, 4))

@@ -1,4 +1,5 @@
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,24 @@ def test_accepts_coordinate_systems_of_three_directions(make_model, letters):
 
 def test_origin_may_be_any_three_numbers(make_model):
     assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
+
+
+def with_doubles(make_model):
+    doubles = np.random.default_rng(1).normal(0, 1, (10, 3)) + np.array([5e5, 5e6, 300.0])
+    origin = (5e5, 5e6, 300.0)
+    means = (doubles - np.array(origin)).astype(np.float32)
+    return make_model(10, 0, means=means, origin=origin, means_double=doubles)
+
+
+def test_doubles_go_with_their_means(make_model):
+    model = with_doubles(make_model)
+    some = model.select(np.array([3, 1]))
+
+    np.testing.assert_array_equal(model.means_double[[3, 1]], some.means_double)
+    assert replace(model, means=model.means + 1, means_double=None).means_double is None
+    for wrong in ({"means": model.means + 1}, {"origin": (0.0, 0.0, 0.0)}, {"means_double": model.means}):
+        with pytest.raises(InputError, match="means_double"):
+            replace(model, **wrong)
 
 
 def test_a_model_does_not_copy_its_arrays(make_model):

@@ -265,6 +265,16 @@ def test_an_outlier_does_not_move_the_origin(tmp_path):
     assert np.abs(restored - positions[1:]).max() < 1e-6
 
 
+def test_doubles_that_float32_does_not_hold_are_kept_and_written_back(tmp_path):
+    positions = np.random.default_rng(3).normal(0, 5, (20, 3)) + np.array([481_250.0, 5_467_100.0, 310.0])
+    write_doubles(tmp_path / "a.ply", positions)
+    model = read_ply(tmp_path / "a.ply")
+    write_ply(tmp_path / "b.ply", model, absolute=True)
+
+    np.testing.assert_array_equal(positions, model.means_double)
+    np.testing.assert_array_equal(positions, read_ply(tmp_path / "b.ply").means_double)
+
+
 def test_doubles_that_are_floats_keep_origin_zero(tmp_path):
     positions = np.float32(1e7) + np.arange(30.0).reshape(10, 3)
     write_doubles(tmp_path / "a.ply", positions)

@@ -16,6 +16,7 @@ from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour
 from csplat.decoder.streams import _undo_run_length, undo_transforms
 from csplat_conformance.deflate import Deflate
 from csplat_conformance.near import too_far
+from csplat_conformance.stated.room import may_be_stated
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
@@ -30,6 +31,7 @@ def spec() -> SimpleNamespace:
         "sqrt": np.sqrt,
         "ldexp": math.ldexp,
         "isfinite": np.isfinite,
+        "floor": math.floor,
     }
     names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
     blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
@@ -197,6 +199,58 @@ def test_nearness(spec, array):
         for y, x in zip(values, exact, strict=True):
             far = too_far(array, y.tobytes(), np.array([x]))
             assert spec.is_near(y, x, array) == (not far), (y, x, far)
+
+
+@pytest.mark.parametrize("measure", ["means", "covariance", "opacities", "sh0", "sh3"])
+@pytest.mark.parametrize("reach", [0.0, 3.0, 5e6])
+def test_what_may_be_stated(spec, measure, reach):
+    # SER-7
+    for error in (0.0, 1e-12, 1e-7, 3e-3, 0.5, 1e6):
+        for wide in (0.0, 1e-13, 1e-9, 1.9e-7, 2.1e-7, 1.9e-6, 2.1e-6, 9e-5 * error, 1.1e-4 * error, error):
+            for stated in (error - wide, error + wide):
+                allowed = spec.may_be_stated(stated, error, measure, reach)
+                assert allowed == may_be_stated(measure, stated, error, reach)
+                assert not (allowed and error > 1e-3 and abs(stated - error) > 0.002 * error)
+
+
+def test_colours_there_and_back(spec):
+    rng = np.random.default_rng(4)
+    for k in (0, 1, 2, 5):
+        bounds = np.array([0.5 + 5 / 12 * 2**k, 0.5 + 2**k / 3, 0.5 + 5 / 12 * 2**k]) if k else 7 / 6
+        for rgb in rng.uniform(-300, 300, (500, 3)):
+            found = spec.rgb_from_ycocg(*spec.ycocg_from_rgb(*rgb.tolist(), k), k)
+            assert (np.abs(found - rgb) <= bounds + 1e-9).all()
+    for rgb in rng.integers(-300, 300, (500, 3)).tolist():
+        assert tuple(rgb) == spec.rgb_from_ycocg(*spec.ycocg_from_rgb(*rgb, 0), 0)
+
+
+@pytest.mark.parametrize("levels", [3, 127, 32767])
+def test_rotations_there_and_back(spec, levels):
+    rng = np.random.default_rng(levels)
+    quats = rng.normal(0, 1, (300, 4))
+    quats[:4] = [[0, 0, 1, 1], [-1, 0, 0, 0], [1, -1, 1, -1], [0, 1, 0, -1]]
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    for quat in quats:
+        turned = spec.with_w_largest(*quat.tolist())
+        assert turned[0] == max(map(abs, turned))
+        # One half turn about an axis of the splat, or none: the axes are the same up to their signs.
+        axes = np.abs(rotation_of(quat).T @ rotation_of(turned))
+        np.testing.assert_allclose(axes, np.eye(3), atol=1e-12)
+        q = spec.quat_integers(turned, levels)
+        assert max(map(abs, q)) <= levels
+        found = np.array(spec.quat(*q, levels), np.float64)
+        assert np.linalg.norm(found - turned) < 2.0 / levels
+
+
+def rotation_of(quat):
+    w, x, y, z = quat
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def lengths_of_codes(count):

@@ -16,11 +16,18 @@ EXCUSES: Final = {
     "CHK-6": "a permission; vectors whose only defect lies in such a payload are marked optional",
     "CHK-7": "the vectors that are marked optional, for decoders that read the payload",
     "SER-5": "about what an encoder states, which needs the source: `tests/test_proof.py`, `tests/test_validator.py`",
+    "SER-6": "likewise: `tests/test_proof.py`",
+    "SER-7": "about who checks what is stated: `tests/test_spec_pseudocode.py`, `tests/test_stated.py`",
+    "SRC-1": "about encoders: `tests/test_stated.py`",
+    "SRC-2": "about encoders: `tests/test_stated.py`",
+    "SRC-3": "about encoders: `tests/test_conformance_encoder.py`",
+    "SRC-4": "about encoders: `tests/test_encode.py`",
     "CNF-2": "the sum of all vectors",
     "CNF-3": "no file shows the absence of crashes: `tests/fuzz.py`, `tests/test_damage.py`",
     "CNF-4": "about a decoder's interface: `tests/test_decoder_scene.py`",
     "CNF-5": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
     "CNF-6": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
+    "CNF-10": "about encoders: `tests/test_encode.py`",
     "CNF-9": "about what a decoder says of itself",
 }
 
