@@ -1,0 +1,59 @@
+"""What a wrong encoder does: ours, with its one mistake."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import csplat
+from csplat import ply as ply_files
+from csplat.encoder import Origin, encode_with_report
+from wrong_encoders.serr import bounded
+from wrong_encoders.truth import true_errors
+
+
+def encode(mistake, ply, out, index=None):
+    """Read, encode, write.
+
+    Args:
+        mistake: what is wrong.
+        ply, out: input and output.
+        index: where the map from splats of the file to those of the source is wanted, if it is.
+    """
+    with np.errstate(all="ignore"):  # who is wrong divides by zero, too
+        data, source_index = _encoded(mistake, ply)
+    if mistake.honest is not None:
+        data = bounded(true_errors(mistake.honest(ply), csplat.decode(data), source_index))(data)
+    if mistake.data is not None:
+        data = mistake.data(data)
+    if index is not None:
+        with Path(index).open("wb") as stream:
+            np.save(stream, source_index if mistake.index is None else mistake.index(source_index))
+    if mistake.end is None:
+        out.write_bytes(data)
+    else:
+        mistake.end(ply, out, data)
+
+
+def _encoded(mistake, ply):
+    """Return the file, and which splat of the input each of its splats is."""
+    with mistake.stage():
+        model = _read(mistake, ply)
+        if mistake.scene is not None:
+            model = mistake.scene(model)
+        origin = None
+        if mistake.keep is not None:
+            rows = mistake.keep(model).astype(np.int64)
+            model, origin = model.select(rows), Origin(len(model), rows)
+        result = encode_with_report(model, csplat.EncodeOptions(**mistake.options), origin=origin)
+    return result.data, result.source_index
+
+
+def _read(mistake, ply):
+    keep_extra = bool(mistake.options.get("keep_extra"))
+    if mistake.ply is None:
+        return ply_files.read_ply(ply, keep_extra=keep_extra)
+    with tempfile.TemporaryDirectory(prefix="csplat-wrong-") as folder:
+        path = Path(folder) / "in.ply"
+        path.write_bytes(mistake.ply(ply.read_bytes()))
+        return ply_files.read_ply(path, keep_extra=keep_extra)

@@ -1,0 +1,103 @@
+"""What the conformance suite says of a mistake."""
+
+import contextlib
+import io
+import shlex
+import sys
+import time
+from fnmatch import fnmatch
+from functools import cache
+from pathlib import Path
+
+from csplat.errors import CsplatError
+from csplat_conformance.encoders import LEVELS, EncoderChoice, all_inputs, run_encoder
+from csplat_conformance.process import Ended, run_program
+from csplat_conformance.report import Report, Status
+from wrong_encoders.encoding import encode
+from wrong_encoders.mistake import Mistake
+from wrong_encoders.mistakes import MISTAKES
+
+FOLDER = Path(__file__).parent
+PLACES = "{ply} {out}"
+#: Statuses that are no failures and say something all the same.
+SIGNS = ("warned", "not proved")
+
+
+def command_of(name: str) -> str:
+    """The command line that starts a wrong encoder."""
+    return f"{shlex.quote(sys.executable)} {shlex.quote(str(FOLDER))} {name} {PLACES}"
+
+
+def inputs_of(mistake: Mistake) -> list[str]:
+    """Names of the reference inputs that show a mistake; none where there is no such input."""
+    patterns = mistake.inputs.split(",")
+    return [one.name for one in all_inputs() if any(fnmatch(one.name, pattern) for pattern in patterns)]
+
+
+def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] | None = None) -> Report:
+    """Run the conformance suite over a mistake; return its report.
+
+    Args:
+        name: of the mistake.
+        names: of the inputs; its own if left out.
+        levels: those wanted; without pictures if left out, unless nothing else shows the mistake.
+    """
+    mistake = MISTAKES[name]
+    names = inputs_of(mistake) if names is None else names
+    if not names:
+        return Report("encoder", name, [], ("there is no such input",))
+    if levels is None:
+        levels = LEVELS if mistake.caught[0] == LEVELS[-1] else LEVELS[:-1]
+    choice = EncoderChoice(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
+    pictures = psnr if LEVELS[-1] in levels else None
+    return run_encoder(command_of(name), choice, pictures=pictures, run=run_program if mistake.starts else run_here)
+
+
+def first_sign(report: Report):
+    """The first outcome that says that something is wrong, or `None`."""
+    signs = report.failures or [one for one in report.outcomes if str(one.status) in SIGNS]
+    return signs[0] if signs else None
+
+
+def run_here(command, places, _seconds):
+    """Encode as `main` does with this command line, in this process."""
+    began = time.perf_counter()
+    index = places.get("index")
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = status_of(shlex.split(command)[2], places["ply"], places["out"], index)
+    status, message = (Status.WRONG_STATUS, f"exit status {code}") if code > 1 else (None, "")
+    seconds = time.perf_counter() - began
+    return Ended(status, code, out.getvalue().encode(), err.getvalue().encode(), seconds, message)
+
+
+def status_of(name, ply, out, index=None):
+    """Encode and return the exit status."""
+    try:
+        encode(MISTAKES[name], Path(ply), Path(out), index)
+    except SystemExit as ended:
+        if not isinstance(ended.code, str):
+            return ended.code or 0
+        sys.stderr.write(ended.code + "\n")
+        return 1
+    except CsplatError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    return 0
+
+
+def psnr(source, decoded):
+    """PSNR of renders; those of a source are made once."""
+    key = b"".join(values.tobytes() for values in (source.means, source.quats, source.sh0, source.shN))
+    judge = _judges().get(key)
+    if judge is None:
+        from csplat_render.judge import Judge
+        from csplat_tools.views import comparison_cameras
+
+        judge = _judges()[key] = Judge.of_source(source, comparison_cameras(source))
+    return judge.psnr(decoded)
+
+
+@cache
+def _judges():
+    return {}

@@ -1,0 +1,216 @@
+"""Mistakes in what is made of a scene before it is coded: precision, range, choice, frame, facts."""
+
+import os
+
+import numpy as np
+
+from csplat.model import SplatModel
+from wrong_encoders.mistake import (
+    DEGREE_2,
+    DEGREE_3,
+    SHAPES,
+    STRONG,
+    Harm,
+    Mistake,
+    changed,
+    floats,
+)
+from wrong_encoders.truth import as_read, in_binary64
+
+L3 = ("L3", "SER-5")
+FACT = ("L2", "CNF-6")
+
+
+def merged(model):
+    """Drop exact duplicates and say nothing."""
+    _, first = np.unique(model.means, axis=0, return_index=True)
+    return model.select(np.sort(first))
+
+
+def clipped(field, most):
+    return changed(**{field: lambda m: np.clip(getattr(m, field), np.float32(-most), np.float32(most))})
+
+
+def half(field):
+    """Store values in float16, none of them infinite."""
+    return changed(**{field: lambda m: np.clip(getattr(m, field), -65504, 65504).astype(np.float16).astype(np.float32)})
+
+
+def own_origin(model):
+    """Choose an origin in the middle, in doubles, as 4.3 allows."""
+    absolute = model.means.astype(np.float64) + model.origin
+    middle = tuple(np.median(absolute, axis=0).tolist())
+    return changed(means=lambda _: floats(absolute - middle), origin=lambda _: middle)(model)
+
+
+def origin_not_written(model):
+    return changed(means=lambda m: m.means - m.means[0])(model)
+
+
+def with_extra(model):
+    return changed(extra=lambda m: {"confidence": m.opacities.copy()})(model)
+
+
+def reversed_extra(model):
+    return changed(extra=lambda m: {name: column[::-1].copy() for name, column in m.extra.items()})(model)
+
+
+def of_degree_3(model):
+    padded = np.zeros((len(model), 15, 3), np.float32)
+    padded[:, : model.shN.shape[1]] = model.shN
+    return changed(shN=lambda _: padded)(model)
+
+
+def by_chance(model):
+    """A permutation that comes from outside."""
+    return np.argsort(np.frombuffer(os.urandom(8 * len(model)), "<u8"), kind="stable")
+
+
+def from_a_temporary(model):
+    name = f"/tmp/splats-{os.urandom(4).hex()}.ply"  # noqa: S108 - a name, no file
+    return changed(metadata=lambda m: {**m.metadata, "source": name})(model)
+
+
+def mirrored(model: SplatModel) -> SplatModel:
+    """Turn y and z around in centres and colours' frame, and leave the rotations."""
+    return changed(quats=lambda m: m.quats[:, [1, 0, 3, 2]] * np.float32([-1, 1, -1, 1]))(model)
+
+
+MISTAKES = {
+    # precision and range
+    "half_precision": Mistake(
+        "float16 is enough, and errors are measured after it",
+        Harm.PICTURE,
+        FACT,
+        "nasty/far_coordinates",
+        scene=half("means"),
+    ),
+    "sh_half_precision": Mistake(
+        "float16 is enough for SH, and errors are measured after it", Harm.BOUND, L3, DEGREE_3, scene=half("shN")
+    ),
+    "sh_half_precision_honest": Mistake(
+        "the same, and errors are measured from the file",
+        Harm.HARMLESS,
+        inputs=DEGREE_3,
+        scene=half("shN"),
+        honest=as_read,
+    ),
+    "colours_clipped": Mistake("colours lie within ±2", Harm.PICTURE, L3, STRONG, scene=clipped("sh0", 2)),
+    "colours_clipped_honest": Mistake(
+        "colours lie within ±1, and errors say so",
+        Harm.PICTURE,
+        ("L4", ""),
+        STRONG,
+        scene=clipped("sh0", 1),
+        honest=as_read,
+    ),
+    "sh_clipped": Mistake("SH lie within ±1", Harm.PICTURE, L3, STRONG, scene=clipped("shN", 1)),
+    "sh_clipped_honest": Mistake(
+        "SH lie within ±1, and errors say so", Harm.PICTURE, ("L4", ""), STRONG, scene=clipped("shN", 1), honest=as_read
+    ),
+    "scales_clipped": Mistake(
+        "scales lie within ±20", Harm.PICTURE, L3, "nasty/huge_scales", scene=clipped("scales", 20)
+    ),
+    "needles_thickened_honest": Mistake(
+        "no axis need be thinner than a fiftieth of the longest, and errors say so",
+        Harm.HARMLESS,
+        inputs="ordinary/needles_and_discs",
+        scene=changed(scales=lambda m: np.maximum(m.scales, m.scales.max(axis=1, keepdims=True) - np.float32(4))),
+        honest=as_read,
+    ),
+    # choice
+    "duplicates_merged": Mistake(
+        "equal splats are one", Harm.PICTURE, ("L2", "SRC-1"), "nasty/duplicates", scene=merged
+    ),
+    "pruned_uncounted": Mistake(
+        "nobody misses what is nearly transparent",
+        Harm.FACTS,
+        ("L2", "SRC-1"),
+        scene=lambda m: m.select(m.opacities >= 0.1),
+    ),
+    "pruned_counted": Mistake(
+        "the same, and the file says how many",
+        Harm.HARMLESS,
+        keep=lambda m: np.flatnonzero(m.opacities >= 0.02),
+    ),
+    "pruned_most": Mistake(
+        "whoever counts what is pruned may prune any",
+        Harm.COARSE,
+        ("L2", ""),
+        keep=lambda m: np.flatnonzero(m.opacities >= np.quantile(m.opacities, 0.6)),
+    ),
+    "bands_dropped": Mistake(
+        "degree 1 is enough, and errors say so", Harm.COARSE, ("L3", ""), DEGREE_3, options={"sh_degree": 1}
+    ),
+    "all_bands_dropped": Mistake(
+        "colour is sh0, and errors say so", Harm.COARSE, ("L3", ""), DEGREE_2, options={"sh_degree": 0}
+    ),
+    "alpha_of_eight": Mistake(
+        "eight levels of alpha will do, and errors say so", Harm.COARSE, ("L3", ""), options={"opacity_levels": 8}
+    ),
+    "coarse": Mistake(
+        "honest errors may be of any size",
+        Harm.COARSE,
+        ("L4", ""),
+        options={"attribute_psnr": 16.0, "sh_coding": "none"},
+    ),
+    # frame
+    "y_and_z_swapped": Mistake(
+        "z points up",
+        Harm.PICTURE,
+        FACT,
+        scene=changed(means=lambda m: np.ascontiguousarray(m.means[:, [0, 2, 1]])),
+    ),
+    "rotations_in_another_frame": Mistake(
+        "y and z point the other way, and only rotations notice",
+        Harm.PICTURE,
+        ("L4", ""),
+        SHAPES,
+        scene=mirrored,
+        honest=as_read,
+    ),
+    "origin_not_written": Mistake("a viewer centres the scene anyway", Harm.PICTURE, FACT, scene=origin_not_written),
+    "origin_not_subtracted": Mistake(
+        "the origin says where the middle is",
+        Harm.PICTURE,
+        FACT,
+        scene=changed(origin=lambda m: tuple((np.array(m.origin) + m.means.mean(axis=0) + 10.0).tolist())),
+    ),
+    "own_origin": Mistake(
+        "an encoder chooses the origin",
+        Harm.HARMLESS,
+        inputs="ordinary/degree_1,nasty/far_doubles",
+        scene=own_origin,
+        honest=in_binary64,
+    ),
+    # facts
+    "axes_guessed": Mistake(
+        "every scene is right-down-forward", Harm.FACTS, FACT, scene=changed(coordinate_system=lambda _: "RDF")
+    ),
+    "unit_guessed": Mistake("a unit is a metre", Harm.FACTS, FACT, scene=changed(unit_metres=lambda _: 1.0)),
+    "antialiased_guessed": Mistake(
+        "trainers filter nowadays", Harm.FACTS, FACT, scene=changed(antialiased=lambda _: True)
+    ),
+    "flat_guessed": Mistake("discs are faster", Harm.FACTS, FACT, scene=changed(flat=lambda _: True)),
+    "degree_always_3": Mistake("every scene has degree 3", Harm.FACTS, FACT, scene=of_degree_3),
+    "extra_invented": Mistake(
+        "a column more does no harm", Harm.FACTS, FACT, scene=with_extra, options={"keep_extra": True}
+    ),
+    "extra_garbled": Mistake(
+        "extra columns need not be sorted with the splats",
+        Harm.FACTS,
+        FACT,
+        "ordinary/extra_columns",
+        scene=reversed_extra,
+        options={"keep_extra": True},
+    ),
+    # chance
+    "order_by_chance": Mistake(
+        "the order of splats is nobody's business",
+        Harm.DETERMINISM,
+        ("L1", ""),
+        keep=by_chance,
+        options={"means_coding": "axis"},
+    ),
+    "temporary_name_kept": Mistake("metadata say what was read", Harm.DETERMINISM, ("L1", ""), scene=from_a_temporary),
+}

@@ -1,0 +1,70 @@
+"""What an honest encoder measures against: the scene as the input has it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import csplat
+from csplat.encoder.measure import ErrorSums, distance_errors, measured_sums
+from wrong_encoders import plyrows
+
+
+def as_read(ply):
+    """The scene as our reader has it: alpha and unit quaternions in float32."""
+    return csplat.read_ply(ply)
+
+
+def in_binary64(ply):
+    """The scene in binary64: alpha and unit quaternions that nobody rounded."""
+    return Exact.of(ply)
+
+
+def true_errors(source, decoded, index):
+    """Return (max, rms) by measure, a hair wider, as ours states them; origins may differ."""
+    sums = measured_sums(source, decoded, index)
+    absolute = [
+        np.add(model.means.astype(np.float64), model.origin) if model.means_double is None else model.means_double
+        for model in (source, decoded)
+    ]
+    most, squares = distance_errors(absolute[0][index].T, absolute[1].T)
+    largest, all_squares = {**sums.largest, "means": most}, {**sums.squares, "means": squares}
+    return ErrorSums(sums.count, largest, all_squares).stated()
+
+
+@dataclass(frozen=True)
+class Exact:
+    """A scene of float64 that can be measured against; finite, and no quaternion of length 0."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh0: np.ndarray
+    shN: np.ndarray
+    sh_degree: int
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    means_double: None = None
+
+    def __len__(self):
+        return len(self.means)
+
+    @classmethod
+    def of(cls, ply):
+        """Read its columns by hand."""
+        columns = plyrows.parsed(ply.read_bytes())
+        rest = sum(name.startswith("f_rest_") for name in columns.dtype.names) // 3
+
+        def group(*names):
+            return np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+
+        quats = group(*(f"rot_{i}" for i in range(4)))
+        shN = [group(*(f"f_rest_{c * rest + i}" for i in range(rest))) for c in range(3)] if rest else []
+        return cls(
+            means=group(*"xyz"),
+            quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
+            scales=group(*(f"scale_{i}" for i in range(3))),
+            opacities=1.0 / (1.0 + np.exp(-columns["opacity"].astype(np.float64))),
+            sh0=group(*(f"f_dc_{i}" for i in range(3))),
+            shN=np.stack(shN, axis=2) if rest else np.zeros((len(columns), 0, 3)),
+            sh_degree=round((rest + 1) ** 0.5) - 1,
+        )
