@@ -47,7 +47,7 @@ class StatedErrors:
         source_count: splats of the source.
         pruned_count: splats of the source that the file does not hold.
         source_sh_degree: SH degree of the source.
-        refitted: attributes were fitted anew; renders judge them, not these bounds.
+        refitted: attributes were fitted anew; renders judge those without a record.
         records: by measure.
     """
 

@@ -141,7 +141,7 @@ def _stated_errors(stated: StatedErrors) -> str:
     source = f"{stated.source_count} splats, SH degree {stated.source_sh_degree}"
     lines = [f"stands for a source of {source}; {stated.pruned_count} pruned"]
     if stated.refitted:
-        lines.append("attributes were fitted anew: renders are the judge, not these errors")
+        lines.append("attributes were fitted anew: renders are the judge of those without an error here")
     if stated.records:
         rows = [(one.measure, f"{one.max:.6g}", f"{one.rms:.6g}") for one in stated.records]
         lines.append(format_table(("stated error", "max", "rms"), rows))
