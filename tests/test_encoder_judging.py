@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import types
 import xml.etree.ElementTree as ET
 from contextlib import contextmanager
@@ -98,6 +99,19 @@ def test_centres_in_doubles_are_compared_in_doubles():
     content, pairs = judge_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
 
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
+
+
+def test_splats_that_are_nowhere_near_are_named(plain):
+    moved = plain.means.copy()
+    moved[:3, 0] += 7.0
+    moved[5] = moved[6]
+    content, errors, _ = judged(PLAIN, dataclasses.replace(plain, means=moved))
+
+    assert (Status.FAILED, ("CNF-6", "SER-5")) == (content.status, content.clauses)
+    far, near, _ = content.message.split("; ")
+    assert re.fullmatch(r"3 splats of the file, the first splat \d+, are not within 0.03 of a splat of the source", far)
+    assert re.fullmatch(r"splat \d+ of the file is near a splat of the source that another stands for already", near)
+    assert Status.SKIPPED is errors.status
 
 
 # Stated errors -------------------------------------------------------------------------------------

@@ -80,11 +80,18 @@ def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) 
 def _wrong_splats(one: Input, pairs: Pairs) -> list[Wrong]:
     wrong = []
     if pairs.strays:
-        near = f"{one.apart / 2.0:g}"
-        wrong.append(("CNF-6", f"{pairs.strays} splats of the file are not within {near} of a splat of the source"))
+        far = f"not within {one.apart / 2.0:g} of a splat of the source"
+        wrong.append(("CNF-6", f"{_many(pairs.strays, pairs.examples[0])} {far}"))
     if pairs.surplus:
-        wrong.append(("CNF-6", f"{pairs.surplus} splats of the file stand for one that another stands for already"))
+        many = _many(pairs.surplus, pairs.examples[1])
+        wrong.append(("CNF-6", f"{many} near a splat of the source that another stands for already"))
     return wrong
+
+
+def _many(count: int, first: int) -> str:
+    return (
+        f"splat {first} of the file is" if count == 1 else f"{count} splats of the file, the first splat {first}, are"
+    )
 
 
 def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[Wrong]:

@@ -70,8 +70,8 @@ def _expected(one: Input, data: bytes) -> dict[str, Any] | None:
 
 def _rows(data: bytes) -> int:
     """Return what the header says: `element vertex 64`."""
-    header, _, _ = data.partition(b"end_header")
-    for line in header.splitlines():
+    # A comment may say anything, `end_header` and `element vertex 9` too.
+    for line in data.split(b"\n"):
         words = line.split()
         if words[:2] == [b"element", b"vertex"]:
             return int(words[2])
