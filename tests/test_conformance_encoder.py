@@ -32,7 +32,7 @@ from csplat_tools.cli.app import app
 
 INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
-OURS = f"{shlex.quote(sys.executable)} -m csplat_tools encode {{ply}} {{out}} --quiet"
+OURS = f"{shlex.quote(sys.executable)} -m csplat_tools encode {{ply}} {{out}} --source-index {{index}} --quiet"
 INTEGRITY = ("L1", "L2", "L3")
 HAS_RENDERER = find_spec("numba") is not None
 
@@ -324,15 +324,16 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     )  # fmt: skip
 
     assert 0 == result.exit_code, result.output
-    assert "all         3       3       0        0" in result.stdout
+    assert "all         3       3       0         0           0       0        0" in result.stdout
     report = json.loads((tmp_path / "r.json").read_text())
     assert ("encoder", True) == (report["suite"], report["passed"])
     assert ["L1", "L2", "L3"] == [one["level"] for one in report["outcomes"]]
     assert 0.0 == report["outcomes"][2]["details"]["means"]["stated_max"]
     root = ET.fromstring((tmp_path / "r.xml").read_text())  # noqa: S314 - our own file
     assert {"tests": "3", "failures": "0"}.items() <= root.attrib.items()
-    assert ["ordinary-one_splat.csplat", "ordinary-one_splat.ply"] == sorted(
-        path.name for path in (tmp_path / "kept").iterdir()
+    assert ["ordinary-one_splat"] == [path.name for path in (tmp_path / "kept").iterdir()]
+    assert ["in.ply", "out.csplat", "out.npy"] == sorted(
+        path.name for path in (tmp_path / "kept" / "ordinary-one_splat").iterdir()
     )
     assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--report", tmp_path / "r.json").exit_code
     assert 1 == invoke("--filter", "*/one_splat", "--level", 1, "--keep", tmp_path / "kept").exit_code
@@ -368,10 +369,10 @@ def test_wrong_words_are_one_line(words, message):
 
 
 def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
-    def absent(**_):
+    def absent():
         raise InputError("this needs numba: pip install 'csplat[render]'")
 
-    monkeypatch.setattr("csplat_tools.cli.conformance.prepare_renderer", absent)
+    monkeypatch.setattr("csplat_tools.cli.conformance.need_renderer", absent)
     result = invoke("--filter", "*/degree_0")
 
     assert 0 == result.exit_code

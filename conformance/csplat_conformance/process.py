@@ -6,7 +6,8 @@
     (None, 0)
 
 The command line is split as a shell would, without a shell: no pipes, no variables. Names in braces are put in after
-the split, so that file names may hold spaces.
+the split, so that file names may hold spaces. In a working directory of its own the program still finds files that
+the caller's command line names: see `run_program`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO
 
 from csplat.errors import InputError
@@ -51,8 +53,13 @@ class Ended:
     message: str = ""
 
 
-def split_command(command: str, names: tuple[str, ...]) -> list[str]:
+def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[str]:
     """Split a command line and see to it that it names what it must.
+
+    Args:
+        command: the line.
+        names: that have to stand in it in braces.
+        optional: that may.
 
     Raises:
         InputError: quotes without an end, no program, a name in braces that is missing or unknown.
@@ -61,7 +68,7 @@ def split_command(command: str, names: tuple[str, ...]) -> list[str]:
         words = shlex.split(command)
         missing = [name for name in names if not any(f"{{{name}}}" in word for word in words)]
         for word in words:
-            word.format(**dict.fromkeys(names, ""))
+            word.format(**dict.fromkeys((*names, *optional), ""))
     except (ValueError, LookupError, AttributeError) as error:
         raise InputError(f"the command {command!r} cannot be used: {error}") from None
     if missing or not words:
@@ -69,23 +76,29 @@ def split_command(command: str, names: tuple[str, ...]) -> list[str]:
     return words
 
 
-def run_program(command: str, places: Mapping[str, str], timeout_seconds: float) -> Ended:
+def run_program(command: str, places: Mapping[str, str], timeout_seconds: float, *, cwd: Path | None = None) -> Ended:
     """Run a command line in a process group of its own; what is left of the group after the time is killed.
 
     Args:
         command: with the keys of `places` in braces.
         places: what to put in.
         timeout_seconds: wall-clock limit.
+        cwd: working directory. A program with a slash is then still one of this process's own directory, and so are
+            words, or what follows the `=` of an option, that look like a path (a slash, or a suffix) and name
+            something there.
 
     Raises:
         InputError: the command line is not one, or there is no such program.
     """
-    words = [word.format(**places) for word in split_command(command, tuple(places))]
+    words = split_command(command, tuple(places))
+    if cwd is not None:
+        words = [_absolute(words[0]) if os.sep in words[0] else words[0], *map(_found_from_anywhere, words[1:])]
+    words = [word.format(**places) for word in words]
     start = time.perf_counter()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
             process = subprocess.Popen(  # noqa: S603 - to run the caller's command is what this is for
-                words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
+                words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
             )
         except OSError as error:
             raise InputError(f"{words[0]}: {error.strerror or error}") from None
@@ -106,6 +119,20 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float)
         elif returncode > 1:
             status, message = Status.WRONG_STATUS, f"exit status {returncode}"
         return Ended(status, returncode, _tail(out), _tail(err), seconds, message)
+
+
+def _found_from_anywhere(word: str) -> str:
+    """Make a word absolute that names something in the working directory."""
+    option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
+    like_a_path = os.sep in path or bool(Path(path).suffix)
+    # Path.exists() raises for words that are too long to be one.
+    found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
+    return option + equals + _absolute(path) if found else word
+
+
+def _absolute(path: str) -> str:
+    # A link stays one: the program of a virtual environment is known by where it lies.
+    return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
 
 
 def _kill_group(process: subprocess.Popen[bytes]) -> None:

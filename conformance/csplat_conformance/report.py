@@ -16,7 +16,8 @@
 
 A runner makes one `Outcome` for each check, that is for each vector or input and level. `failed` and what a process
 can do instead of an answer (`crashed`, `hung` and so on) all count as failures; they are told apart for whoever has
-to mend something. Nothing here knows decoders or encoders.
+to mend something. Statuses that only some suites have are columns of their reports alone (`Report.extra`). Nothing
+here knows decoders or encoders.
 """
 
 from __future__ import annotations
@@ -35,9 +36,12 @@ _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 
 class Status(StrEnum):
-    """What became of a check. All but `PASSED` and `SKIPPED` are failures."""
+    """What became of a check. Those from `FAILED` to `REFUSED` are failures."""
 
     PASSED = "passed"
+    WARNED = "warned"  #: passed: legal, and far worse than need be
+    DECLINED = "declined"  #: what may be refused was refused
+    NOT_PROVED = "not proved"  #: nothing contradicts it, nothing shows it
     FAILED = "failed"  #: the answer is wrong
     CRASHED = "crashed"  #: ended by a signal
     HUNG = "hung"  #: did not end in time
@@ -49,6 +53,9 @@ class Status(StrEnum):
     SKIPPED = "skipped"  #: not looked at; the message says why
 
 
+_GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
+#: What is no failure, and no pass either: JUnit calls these skipped.
+_OPEN = frozenset((Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
 #: What did not come to an answer: JUnit calls these errors.
 _ERRORS = frozenset((Status.CRASHED, Status.HUNG, Status.WRONG_STATUS, Status.NO_OUTPUT, Status.WRONG_ANSWER))
 
@@ -79,8 +86,8 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether the check passed or was skipped."""
-        return self.status in (Status.PASSED, Status.SKIPPED)
+        """Whether the check did not fail."""
+        return self.status in _GOOD
 
 
 @dataclass(frozen=True)
@@ -92,12 +99,14 @@ class Report:
         subject: what was tested: a command line, or words.
         outcomes: in the order of the run.
         notes: a line each about the run as a whole.
+        extra: statuses that this suite has beside passed, failed and skipped, and that are counted.
     """
 
     suite: str
     subject: str
     outcomes: Sequence[Outcome]
     notes: Sequence[str] = ()
+    extra: Sequence[Status] = ()
 
     @property
     def failures(self) -> list[Outcome]:
@@ -110,16 +119,20 @@ class Report:
         return bool(self.outcomes) and not self.failures
 
     def levels(self) -> dict[str, dict[str, int]]:
-        """Return by level how many checks there were, how many passed, failed and were skipped."""
-        return {level: _counts(one for one in self.outcomes if one.level == level) for level in _levels(self)}
+        """Return by level how many checks there were, how many passed, failed and were skipped, and so on."""
+        return {level: self.counts(level) for level in _levels(self)}
+
+    def counts(self, level: str | None = None) -> dict[str, int]:
+        """Return the same of one level, or of all."""
+        return _counts((one for one in self.outcomes if level in (None, one.level)), self.extra)
 
 
 def _levels(report: Report) -> list[str]:
     return sorted({one.level for one in report.outcomes})
 
 
-def _counts(outcomes: Iterable[Outcome]) -> dict[str, int]:
-    counts = {"checks": 0, "passed": 0, "failed": 0, "skipped": 0}
+def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, int]:
+    counts = dict.fromkeys(("checks", "passed", *map(str, extra), "failed", "skipped"), 0)
     for one in outcomes:
         counts["checks"] += 1
         counts[str(one.status) if one.good else "failed"] += 1
@@ -127,7 +140,7 @@ def _counts(outcomes: Iterable[Outcome]) -> dict[str, int]:
 
 
 def to_table(report: Report, *, verbose: bool = False) -> str:
-    """Return the failures, skips and remarks, a line each, and the counts by level.
+    """Return the failures, warnings, skips and remarks, a line each, and the counts by level.
 
     Args:
         report: the run.
@@ -137,15 +150,15 @@ def to_table(report: Report, *, verbose: bool = False) -> str:
     lines = _aligned([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
     lines += [""] * bool(lines)
     lines += [*report.notes]
-    counts = [*report.levels().items(), ("all", _counts(report.outcomes))]
-    header = ("level", "checks", "passed", "failed", "skipped")
-    rows = [(level, *map(str, (count[name] for name in header[1:]))) for level, count in counts]
+    counts = [*report.levels().items(), ("all", report.counts())]
+    header = ("level", *counts[-1][1])
+    rows = [(level, *map(str, count.values())) for level, count in counts]
     return "\n".join([*lines, *_aligned([header, *rows], right=True)])
 
 
 def _word(status: Status) -> str:
     """Failures are in capitals, so that the eye and grep find them."""
-    return "ok" if status is Status.PASSED else "skipped" if status is Status.SKIPPED else str(status).upper()
+    return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
 
 
 def _remark(one: Outcome) -> str:
@@ -206,14 +219,15 @@ def _suite(report: Report, level: str) -> str:
     name = f"csplat.{report.suite}.{level}"
     cases = [_case(one, name) for one in outcomes]
     head = f'  <testsuite name="{_xml(name)}" {_totals(outcomes)}>'
-    subject = f'    <properties><property name="subject" value="{_xml(report.subject)}"/></properties>'
-    return "\n".join([head, subject, *cases, "  </testsuite>"])
+    facts = [("subject", report.subject), *(("note", note) for note in report.notes)]
+    properties = "".join(f'<property name="{name}" value="{_xml(value)}"/>' for name, value in facts)
+    return "\n".join([head, f"    <properties>{properties}</properties>", *cases, "  </testsuite>"])
 
 
 def _totals(outcomes: Sequence[Outcome]) -> str:
     errors = sum(one.status in _ERRORS for one in outcomes)
     failures = sum(not one.good for one in outcomes) - errors
-    skipped = sum(one.status is Status.SKIPPED for one in outcomes)
+    skipped = sum(one.status in _OPEN for one in outcomes)
     seconds = sum(one.seconds for one in outcomes)
     return f'tests="{len(outcomes)}" failures="{failures}" errors="{errors}" skipped="{skipped}" time="{seconds:.3f}"'
 
@@ -222,8 +236,11 @@ def _case(one: Outcome, suite: str) -> str:
     head = f'    <testcase classname="{_xml(suite)}" name="{_xml(one.name)}" time="{one.seconds:.3f}"'
     if one.status is Status.PASSED:
         return head + "/>"
-    if one.status is Status.SKIPPED:
-        return f'{head}><skipped message="{_xml(one.message)}"/></testcase>'
+    if one.status is Status.WARNED:
+        return f"{head}><system-out>{_xml(f'warning: {one.message}')}</system-out></testcase>"
+    if one.status in _OPEN:
+        message = one.message if one.status is Status.SKIPPED else f"{one.status}: {one.message}"
+        return f'{head}><skipped message="{_xml(message)}"/></testcase>'
     kind = "error" if one.status in _ERRORS else "failure"
     message = f'message="{_xml(f"{one.status}: {_remark(one)}")}"'
     return f'{head}><{kind} type="{_xml(one.code or str(one.status))}" {message}/></testcase>'

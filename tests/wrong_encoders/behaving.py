@@ -12,7 +12,7 @@ from csplat_conformance.encoders import all_inputs
 from wrong_encoders.mistake import PLAIN, Harm, Mistake
 
 NO_FILE, FILES = Harm.VALIDITY, Harm.FILES
-MAP = (Harm.FACTS, ("L2", ""))
+MAP = (Harm.FACTS, ("L2", "SRC-4"))
 
 # Ends -----------------------------------------------------------------------------------------------
 

@@ -26,13 +26,13 @@ def encode(mistake, ply, out, index=None):
         data = bounded(true_errors(mistake.honest(ply), csplat.decode(data), source_index))(data)
     if mistake.data is not None:
         data = mistake.data(data)
-    if index is not None:
-        with Path(index).open("wb") as stream:
-            np.save(stream, source_index if mistake.index is None else mistake.index(source_index))
     if mistake.end is None:
         out.write_bytes(data)
     else:
         mistake.end(ply, out, data)
+    if index is not None:
+        with Path(index).open("wb") as stream:
+            np.save(stream, source_index if mistake.index is None else mistake.index(source_index))
 
 
 def _encoded(mistake, ply):

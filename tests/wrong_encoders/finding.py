@@ -11,16 +11,16 @@ from pathlib import Path
 
 from csplat.errors import CsplatError
 from csplat_conformance.encoders import LEVELS, EncoderChoice, all_inputs, run_encoder
-from csplat_conformance.process import Ended, run_program
-from csplat_conformance.report import Report, Status
+from csplat_conformance.process import Ended
+from csplat_conformance.report import Outcome, Report, Status
 from wrong_encoders.encoding import encode
 from wrong_encoders.mistake import Mistake
 from wrong_encoders.mistakes import MISTAKES
 
 FOLDER = Path(__file__).parent
-PLACES = "{ply} {out}"
+PLACES = "{ply} {out} {index}"
 #: Statuses that are no failures and say something all the same.
-SIGNS = ("warned", "not proved")
+SIGNS = (Status.WARNED, Status.NOT_PROVED)
 
 
 def command_of(name: str) -> str:
@@ -50,12 +50,13 @@ def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] |
         levels = LEVELS if mistake.caught[0] == LEVELS[-1] else LEVELS[:-1]
     choice = EncoderChoice(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
     pictures = psnr if LEVELS[-1] in levels else None
-    return run_encoder(command_of(name), choice, pictures=pictures, run=run_program if mistake.starts else run_here)
+    return run_encoder(command_of(name), choice, pictures=pictures, run=None if mistake.starts else run_here)
 
 
 def first_sign(report: Report):
     """The first outcome that says that something is wrong, or `None`."""
-    signs = report.failures or [one for one in report.outcomes if str(one.status) in SIGNS]
+    signs = report.failures or [one for one in report.outcomes if one.status in SIGNS]
+    signs += [Outcome("", "L1", Status.WARNED, message=note) for note in report.notes if note.startswith("warning: ")]
     return signs[0] if signs else None
 
 

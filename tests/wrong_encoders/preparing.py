@@ -18,7 +18,7 @@ from wrong_encoders.mistake import (
 from wrong_encoders.truth import as_read, in_binary64
 
 L3 = ("L3", "SER-5")
-FACT = ("L2", "CNF-6")
+FAR, INVENTED = ("L2", "CNF-6"), ("L2", "SRC-3")
 
 
 def merged(model):
@@ -81,7 +81,7 @@ MISTAKES = {
     "half_precision": Mistake(
         "float16 is enough, and errors are measured after it",
         Harm.PICTURE,
-        FACT,
+        FAR,
         "nasty/far_coordinates",
         scene=half("means"),
     ),
@@ -158,7 +158,7 @@ MISTAKES = {
     "y_and_z_swapped": Mistake(
         "z points up",
         Harm.PICTURE,
-        FACT,
+        FAR,
         scene=changed(means=lambda m: np.ascontiguousarray(m.means[:, [0, 2, 1]])),
     ),
     "rotations_in_another_frame": Mistake(
@@ -169,11 +169,11 @@ MISTAKES = {
         scene=mirrored,
         honest=as_read,
     ),
-    "origin_not_written": Mistake("a viewer centres the scene anyway", Harm.PICTURE, FACT, scene=origin_not_written),
+    "origin_not_written": Mistake("a viewer centres the scene anyway", Harm.PICTURE, FAR, scene=origin_not_written),
     "origin_not_subtracted": Mistake(
         "the origin says where the middle is",
         Harm.PICTURE,
-        FACT,
+        FAR,
         scene=changed(origin=lambda m: tuple((np.array(m.origin) + m.means.mean(axis=0) + 10.0).tolist())),
     ),
     "own_origin": Mistake(
@@ -185,21 +185,21 @@ MISTAKES = {
     ),
     # facts
     "axes_guessed": Mistake(
-        "every scene is right-down-forward", Harm.FACTS, FACT, scene=changed(coordinate_system=lambda _: "RDF")
+        "every scene is right-down-forward", Harm.FACTS, INVENTED, scene=changed(coordinate_system=lambda _: "RDF")
     ),
-    "unit_guessed": Mistake("a unit is a metre", Harm.FACTS, FACT, scene=changed(unit_metres=lambda _: 1.0)),
+    "unit_guessed": Mistake("a unit is a metre", Harm.FACTS, INVENTED, scene=changed(unit_metres=lambda _: 1.0)),
     "antialiased_guessed": Mistake(
-        "trainers filter nowadays", Harm.FACTS, FACT, scene=changed(antialiased=lambda _: True)
+        "trainers filter nowadays", Harm.FACTS, INVENTED, scene=changed(antialiased=lambda _: True)
     ),
-    "flat_guessed": Mistake("discs are faster", Harm.FACTS, FACT, scene=changed(flat=lambda _: True)),
-    "degree_always_3": Mistake("every scene has degree 3", Harm.FACTS, FACT, scene=of_degree_3),
+    "flat_guessed": Mistake("discs are faster", Harm.FACTS, INVENTED, scene=changed(flat=lambda _: True)),
+    "degree_always_3": Mistake("every scene has degree 3", Harm.FACTS, INVENTED, scene=of_degree_3),
     "extra_invented": Mistake(
-        "a column more does no harm", Harm.FACTS, FACT, scene=with_extra, options={"keep_extra": True}
+        "a column more does no harm", Harm.FACTS, INVENTED, scene=with_extra, options={"keep_extra": True}
     ),
     "extra_garbled": Mistake(
         "extra columns need not be sorted with the splats",
         Harm.FACTS,
-        FACT,
+        INVENTED,
         "ordinary/extra_columns",
         scene=reversed_extra,
         options={"keep_extra": True},

@@ -260,7 +260,7 @@ MISTAKES = {
     "some_errors_left_out": Mistake(
         "the others are stated",
         Harm.PICTURE,
-        ("L3", "SER-5"),
+        ("L3", "SER-6"),
         DEGREE_3,
         scene=changed(shN=without_band_sign),
         stage=none_of("sh1", "sh2", "sh3"),

@@ -1,10 +1,8 @@
-"""What is made of one file that an encoder wrote: is it valid, whole, honest, and how does it look."""
+"""L1 and L2 of one file that an encoder wrote: is it valid, and does it hold what its source does."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -12,38 +10,19 @@ from csplat import _spec
 from csplat.decoder import Scene, decode_scene
 from csplat.errors import CsplatError
 from csplat.model import UNSPECIFIED, SplatModel
+from csplat_conformance.encoders.coarse import coarse_pruning
 from csplat_conformance.encoders.inputs import Input
+from csplat_conformance.encoders.mapping import check_index
 from csplat_conformance.encoders.matching import Pairs, pair
+from csplat_conformance.encoders.verdict import Verdict, Wrong, failed
 from csplat_conformance.report import Status
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.stated import Source
 from csplat_conformance.validator import validate
 
-__all__ = ["PictureJudge", "Verdict", "judge_content", "judge_errors", "judge_pictures", "judge_stream"]
-
-#: PSNR in dB of a decoded scene against its source; the source comes first.
-PictureJudge = Callable[[SplatModel, SplatModel], float]
+__all__ = ["judge_content", "judge_stream"]
 
 _CUT_SHORT = frozenset((_spec.ERROR_TRUNCATED,))
 _SHOWN = 3
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What one level says.
-
-    Attributes:
-        status: passed or not.
-        message: why, or a remark.
-        clauses: that are broken.
-        code: of the first violation.
-        details: numbers, for programs.
-    """
-
-    status: Status
-    message: str = ""
-    clauses: tuple[str, ...] = ()
-    code: str = ""
-    details: dict[str, Any] = field(default_factory=dict)
 
 
 def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
@@ -68,33 +47,54 @@ def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
     return Verdict(Status.PASSED, "; ".join(validation.remarks), details={"bytes": len(data)}), scene
 
 
-def judge_content(one: Input, source: Source, scene: Scene) -> tuple[Verdict, Pairs]:
-    """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated."""
+def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) -> tuple[Verdict, Pairs]:
+    """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated.
+
+    Args:
+        one: the input.
+        source: what it stands for.
+        scene: what the file holds.
+        index: the encoder's own source index, `None` where none was asked for.
+
+    Returns:
+        The verdict, and which splat of the source each of the file is: by the encoder's own index, if it is right.
+    """
     decoded = scene.model
     centres = decoded.means.astype(np.float64) + np.subtract(decoded.origin, source.origin)
     pairs = pair(source.means.astype(np.float64), centres, one.apart)
     details = {"splats": len(decoded), "source_splats": len(source), "missing": pairs.missing}
     wrong = [*_wrong_splats(one, pairs), *_wrong_counts(source, scene, pairs), *_wrong_facts(source, decoded)]
+    if index is not None:
+        pairs, wrong_numbers = check_index(index, source, len(decoded), pairs)
+        details["source_index"] = not wrong_numbers
+        wrong += wrong_numbers
     if pairs.strays == pairs.surplus == 0:
         wrong += _wrong_extras(source, decoded, pairs)
     if wrong:
-        clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
-        return Verdict(Status.FAILED, "; ".join(text for _, text in wrong), clauses, details=details), pairs
+        return failed(wrong, details), pairs
+    coarse = coarse_pruning(one, pairs.missing, len(source))
     remark = f"{pairs.missing} splats pruned" if pairs.missing else ""
-    return Verdict(Status.PASSED, remark, details=details), pairs
+    return Verdict(Status.WARNED if coarse else Status.PASSED, coarse or remark, details=details), pairs
 
 
-def _wrong_splats(one: Input, pairs: Pairs) -> list[tuple[str, str]]:
+def _wrong_splats(one: Input, pairs: Pairs) -> list[Wrong]:
     wrong = []
     if pairs.strays:
-        near = f"{one.apart / 2.0:g}"
-        wrong.append(("CNF-6", f"{pairs.strays} splats of the file are not within {near} of a splat of the source"))
+        far = f"not within {one.apart / 2.0:g} of a splat of the source"
+        wrong.append(("CNF-6", f"{_many(pairs.strays, pairs.examples[0])} {far}"))
     if pairs.surplus:
-        wrong.append(("CNF-6", f"{pairs.surplus} splats of the file stand for one that another stands for already"))
+        many = _many(pairs.surplus, pairs.examples[1])
+        wrong.append(("CNF-6", f"{many} near a splat of the source that another stands for already"))
     return wrong
 
 
-def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[tuple[str, str]]:
+def _many(count: int, first: int) -> str:
+    return (
+        f"splat {first} of the file is" if count == 1 else f"{count} splats of the file, the first splat {first}, are"
+    )
+
+
+def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[Wrong]:
     stated = scene.stated_errors
     if stated is None:
         text = f"{pairs.missing} splats of the source are missing, and nothing says so"
@@ -110,7 +110,7 @@ def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[tuple[str,
     return wrong
 
 
-def _wrong_facts(source: Source, decoded: SplatModel) -> list[tuple[str, str]]:
+def _wrong_facts(source: Source, decoded: SplatModel) -> list[Wrong]:
     """A PLY says nothing of axes, unit and filters: a file that does has guessed."""
     facts = {
         "axes": (decoded.coordinate_system, UNSPECIFIED),
@@ -119,44 +119,21 @@ def _wrong_facts(source: Source, decoded: SplatModel) -> list[tuple[str, str]]:
         "flat": (decoded.flat, False),
     }
     wrong = [
-        ("CNF-6", f"{name} is {found}, of which the source says nothing")
+        ("SRC-3", f"{name} is {found}, of which the source says nothing")
         for name, (found, wanted) in facts.items()
         if found != wanted
     ]
     if decoded.sh_degree > source.sh_degree:
-        wrong.append(("CNF-6", f"SH degree {decoded.sh_degree}, the source has {source.sh_degree}"))
+        wrong.append(("SRC-3", f"SH degree {decoded.sh_degree}, the source has {source.sh_degree}"))
     return wrong
 
 
-def _wrong_extras(source: Source, decoded: SplatModel, pairs: Pairs) -> list[tuple[str, str]]:
+def _wrong_extras(source: Source, decoded: SplatModel, pairs: Pairs) -> list[Wrong]:
     wrong = []
     for name, column in decoded.extra.items():
         other = source.extra.get(name)
-        if other is None or column.tobytes() != other[pairs.source_index].astype(column.dtype).tobytes():
-            wrong.append(("CNF-6", f"the extra column {name!r} is not the source's"))
+        if other is None:
+            wrong.append(("SRC-3", f"the extra column {name!r} is none of the source's"))
+        elif column.tobytes() != other[pairs.source_index].astype(column.dtype).tobytes():
+            wrong.append(("SRC-3", f"the extra column {name!r} does not hold what the source's does"))
     return wrong
-
-
-def judge_errors(source: Source, scene: Scene, pairs: Pairs) -> Verdict:
-    """L3: the stated errors hold (SER-5)."""
-    if pairs.strays or pairs.surplus:
-        return Verdict(Status.SKIPPED, "which splat is which is not known")
-    if scene.stated_errors is None:
-        return Verdict(Status.SKIPPED, "the file states no errors")
-    proof = prove(source, scene.model, scene.header, scene.stated_errors, pairs.source_index)
-    details = proof.as_json()["measures"]
-    if not proof.holds:
-        return Verdict(Status.FAILED, "; ".join(proof.failures), ("SER-5",), details=details)
-    return Verdict(Status.PASSED, "; ".join(proof.notes), details=details)
-
-
-def judge_pictures(one: Input, source: Source, scene: Scene, pictures: PictureJudge, psnr_min: float) -> Verdict:
-    """L4: renders of the file look like those of the source."""
-    if not one.renders:
-        return Verdict(Status.SKIPPED, "pictures of this scene say nothing")
-    psnr = pictures(source.model(scene.model.origin), scene.model)
-    details = {"psnr": psnr}
-    wanted = psnr_min - one.psnr_room
-    if psnr < wanted:
-        return Verdict(Status.FAILED, f"{psnr:.2f} dB, wanted {wanted:g} at least", details=details)
-    return Verdict(Status.PASSED, f"{psnr:.2f} dB", details=details)

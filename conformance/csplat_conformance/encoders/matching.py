@@ -27,12 +27,14 @@ class Pairs:
         strays: decoded splats without a source.
         surplus: decoded splats whose source splat another one has taken.
         missing: source splats that nobody stands for.
+        examples: the first of `strays` and of `surplus`; −1 where there is none.
     """
 
     source_index: I64
     strays: int
     surplus: int
     missing: int
+    examples: tuple[int, int] = (_NONE, _NONE)
 
 
 def pair(source: F64, decoded: F64, apart: float) -> Pairs:
@@ -45,7 +47,8 @@ def pair(source: F64, decoded: F64, apart: float) -> Pairs:
         apart: a decoded splat belongs to the source centre that is nearer than half of this.
     """
     if not len(source) or not len(decoded):
-        return Pairs(np.full(len(decoded), _NONE, np.int64), len(decoded), 0, len(source))
+        first_stray = 0 if len(decoded) else _NONE
+        return Pairs(np.full(len(decoded), _NONE, np.int64), len(decoded), 0, len(source), (first_stray, _NONE))
     centres, member_of, counts = np.unique(source, axis=0, return_inverse=True, return_counts=True)
     group = _nearest(centres, decoded, apart)
     members = np.argsort(member_of.reshape(-1), kind="stable")
@@ -58,7 +61,12 @@ def pair(source: F64, decoded: F64, apart: float) -> Pairs:
     taken = rank < counts[groups]
     index[order[taken]] = members[first[groups[taken]] + rank[taken]]
     paired = int(taken.sum())
-    return Pairs(index, len(decoded) - len(near), len(near) - paired, len(source) - paired)
+    examples = _first(group == _NONE), _first((group != _NONE) & (index == _NONE))
+    return Pairs(index, len(decoded) - len(near), len(near) - paired, len(source) - paired, examples)
+
+
+def _first(which: NDArray[np.bool_]) -> int:
+    return int(which.argmax()) if which.any() else _NONE
 
 
 def _nearest(centres: F64, decoded: F64, apart: float) -> I64:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,30 +15,19 @@ from pathlib import Path
 from csplat.errors import InputError
 from csplat_conformance.choosing import matching
 from csplat_conformance.encoders.inputs import Input, all_inputs
-from csplat_conformance.encoders.judge import (
-    PictureJudge,
-    Verdict,
-    judge_content,
-    judge_errors,
-    judge_pictures,
-    judge_stream,
-)
-from csplat_conformance.process import Ended, run_program, split_command
+from csplat_conformance.encoders.levels import LEVELS, Asked, judge_input
+from csplat_conformance.encoders.picturing import PictureJudge
+from csplat_conformance.encoders.trial import AGAIN_SECONDS, OPTIONAL_PLACES, PLACES, Runner, Trial, try_once
+from csplat_conformance.process import split_command
 from csplat_conformance.report import Outcome, Report, Status
 
-__all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "run_encoder"]
+__all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "chosen_inputs", "run_encoder"]
 
-LEVELS = ("L1", "L2", "L3", "L4")
 TIMEOUT_SECONDS = 60.0
 PSNR_MIN = 30.0  #: dB
 
-#: Runs a command line with some places put in, within some seconds.
-Runner = Callable[[str, Mapping[str, str], float], Ended]
-
-_NAMES = ("ply", "out")
-_TRACEBACK = b"Traceback (most recent call last)"
-_LINE_MAX = 200  # characters of a program's line that are shown
 _NO_PICTURES = "nothing renders here"
+_AGAIN = ".again"
 
 
 @dataclass(frozen=True)
@@ -45,11 +36,12 @@ class EncoderChoice:
 
     Attributes:
         pattern: shell patterns of the inputs' names, `ordinary/*,nasty/empty`; `None` for all.
-        levels: those wanted; each needs the ones before it, which are run and not reported.
+        levels: those wanted; each needs the ones before it, which are run and not reported. Where L3 proves nothing
+            L4 is judged, too.
         timeout_seconds: for one input.
         psnr_min: dB, of L4.
         jobs: processes at a time; one per core if left out.
-        keep: folder for the inputs and what was made of them; `None` keeps nothing.
+        keep: folder for the inputs and what was made of them, a folder for each; `None` keeps nothing.
     """
 
     pattern: str | None = None
@@ -67,145 +59,140 @@ def run_encoder(
     pictures: PictureJudge | None = None,
     no_pictures: str = _NO_PICTURES,
     progress: Callable[[int, int], None] | None = None,
-    run: Runner = run_program,
+    run: Runner | None = None,
 ) -> Report:
     """Run an encoder over the inputs.
 
-    It is started once for each: status 0 and a complete file at `{out}`, or status 1, a line that says why and no
-    file.
+    It is started for each: status 0 and a complete file at `{out}`, or status 1, a line that says why and no file.
+    Where it wrote a file it is started once more, after all others: the bytes have to be the same.
 
     Args:
-        command: its command line, with `{ply}` and `{out}`.
+        command: its command line, with `{ply}` and `{out}`, and perhaps `{index}`, where it writes which splat of the
+            source each splat of the file is.
         choice: what to run.
-        pictures: judges L4; without it the level is skipped.
+        pictures: judges L4; without it the level is skipped, or fails where nothing else can judge.
         no_pictures: why it is.
-        progress: is told how many inputs of how many are done.
-        run: runs the command line with `ply` and `out` put in, within some seconds; `run_program` starts a process.
-            On threads, as many as `choice.jobs` says.
+        progress: is told how many steps of how many are done.
+        run: runs the command line with `ply`, `out` and `index` put in, within some seconds, in this process; on
+            threads, as many as `choice.jobs` says. Without it processes are started, each in an empty working
+            directory, and `AGAIN_SECONDS` go by before a repetition.
 
     Raises:
         InputError: the command line is not one, there is no such program, or no such level, or a pattern matches no
             input.
     """
     choice = choice or EncoderChoice()
-    split_command(command, _NAMES)
+    split_command(command, PLACES, OPTIONAL_PLACES)
     unknown = [level for level in choice.levels if level not in LEVELS]
     if unknown:
         raise InputError(f"there is no level {', '.join(unknown)}, wanted {', '.join(LEVELS)}")
-    names = matching(choice.pattern, [one.name for one in all_inputs()], "input")
-    inputs = [one for one in all_inputs() if one.name in names]
+    inputs = chosen_inputs(choice.pattern)
+    asked = Asked(choice.levels, choice.psnr_min, pictures, no_pictures)
     outcomes: list[Outcome] = []
+    declined: dict[str, bool] = {}
     with _folder(choice.keep) as folder, ThreadPoolExecutor(choice.jobs or os.cpu_count() or 1) as pool:
-        started = [pool.submit(_run, run, command, one, folder, choice.timeout_seconds) for one in inputs]
         try:
-            for done, (one, future) in enumerate(zip(inputs, started, strict=True)):
+            steps = _Steps(2 * len(inputs), progress)
+            firsts, repeated = _try_all(pool, command, inputs, folder, choice.timeout_seconds, run, steps)
+            for one, first, future in zip(inputs, firsts, repeated, strict=True):
                 # Judged here, one after the other: rendering uses all cores by itself.
-                levels = _judge(one, future.result(), folder, pictures, no_pictures, choice)
-                outcomes += [outcome for outcome in levels if outcome.level in choice.levels]
-                if progress is not None:
-                    progress(done + 1, len(inputs))
+                again = future.result() if future is not None else None
+                outcomes += judge_input(one, first, again, asked)
+                if one.may_refuse:
+                    declined[one.name] = first.ended.status is None and first.ended.returncode == 1
+                _forget(folder, one, first, again)
+                steps.go()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    wants_pictures = pictures is None and "L4" in choice.levels
-    notes = (f"L4 SKIPPED: {no_pictures}",) if wants_pictures and inputs else ()
-    return Report("encoder", command, outcomes, notes)
+    notes = _notes(declined)
+    if pictures is None and "L4" in choice.levels and inputs:
+        notes.append(f"L4 SKIPPED: {no_pictures}")
+    extra = (Status.WARNED, Status.DECLINED, Status.NOT_PROVED)
+    return Report("encoder", command, outcomes, notes, extra)
+
+
+def chosen_inputs(pattern: str | None) -> list[Input]:
+    """Return the inputs of some names, in the order of a run.
+
+    Args:
+        pattern: as in `EncoderChoice`.
+
+    Raises:
+        InputError: a pattern matches none.
+    """
+    inputs = all_inputs()
+    names = matching(pattern, [one.name for one in inputs], "input")
+    return [one for one in inputs if one.name in names]
 
 
 @contextmanager
 def _folder(keep: Path | None) -> Iterator[Path]:
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
-        yield keep
+        yield keep.absolute()
         return
     with tempfile.TemporaryDirectory(prefix="csplat-encoder-") as name:
         yield Path(name)
 
 
-def _places(one: Input, folder: Path) -> tuple[Path, Path]:
-    stem = one.name.replace("/", "-")
-    return folder / f"{stem}.ply", folder / f"{stem}.csplat"
+def _place(folder: Path, one: Input) -> Path:
+    return folder / one.name.replace("/", "-")
 
 
-def _run(run: Runner, command: str, one: Input, folder: Path, timeout_seconds: float) -> Ended:
-    ply, out = _places(one, folder)
-    ply.write_bytes(one.make())
-    out.unlink(missing_ok=True)  # of an earlier run that was kept
-    return run(command, {"ply": str(ply), "out": str(out)}, timeout_seconds)
+@dataclass
+class _Steps:
+    """How far a run has come."""
+
+    count: int
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    def go(self) -> None:
+        """Go one step."""
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.count)
 
 
-# Judging -------------------------------------------------------------------------------------------
-
-
-def _judge(
-    one: Input,
-    ended: Ended,
+def _try_all(
+    pool: ThreadPoolExecutor,
+    command: str,
+    inputs: Sequence[Input],
     folder: Path,
-    pictures: PictureJudge | None,
-    no_pictures: str,
-    choice: EncoderChoice,
-) -> Iterator[Outcome]:
-    """Judge level by level; where one fails, those that need it are skipped."""
+    seconds: float,
+    run: Runner | None,
+    steps: _Steps,
+) -> tuple[list[Trial], list[Future[Trial] | None]]:
+    """Run all inputs, then begin with the repetitions of those that gave a file."""
 
-    def outcome(level: str, verdict: Verdict, seconds: float = 0.0) -> Outcome:
-        facts = (verdict.clauses, verdict.code, verdict.message, seconds, verdict.details)
-        return Outcome(one.name, level, verdict.status, *facts)
+    def again(one: Input, first: Trial) -> Trial:
+        if run is None:
+            time.sleep(max(0.0, first.started + AGAIN_SECONDS - time.monotonic()))
+        place = _place(folder, one)
+        return try_once(command, one, place.with_name(place.name + _AGAIN), seconds, run)
 
-    def skipped(after: str, why: str) -> Iterator[Outcome]:
-        for level in () if one.must_refuse else LEVELS[LEVELS.index(after) + 1 :]:
-            yield outcome(level, Verdict(Status.SKIPPED, why))
-
-    _, out = _places(one, folder)
-    verdict = _judge_end(one, ended, out)
-    if verdict is not None:
-        yield outcome("L1", verdict, ended.seconds)
-        yield from skipped("L1", "no file was written" if verdict.status is Status.PASSED else "L1 failed")
-        return
-    stream, scene = judge_stream(out.read_bytes())
-    yield outcome("L1", stream, ended.seconds)
-    if scene is None or one.source is None:
-        yield from skipped("L1", "L1 failed")
-        return
-    source = one.source()
-    content, pairs = judge_content(one, source, scene)
-    yield outcome("L2", content)
-    yield outcome("L3", judge_errors(source, scene, pairs))
-    if pictures is None:
-        yield outcome("L4", Verdict(Status.SKIPPED, no_pictures))
-    elif "L4" in choice.levels:
-        yield outcome("L4", judge_pictures(one, source, scene, pictures, choice.psnr_min))
+    begun = [pool.submit(try_once, command, one, _place(folder, one), seconds, run) for one in inputs]
+    firsts = []
+    for future in begun:
+        firsts.append(future.result())
+        steps.go()
+    pairs = zip(inputs, firsts, strict=True)
+    return firsts, [pool.submit(again, one, first) if first.wrote else None for one, first in pairs]
 
 
-def _judge_end(one: Input, ended: Ended, out: Path) -> Verdict | None:
-    """Judge how the program ended; `None` where there is a file to look at."""
-    if ended.status is not None:
-        return Verdict(ended.status, _with_line(ended.message, ended))
-    if ended.returncode == 1:
-        return _judge_refusal(one, ended, out)
-    if not out.exists():
-        return Verdict(Status.NO_OUTPUT, "exit status 0, and there is no file")
-    if one.must_refuse:
-        return Verdict(Status.FAILED, "accepted, though there are no splats in it")
-    return None
+def _forget(folder: Path, one: Input, first: Trial, again: Trial | None) -> None:
+    """Remove a repetition that gave the same file; where another one came out, whoever keeps files wants both."""
+    if again is not None and again.wrote and first.out.read_bytes() == again.out.read_bytes():
+        place = _place(folder, one)
+        shutil.rmtree(place.with_name(place.name + _AGAIN))
 
 
-def _judge_refusal(one: Input, ended: Ended, out: Path) -> Verdict:
-    if _TRACEBACK in ended.stderr:
-        return Verdict(Status.CRASHED, _with_line("a traceback", ended))
-    if out.exists():
-        return Verdict(Status.PARTIAL_OUTPUT, "exit status 1, and there is a file")
-    line = _last_line(ended)
-    if not line:
-        return Verdict(Status.WRONG_ANSWER, "exit status 1 without a line that says why")
-    if one.must_refuse or one.may_refuse:
-        return Verdict(Status.PASSED, f"refused: {line}")
-    return Verdict(Status.REFUSED, line)
-
-
-def _last_line(ended: Ended) -> str:
-    text = (ended.stderr.strip() or ended.stdout.strip()).decode("utf-8", "replace")
-    return text.splitlines()[-1].strip()[:_LINE_MAX] if text else ""
-
-
-def _with_line(message: str, ended: Ended) -> str:
-    line = _last_line(ended)
-    return f"{message}; its last line: {line}" if line else message
+def _notes(declined: dict[str, bool]) -> list[str]:
+    """Say how many of the inputs that may be refused were; all of them is worth a warning."""
+    notes = []
+    for group in dict.fromkeys(name.partition("/")[0] for name in declined):
+        those = [gone for name, gone in declined.items() if name.partition("/")[0] == group]
+        if any(those):
+            word = "warning: " if all(those) and len(those) > 1 else ""
+            notes.append(f"{word}{group}: {sum(those)} of {len(those)} declined")
+    return notes

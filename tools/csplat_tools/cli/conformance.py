@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +14,8 @@ import typer
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder
-from csplat_conformance.encoders.judge import PictureJudge
+from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder, write_inputs
+from csplat_conformance.encoders.picturing import PictureJudge
 from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
 from csplat_conformance.near import EXACT
 from csplat_conformance.report import Report, to_json, to_junit, to_table
@@ -22,13 +23,14 @@ from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.options import Group, Output, command
 from csplat_tools.files.console import Progress, note, say
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
 
 __all__ = ["conformance"]
 
-_PICTURES_LEVEL = 4
-_OURS = "-m csplat_tools encode {ply} {out} --quiet"
+_OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
+#: What a run is asked for, and a folder of inputs is not.
+_OF_A_RUN = ("program", "level", "min_psnr", "keep", "timeout", "jobs", "junit", "verbose")
 
 conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
@@ -92,6 +94,7 @@ def root() -> None:
       csplat conformance decoder
       csplat conformance decoder --cmd 'my-decoder {input} {outdir}'
       csplat conformance encoder --cmd 'my-encoder {ply} {out}'
+      csplat conformance encoder --write-inputs inputs
     """
 
 
@@ -152,39 +155,55 @@ def decoder(
 
 
 @conformance.command()
-@command()
+@command(one_of=[("folder", name) for name in _OF_A_RUN])
 def encoder(
     run: Run,
     out: Output,
     program: Annotated[
-        str | None, typer.Option("--cmd", metavar="COMMAND", help="Another encoder, with {ply} and {out}.")
+        str | None,
+        typer.Option("--cmd", metavar="COMMAND", help="Another encoder, with {ply}, {out}, and perhaps {index}."),
     ] = None,
     level: Annotated[str, typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3.")] = "4",
     min_psnr: Annotated[
         float, typer.Option(metavar="DB", help="That pictures must keep at L4; choose it by your preset.")
     ] = PSNR_MIN,
     keep: Annotated[
-        str | None, typer.Option(metavar="FOLDER", help="Write the inputs and what was made of them there.")
+        str | None, typer.Option(metavar="FOLDER", help="Keep the inputs and what was made of them there.")
+    ] = None,
+    folder: Annotated[
+        str | None,
+        typer.Option(
+            "--write-inputs", metavar="FOLDER", help="Write the inputs and a list of them there; run nothing."
+        ),
     ] = None,
 ) -> None:
     """Run an encoder over reference PLYs: csplat's own, or the one that --cmd starts.
 
-    L1: it ends as it should and the file breaks no clause. L2: every splat
-    of the source is there once, or counted as left out. L3: the stated errors
-    hold. L4: pictures keep --min-psnr; needs the packages of the render
-    extra. An encoder exits with 0 and a file, or with 1, a line that says
-    why, and no file; ordinary inputs it must take.
+    L1: it ends as it should, the file breaks no clause, and a second run gives
+    the same bytes. L2: every splat of the source is there once, or counted as
+    left out. L3: the stated errors hold. L4: pictures keep --min-psnr; needs
+    the packages of the render extra; judged, too, where L3 proves nothing.
+    An encoder exits with 0 and a file, or with 1, a line that says why, and
+    no file; ordinary inputs it must take. The line is the last one on standard
+    error or, where nothing is there, on standard output. It starts in an empty
+    folder; words of the command that name files here still do.
+    {index}: a .npy of integers, which splat of the source each splat is.
 
     Examples:
       csplat conformance encoder --cmd 'my-encoder {ply} {out}'
-      csplat conformance encoder --cmd 'my-encoder --small {ply} {out}' --min-psnr 28 --junit report.xml
-      csplat conformance encoder --cmd 'my-encoder {ply} {out}' --filter 'nasty/*' --level 1 --keep tried
+      csplat conformance encoder --cmd 'enc -s {ply} {out}' --min-psnr 28
+      csplat conformance encoder --cmd 'enc {ply} {out} {index}' --keep tried
+      csplat conformance encoder --write-inputs inputs
     """
     run.check(out)
+    if folder is not None:
+        made = write_inputs(_checked_folder(folder, force=out.force), run.pattern)
+        out.publish(made, f"{len(made['inputs'])} inputs in {folder}")
+        return
     levels = tuple(f"L{number}" for number in parse_levels(level))
-    folder = _checked_folder(keep, force=out.force)
-    pictures, reason = _picture_judge(quiet=out.quiet) if f"L{_PICTURES_LEVEL}" in levels else (None, "")
-    choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, folder)
+    kept = _checked_folder(keep, force=out.force) if keep is not None else None
+    pictures, reason = _picture_judge(levels, quiet=out.quiet)
+    choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
         report = run_encoder(program or ours, choice, pictures=pictures, no_pictures=reason, progress=_moved(bar))
@@ -199,9 +218,7 @@ def _moved(bar: Progress | None) -> Callable[[int, int], None] | None:
     return (lambda done, count: bar("conformance", done / count)) if bar else None
 
 
-def _checked_folder(name: str | None, *, force: bool) -> Path | None:
-    if name is None:
-        return None
+def _checked_folder(name: str, *, force: bool) -> Path:
     folder = Path(name)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{name} is a file, wanted a folder")
@@ -210,16 +227,28 @@ def _checked_folder(name: str | None, *, force: bool) -> Path | None:
     return folder
 
 
-def _picture_judge(*, quiet: bool) -> tuple[PictureJudge | None, str]:
-    """Return what judges pictures, or why nothing does."""
+def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[PictureJudge | None, str]:
+    """Return what judges pictures, or why nothing does.
+
+    Args:
+        levels: those wanted. At L4 every file is rendered, at L3 alone hardly one: the renderer then waits for it.
+        quiet: say nothing of what it takes.
+    """
+    if not {"L3", "L4"} & {*levels}:
+        return None, ""
     try:
-        prepare_renderer(quiet=quiet)
+        need_renderer()
     except InputError as error:
         return None, str(error)
-    from csplat_render.judge import Judge
-    from csplat_tools.views import comparison_cameras
+    ready = cache(lambda: prepare_renderer(quiet=quiet))
+    if "L4" in levels:
+        ready()
 
     def psnr(source: SplatModel, decoded: SplatModel) -> float:
+        ready()
+        from csplat_render.judge import Judge
+        from csplat_tools.views import comparison_cameras
+
         return Judge.of_source(source, comparison_cameras(source)).psnr(decoded)
 
     return psnr, ""

@@ -77,6 +77,7 @@ _Set = Annotated[
 _MORE = re.compile(r"\n *---\n")  # in a docstring: what follows is for --help-all
 _HELP_ALL = "help_all"
 _ALIAS = "output_option"  # `-o`, beside the argument
+_EXCLUDED_MAX = 6  # options that one excludes and that say so themselves
 T = TypeVar("T")
 
 
@@ -310,17 +311,21 @@ def _saying_what_excludes_it(
 ) -> inspect.Parameter:
     """The same option; its help says which other one it excludes. Of three and more the name of the panel says it.
 
+    Where one excludes many, its own help says it, and not that of each of them.
+
     Args:
         one: the option.
         shown: how those options are spelt that `--help` shows.
         exclusive: as `one_of` of `Group`.
     """
-    pairs = [names for names in exclusive if one.name in names and len(names) == 2]
-    others = [shown[name] for names in pairs for name in names if name != one.name and name in shown]
+    pairs = [names for names in exclusive if len(names) == 2]
+    many = {name for name in shown if sum(name in names for names in pairs) > _EXCLUDED_MAX}
+    own = [names for names in pairs if one.name in names]
+    others = [shown[name] for names in own for name in names if name != one.name and name in shown and name not in many]
     if not others:
         return one
     kind, info = one.annotation.__origin__, copy(one.annotation.__metadata__[0])
-    info.help = f"{info.help} Not with {' or '.join(others)}."
+    info.help = f"{info.help} Not with {' or '.join([*filter(None, [', '.join(others[:-1])]), others[-1]])}."
     return one.replace(annotation=Annotated[kind, info])
 
 

@@ -1,0 +1,109 @@
+"""One run of an encoder over one input: where its files lie, and what it leaves behind."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from csplat_conformance.encoders.inputs import Input
+from csplat_conformance.process import Ended, run_program
+
+__all__ = ["AGAIN_SECONDS", "OPTIONAL_PLACES", "PLACES", "Runner", "Trial", "try_once"]
+
+#: Runs a command line with some places put in, within some seconds, without a process of its own.
+Runner = Callable[[str, Mapping[str, str], float], Ended]
+
+#: What a command line names, and what it may name.
+PLACES, OPTIONAL_PLACES = ("ply", "out"), ("index",)
+#: From the start of a run to that of its repetition: a time stamp in seconds is another one by then.
+AGAIN_SECONDS = 1.1
+
+_NAMES = {"ply": "in.ply", "out": "out.csplat", "index": "out.npy"}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run.
+
+    Attributes:
+        ended: how it ended.
+        out: where the file was to be written.
+        index: where the source index was; `None` where the command line has no place for it.
+        traces: what the run did beside writing its output, a line each.
+        started: when, in seconds of `time.monotonic`.
+    """
+
+    ended: Ended
+    out: Path
+    index: Path | None
+    traces: tuple[str, ...]
+    started: float
+
+    @property
+    def wrote(self) -> bool:
+        """Whether there is a file, and the exit status says that it is one."""
+        return self.ended.status is None and self.ended.returncode == 0 and self.out.is_file()
+
+
+def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner | None) -> Trial:
+    """Run an encoder once.
+
+    Args:
+        command: its command line.
+        one: the input.
+        folder: where input and output lie; what is in the way there is replaced.
+        seconds: it may take.
+        run: runs it in this process; without it a process is started, in an empty working directory of its own.
+
+    Raises:
+        InputError: there is no such program.
+    """
+    ply = one.make()
+    folder.mkdir(parents=True, exist_ok=True)
+    places = {
+        name: folder / _NAMES[name] for name in (*PLACES, *OPTIONAL_PLACES) if name in PLACES or _has(command, name)
+    }
+    for name in _NAMES.values():
+        _remove(folder / name)
+    before = {path.name for path in folder.iterdir()}
+    places["ply"].write_bytes(ply)
+    named = {name: str(path) for name, path in places.items()}
+    traces: list[str] = []
+    started = time.monotonic()
+    if run is not None:
+        ended = run(command, named, seconds)
+    else:
+        with tempfile.TemporaryDirectory(prefix="csplat-cwd-") as cwd:
+            ended = run_program(command, named, seconds, cwd=Path(cwd))
+            traces += [f"left {name} in its working directory" for name in _names(Path(cwd))]
+    outputs = {_NAMES["out"], _NAMES["index"]} if ended.returncode == 0 else {_NAMES["out"]}  # that is told apart
+    left = [name for name in _names(folder) if name not in before | outputs | {_NAMES["ply"]}]
+    traces = [*_harm(places["ply"], ply), *(f"left {name} beside the output" for name in left), *traces]
+    return Trial(ended, places["out"], places.get("index"), tuple(traces), started)
+
+
+def _has(command: str, name: str) -> bool:
+    return f"{{{name}}}" in command
+
+
+def _remove(path: Path) -> None:
+    """Remove what an earlier run left that was kept."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+
+def _harm(path: Path, content: bytes) -> list[str]:
+    """Say what became of the input."""
+    try:
+        return [] if path.read_bytes() == content else ["the input was modified"]
+    except OSError:
+        return ["the input is gone"]

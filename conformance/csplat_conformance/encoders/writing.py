@@ -1,0 +1,78 @@
+"""The inputs as files, for whoever wants them without a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from csplat_conformance.encoders.inputs import Input
+from csplat_conformance.encoders.picturing import psnr_wanted
+from csplat_conformance.encoders.run import PSNR_MIN, chosen_inputs
+
+__all__ = ["LIST", "write_inputs"]
+
+LIST = "inputs.json"
+
+
+def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:
+    """Write the PLY of every input, `ordinary/degree_3.ply`, and a list of them, `inputs.json`.
+
+    Args:
+        folder: where; what is in the way is replaced.
+        pattern: shell patterns of the inputs' names; `None` for all.
+
+    Returns:
+        What the list says: `inputs`, of each `name`, `file`, `why`, `refusal` (`must`, `may` or `no`) and `expected`,
+        `null` where it must be refused: `splats` of the source (SRC-1), `rows` of the PLY, `sh_degree`,
+        `extra_columns`, `apart` (no two different centres are nearer), `renders` (whether pictures are compared) and
+        `psnr_min` (dB, unless another is asked for; `null` where they are not).
+
+    Raises:
+        InputError: the pattern matches no input.
+    """
+    entries = []
+    for one in chosen_inputs(pattern):
+        file = folder / f"{one.name}.ply"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        data = one.make()
+        file.write_bytes(data)
+        entries.append(_entry(one, data))
+    result = {"inputs": entries}
+    (folder / LIST).write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+    return result
+
+
+def _entry(one: Input, data: bytes) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "file": f"{one.name}.ply",
+        "why": one.why,
+        "refusal": "must" if one.must_refuse else "may" if one.may_refuse else "no",
+        "expected": _expected(one, data),
+    }
+
+
+def _expected(one: Input, data: bytes) -> dict[str, Any] | None:
+    if one.source is None:
+        return None
+    source = one.source()
+    return {
+        "splats": len(source),
+        "rows": _rows(data),
+        "sh_degree": source.sh_degree,
+        "extra_columns": sorted(source.extra),
+        "apart": one.apart,
+        "renders": one.renders,
+        "psnr_min": psnr_wanted(one, PSNR_MIN) if one.renders else None,
+    }
+
+
+def _rows(data: bytes) -> int:
+    """Return what the header says: `element vertex 64`."""
+    # A comment may say anything, `end_header` and `element vertex 9` too.
+    for line in data.split(b"\n"):
+        words = line.split()
+        if words[:2] == [b"element", b"vertex"]:
+            return int(words[2])
+    raise ValueError("the input has no element vertex")
