@@ -156,7 +156,7 @@ def judge_pictures(one: Input, source: Source, scene: Scene, pictures: PictureJu
         return Verdict(Status.SKIPPED, "pictures of this scene say nothing")
     psnr = pictures(source.model(scene.model.origin), scene.model)
     details = {"psnr": psnr}
-    wanted = psnr_min - one.psnr_room
+    wanted = one.psnr_wanted(psnr_min)
     if psnr < wanted:
         return Verdict(Status.FAILED, f"{psnr:.2f} dB, wanted {wanted:g} at least", details=details)
     return Verdict(Status.PASSED, f"{psnr:.2f} dB", details=details)

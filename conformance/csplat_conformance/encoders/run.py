@@ -12,7 +12,7 @@ from pathlib import Path
 
 from csplat.errors import InputError
 from csplat_conformance.choosing import matching
-from csplat_conformance.encoders.inputs import Input, all_inputs
+from csplat_conformance.encoders.inputs import PSNR_MIN, Input, all_inputs
 from csplat_conformance.encoders.judge import (
     PictureJudge,
     Verdict,
@@ -28,7 +28,6 @@ __all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "run_encode
 
 LEVELS = ("L1", "L2", "L3", "L4")
 TIMEOUT_SECONDS = 60.0
-PSNR_MIN = 30.0  #: dB
 
 #: Runs a command line with some places put in, within some seconds.
 Runner = Callable[[str, Mapping[str, str], float], Ended]
@@ -47,7 +46,7 @@ class EncoderChoice:
         pattern: shell patterns of the inputs' names, `ordinary/*,nasty/empty`; `None` for all.
         levels: those wanted; each needs the ones before it, which are run and not reported.
         timeout_seconds: for one input.
-        psnr_min: dB, of L4.
+        psnr_min: dB, of L4; inputs that want more or less than the usual do so by as much here.
         jobs: processes at a time; one per core if left out.
         keep: folder for the inputs and what was made of them; `None` keeps nothing.
     """

@@ -8,14 +8,15 @@ source alone.
 from __future__ import annotations
 
 from csplat_conformance.encoders.inputs.broken import broken
-from csplat_conformance.encoders.inputs.making import Input
+from csplat_conformance.encoders.inputs.making import PSNR_MIN, Input
 from csplat_conformance.encoders.inputs.nasty import nasty
 from csplat_conformance.encoders.inputs.nasty_values import nasty_values
 from csplat_conformance.encoders.inputs.ordinary import ordinary
+from csplat_conformance.encoders.inputs.pictures import pictures
 
-__all__ = ["Input", "all_inputs"]
+__all__ = ["PSNR_MIN", "Input", "all_inputs"]
 
 
 def all_inputs() -> list[Input]:
     """Return every input, in the order of a run."""
-    return [*ordinary(), *nasty_values(), *nasty(), *broken()]
+    return [*ordinary(), *pictures(), *nasty_values(), *nasty(), *broken()]

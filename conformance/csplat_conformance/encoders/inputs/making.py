@@ -11,8 +11,9 @@ import numpy as np
 from csplat_conformance.encoders.plyfile import Layout, Splats, meaning, write
 from csplat_conformance.stated import Source
 
-__all__ = ["APART", "PITCH", "Input", "cloud", "made"]
+__all__ = ["APART", "PITCH", "PSNR_MIN", "Input", "cloud", "made"]
 
+PSNR_MIN = 30.0  #: dB that pictures keep, unless an input says otherwise
 PITCH = 0.1  #: scene units between neighbours
 _JITTER = 0.2  # of the pitch, to either side
 APART = PITCH * (1.0 - 2.0 * _JITTER)  #: what neighbours of a cloud keep between them
@@ -30,7 +31,8 @@ class Input:
         apart: no two different splats are nearer to each other than this.
         may_refuse: status 1 and a line are as good as a file.
         renders: whether pictures of it say something.
-        psnr_room: dB by which the pictures may fall below what is wanted of the others.
+        psnr_min: dB that pictures of it keep, unless another quality than the usual one is asked for. Those of csplat's
+            coarsest preset keep 1 dB more at least; what harms pictures takes them below.
     """
 
     name: str
@@ -40,12 +42,16 @@ class Input:
     apart: float = APART
     may_refuse: bool = False
     renders: bool = True
-    psnr_room: float = 0.0
+    psnr_min: float = PSNR_MIN
 
     @property
     def must_refuse(self) -> bool:
         """Whether there is nothing to encode."""
         return self.source is None
+
+    def psnr_wanted(self, psnr_min: float) -> float:
+        """What pictures of it must keep, dB, where `psnr_min` is asked instead of `PSNR_MIN`: all inputs move alike."""
+        return self.psnr_min + psnr_min - PSNR_MIN
 
 
 def made(
@@ -56,13 +62,13 @@ def made(
     *,
     apart: float = APART,
     renders: bool = True,
-    psnr_room: float = 0.0,
+    psnr_min: float = PSNR_MIN,
 ) -> Input:
     """Return an input of rows; those called `nasty/…` may be refused."""
     kept = cache(splats)
     may_refuse = name.startswith("nasty/")
     return Input(
-        name, why, lambda: write(kept(), layout), lambda: meaning(kept()), apart, may_refuse, renders, psnr_room
+        name, why, lambda: write(kept(), layout), lambda: meaning(kept()), apart, may_refuse, renders, psnr_min
     )
 
 

@@ -36,7 +36,7 @@ def ordinary() -> list[Input]:
         made("ordinary/quaternions", "lengths from 0.001 to 1000, w below 0 and at −0", _long_quats),
         made("ordinary/transparent_and_opaque", "logits from −200 to 200: alpha 0, denormal, 1", _clear),
         # A small turn moves the tip of a needle out of its pixels.
-        made("ordinary/needles_and_discs", "one axis a thousand times the others", _needles, psnr_room=4.0),
+        made("ordinary/needles_and_discs", "one axis a thousand times the others", _needles, psnr_min=28.0),
         made("ordinary/plane", "all centres in one plane", _plane),
         made(
             "ordinary/elongated",
