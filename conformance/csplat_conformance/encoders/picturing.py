@@ -12,20 +12,10 @@ from csplat_conformance.encoders.verdict import Verdict
 from csplat_conformance.report import Status
 from csplat_conformance.stated import Source
 
-__all__ = ["PictureJudge", "judge_pictures", "psnr_wanted"]
+__all__ = ["PictureJudge", "judge_pictures"]
 
 #: PSNR in dB of a decoded scene against its source; the source comes first.
 PictureJudge = Callable[[SplatModel, SplatModel], float]
-
-
-def psnr_wanted(one: Input, psnr_min: float) -> float:
-    """Return the PSNR in dB that pictures of an input must keep.
-
-    Args:
-        one: the input.
-        psnr_min: what is asked of all.
-    """
-    return psnr_min - one.psnr_room
 
 
 def judge_pictures(
@@ -39,10 +29,10 @@ def judge_pictures(
         scene: what the file holds.
         size_bytes: of the file.
         pictures: compares.
-        psnr_min: dB, asked of all inputs.
+        psnr_min: dB, that is asked; an input may want more or less by so much.
     """
     psnr = pictures(source.model(scene.model.origin), scene.model)
-    figures, wanted = figures_of(one.name), psnr_wanted(one, psnr_min)
+    figures, wanted = figures_of(one.name), one.psnr_wanted(psnr_min)
     details = {"psnr": psnr, "wanted": wanted, "bytes": size_bytes, "beside": figures}
     size = f"in {size_bytes:,} bytes{beside(figures)}"
     if not psnr >= wanted:

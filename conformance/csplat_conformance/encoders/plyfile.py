@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from csplat_conformance.stated import Source
 
-__all__ = ["Splats", "meaning", "write"]
-
-F32 = NDArray[np.float32]
+__all__ = ["Layout", "Splats", "is_splat", "meaning", "write"]
 
 _ENDIAN = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4": "int", "u4": "uint"}
@@ -26,24 +24,26 @@ _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4"
 
 @dataclass
 class Splats:
-    """Rows of a PLY, as they stand in it.
+    """Rows of a PLY, as they stand in it: float32, or float64 where a PLY of doubles holds more than that.
 
     Attributes:
-        means: [N, 3], float32 or float64.
+        means: [N, 3].
         quats: [N, 4], w x y z, of any length.
         scales: [N, 3], natural logarithms.
         logits: [N], of the opacity.
         sh0: [N, 3].
         shN: [N, K, 3].
+        normals: [N, 3], which splats do not use.
         extra: further columns by name.
     """
 
     means: NDArray[Any]
-    quats: F32
-    scales: F32
-    logits: F32
-    sh0: F32
-    shN: F32
+    quats: NDArray[Any]
+    scales: NDArray[Any]
+    logits: NDArray[Any]
+    sh0: NDArray[Any]
+    shN: NDArray[Any]
+    normals: NDArray[Any] | None = None
     extra: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def select(self, rows: NDArray[Any]) -> Splats:
@@ -55,13 +55,14 @@ class Splats:
             self.logits[rows],
             self.sh0[rows],
             self.shN[rows],
+            None if self.normals is None else self.normals[rows],
             {name: column[rows] for name, column in self.extra.items()},
         )
 
 
 def is_splat(splats: Splats) -> NDArray[np.bool_]:
     """Tell which rows are splats of the source (SRC-1): all numbers finite in binary32, logits may be infinite."""
-    good = ~np.isnan(splats.logits)
+    good: NDArray[np.bool_] = ~np.isnan(splats.logits)
     with np.errstate(over="ignore"):
         for array in (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN):
             good &= np.isfinite(array.astype(np.float32)).all(axis=tuple(range(1, array.ndim)))
@@ -79,55 +80,87 @@ def meaning(splats: Splats) -> Source:
     return Source(
         means=splats.means,
         quats=quats.astype(np.float32),
-        scales=splats.scales,
+        scales=splats.scales.astype(np.float32),
         opacities=alpha.astype(np.float32),
-        sh0=splats.sh0,
-        shN=splats.shN,
+        sh0=splats.sh0.astype(np.float32),
+        shN=splats.shN.astype(np.float32),
         extra=splats.extra,
     )
 
 
-def write(
-    splats: Splats,
-    *,
-    format: str = "binary_little_endian",
-    normals: bool = True,
-    dtype: str = "f4",
-    comments: Sequence[str] = (),
-    reverse: bool = False,
-) -> bytes:
-    """Write the bytes of a PLY.
+@dataclass(frozen=True)
+class Layout:
+    """How rows are laid out in a PLY.
 
-    Args:
-        splats: the rows.
+    Attributes:
         format: of the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
-        normals: whether there are columns nx, ny, nz, all zero, as most trainers write.
+        normals: whether there are columns nx, ny, nz, zero unless the rows say otherwise, as most trainers write.
         dtype: `f4` or `f8`, of all columns but the extra ones.
-        comments: lines of the header.
+        means_dtype: of x, y, z, where it is another one.
+        comments: lines of the header, of any characters; bytes that are no UTF-8 by surrogates.
+        obj_info: lines of that word.
         reverse: columns in the opposite order: only their names count.
+        renamed: columns that get another name, or none and are left out.
+        count: of rows, as the header has it, where it is another one.
+        line_end: of the header's lines.
+        lists: [N] lists of small numbers, a property of that kind before all others; not in `ascii`.
+        before: lines of the header and bytes of elements that come before the splats.
+        after: the same of elements that follow them; or no lines, and bytes that nothing speaks of.
     """
-    columns = _columns(splats, dtype, normals=normals)
-    if reverse:
-        columns = dict(reversed(columns.items()))
-    lines = ["ply", f"format {format} 1.0", *(f"comment {line}" for line in comments)]
-    lines.append(f"element vertex {len(splats.means)}")
-    lines += [f"property {_TYPE_NAMES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
-    head = "\n".join([*lines, "end_header\n"]).encode("ascii")
-    if format == "ascii":
+
+    format: str = "binary_little_endian"
+    normals: bool = True
+    dtype: str = "f4"
+    means_dtype: str | None = None
+    comments: Sequence[str] = ()
+    obj_info: Sequence[str] = ()
+    reverse: bool = False
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    count: int | None = None
+    line_end: str = "\n"
+    lists: Sequence[bytes] = ()
+    before: tuple[Sequence[str], bytes] = ((), b"")
+    after: tuple[Sequence[str], bytes] = ((), b"")
+
+
+def write(splats: Splats, layout: Layout | None = None) -> bytes:
+    """Write the bytes of a PLY."""
+    layout = layout or Layout()
+    columns = _columns(splats, layout)
+    head = _head(columns, len(splats.means), layout)
+    if layout.format == "ascii":
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        return head + "".join(" ".join(map(_number, row)) + "\n" for row in rows).encode("ascii")
-    kinds = [(name, _ENDIAN[format] + column.dtype.str[1:]) for name, column in columns.items()]
-    table = np.empty(len(splats.means), kinds)
-    for name, column in columns.items():
-        table[name] = column
-    return head + table.tobytes()
+        body = "".join(" ".join(map(_number, row)) + "\n" for row in rows).encode("ascii")
+    else:
+        kinds = [(name, _ENDIAN[layout.format] + column.dtype.str[1:]) for name, column in columns.items()]
+        table = np.empty(len(splats.means), kinds)
+        for name, column in columns.items():
+            table[name] = column
+        body = table.tobytes()
+        if layout.lists:
+            size = table.dtype.itemsize
+            rows = zip(layout.lists, range(0, len(body), size), strict=True)
+            body = b"".join(bytes((len(one),)) + one + body[at : at + size] for one, at in rows)
+    return head + layout.before[1] + body + layout.after[1]
 
 
-def _columns(splats: Splats, dtype: str, *, normals: bool) -> dict[str, NDArray[Any]]:
+def _head(columns: Mapping[str, NDArray[Any]], count: int, layout: Layout) -> bytes:
+    lines = ["ply", f"format {layout.format} 1.0", *(f"comment {line}" for line in layout.comments)]
+    lines += [f"obj_info {line}" for line in layout.obj_info]
+    lines += [*layout.before[0], f"element vertex {count if layout.count is None else layout.count}"]
+    lines += ["property list uchar uchar neighbours"] if layout.lists else []
+    lines += [f"property {_TYPE_NAMES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+    lines += [*layout.after[0], "end_header", ""]
+    return layout.line_end.join(lines).encode("utf-8", "surrogateescape")
+
+
+def _columns(splats: Splats, layout: Layout) -> dict[str, NDArray[Any]]:
     count = len(splats.means)
-    named: dict[str, NDArray[Any]] = dict(zip("xyz", splats.means.T, strict=True))
-    if normals:
-        named |= {name: np.zeros(count, np.float32) for name in ("nx", "ny", "nz")}
+    means = splats.means.astype(f"<{layout.means_dtype or layout.dtype}")
+    named: dict[str, NDArray[Any]] = {}
+    if layout.normals:
+        normals = np.zeros((count, 3), np.float32) if splats.normals is None else splats.normals
+        named |= {f"n{axis}": column for axis, column in zip("xyz", normals.T, strict=True)}
     named |= {f"f_dc_{i}": column for i, column in enumerate(splats.sh0.T)}
     # Channel by channel: all red coefficients, then all green ones.
     rest = splats.shN.transpose(0, 2, 1).reshape(count, 3 * splats.shN.shape[1])
@@ -135,11 +168,13 @@ def _columns(splats: Splats, dtype: str, *, normals: bool) -> dict[str, NDArray[
     named["opacity"] = splats.logits
     named |= {f"scale_{i}": column for i, column in enumerate(splats.scales.T)}
     named |= {f"rot_{i}": column for i, column in enumerate(splats.quats.T)}
-    return _as_type(named, dtype) | {name: np.asarray(column) for name, column in splats.extra.items()}
-
-
-def _as_type(columns: Mapping[str, NDArray[Any]], dtype: str) -> dict[str, NDArray[Any]]:
-    return {name: column.astype(f"<{dtype}") for name, column in columns.items()}
+    columns = dict(zip("xyz", means.T, strict=True))
+    columns |= {name: column.astype(f"<{layout.dtype}") for name, column in named.items()}
+    columns |= {name: np.asarray(column) for name, column in splats.extra.items()}
+    if layout.reverse:
+        columns = dict(reversed(columns.items()))
+    names = {name: layout.renamed.get(name, name) for name in columns}
+    return {names[name]: column for name, column in columns.items() if names[name]}
 
 
 def _number(value: float) -> str:

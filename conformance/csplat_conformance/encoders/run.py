@@ -14,7 +14,7 @@ from pathlib import Path
 
 from csplat.errors import InputError
 from csplat_conformance.choosing import matching
-from csplat_conformance.encoders.inputs import Input, all_inputs
+from csplat_conformance.encoders.inputs import PSNR_MIN, Input, all_inputs
 from csplat_conformance.encoders.levels import LEVELS, Asked, judge_input
 from csplat_conformance.encoders.picturing import PictureJudge
 from csplat_conformance.encoders.trial import AGAIN_SECONDS, OPTIONAL_PLACES, PLACES, Runner, Trial, try_once
@@ -24,7 +24,6 @@ from csplat_conformance.report import Outcome, Report, Status
 __all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "chosen_inputs", "run_encoder"]
 
 TIMEOUT_SECONDS = 60.0
-PSNR_MIN = 30.0  #: dB
 
 _NO_PICTURES = "nothing renders here"
 _AGAIN = ".again"
@@ -39,7 +38,7 @@ class EncoderChoice:
         levels: those wanted; each needs the ones before it, which are run and not reported. Where L3 proves nothing
             L4 is judged, too.
         timeout_seconds: for one input.
-        psnr_min: dB, of L4.
+        psnr_min: dB, of L4; inputs that want more or less than the usual do so by as much here.
         jobs: processes at a time; one per core if left out.
         keep: folder for the inputs and what was made of them, a folder for each; `None` keeps nothing.
     """

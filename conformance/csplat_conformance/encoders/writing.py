@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from csplat_conformance.encoders.inputs import Input
-from csplat_conformance.encoders.picturing import psnr_wanted
-from csplat_conformance.encoders.run import PSNR_MIN, chosen_inputs
+from csplat_conformance.encoders.inputs import PSNR_MIN, Input
+from csplat_conformance.encoders.run import chosen_inputs
 
 __all__ = ["LIST", "write_inputs"]
 
@@ -64,7 +63,7 @@ def _expected(one: Input, data: bytes) -> dict[str, Any] | None:
         "extra_columns": sorted(source.extra),
         "apart": one.apart,
         "renders": one.renders,
-        "psnr_min": psnr_wanted(one, PSNR_MIN) if one.renders else None,
+        "psnr_min": one.psnr_wanted(PSNR_MIN) if one.renders else None,
     }
 
 

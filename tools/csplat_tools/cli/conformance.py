@@ -165,7 +165,11 @@ def encoder(
     ] = None,
     level: Annotated[str, typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3.")] = "4",
     min_psnr: Annotated[
-        float, typer.Option(metavar="DB", help="That pictures must keep at L4; choose it by your preset.")
+        float,
+        typer.Option(
+            metavar="DB",
+            help="That pictures must keep at L4, some 2 more or less; choose it by your preset.",
+        ),
     ] = PSNR_MIN,
     keep: Annotated[
         str | None, typer.Option(metavar="FOLDER", help="Keep the inputs and what was made of them there.")
