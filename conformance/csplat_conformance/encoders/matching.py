@@ -76,16 +76,19 @@ def _nearest(centres: F64, decoded: F64, apart: float) -> I64:
     keys = keys[order]
     own = _cells(decoded, apart)
     found = np.full(len(decoded), _NONE, np.int64)
-    for step in product((-1, 0, 1), repeat=3):
-        wanted = _keys(own + np.array(step, np.int64))
+    left = np.arange(len(decoded))
+    # Its own cell first: most need no other one.
+    for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
+        wanted = _keys(own[left] + np.array(step, np.int64))
         first, last = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
         # One cell holds few centres, since its side is their distance.
         for nth in range(int((last - first).max(initial=0))):
-            rows = np.flatnonzero(first + nth < last)
-            candidates = order[first[rows] + nth]
+            more = first + nth < last
+            rows, candidates = left[more], order[first[more] + nth]
             moved = decoded[rows] - centres[candidates]
             good = np.sqrt(np.square(moved).sum(axis=1)) < apart / 2.0
             found[rows[good]] = candidates[good]
+        left = left[found[left] == _NONE]
     return found
 
 
