@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 import xml.etree.ElementTree as ET
+from importlib.resources import files
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from csplat import lint
 from csplat.encoder import PRESETS
 from csplat.errors import InputError
 from csplat.ply import lint_ply
+from csplat_conformance import encoders
 from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
 from csplat_conformance.encoders.judge import judge_stream
 from csplat_conformance.encoders.matching import pair
@@ -252,6 +254,24 @@ def test_another_quality_moves_what_is_wanted_of_all_pictures():
         INPUTS[f"ordinary/{name}"].psnr_wanted(30.0) for name in ("degree_3", "needles_and_discs", "surfaces")
     )
     assert (25.0, 27.0) == tuple(INPUTS[f"ordinary/{name}"].psnr_wanted(25.0) for name in ("degree_3", "glossy"))
+
+
+def test_figures_beside_ones_own_are_those_of_the_inputs():
+    # Written by `python -m csplat_bench.codec.inputs --write`
+    figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
+
+    assert set(ENCODABLE) - {DEGREE_4} == set(figures)
+    for name, by in figures.items():
+        assert {"csplat"} <= set(by) <= {"csplat", "spz"}, name
+        assert all((numbers["psnr"] is not None) == ENCODABLE[name].renders for numbers in by.values()), name
+
+
+@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/glossy", "nasty/far_doubles"])
+def test_figures_of_ours_are_of_this_encoder(tmp_path, name):
+    figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
+    size = len(csplat.encode(csplat.read_ply(written(tmp_path, name))))
+
+    assert size == pytest.approx(figures[name]["csplat"]["bytes"], rel=0.01)
 
 
 # Sloppy encoders -----------------------------------------------------------------------------------
