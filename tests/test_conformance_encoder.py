@@ -1,40 +1,26 @@
-"""The encoder suite: its inputs, ours through it at every preset, and wrong encoders that it must catch."""
+"""The encoder suite: ours through it at every preset, what may be refused, and the command."""
 
-import contextlib
-import dataclasses
 import doctest
 import json
-import re
 import shlex
 import sys
 import xml.etree.ElementTree as ET
-from collections import Counter
-from functools import cache
-from importlib.resources import files
 from importlib.util import find_spec
 
 import numpy as np
-import plyfile
 import pytest
 from typer.testing import CliRunner
-from wrong_encoders import finding, serr
-from wrong_encoders.encoding import encode as encode_wrongly
-from wrong_encoders.mistake import Harm, Mistake
-from wrong_encoders.mistakes import MISTAKES, UNNOTICED
+from wrong_encoders import finding
 
 import csplat
 import csplat_conformance.report as report_module
-from csplat import lint
-from csplat.encoder import PRESETS, encode_with_report
+from csplat.encoder import PRESETS
 from csplat.errors import InputError
-from csplat.ply import lint_ply
-from csplat_conformance import encoders
 from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
 from csplat_conformance.encoders.judge import judge_stream
 from csplat_conformance.encoders.matching import pair
 from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Status
-from csplat_conformance.stated import Source
 from csplat_tools.cli.app import app
 
 INPUTS = {one.name: one for one in all_inputs()}
@@ -53,104 +39,6 @@ def invoke(*words):
 def program(code):
     """A command line that runs some Python on {ply} and {out}."""
     return f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} {{ply}} {{out}}"
-
-
-# Inputs --------------------------------------------------------------------------------------------
-
-
-def test_inputs_have_names_of_their_own_and_say_why():
-    assert len(all_inputs()) == len(INPUTS)
-    assert {"ordinary", "nasty", "broken"} == {name.split("/")[0] for name in INPUTS}
-    assert all(one.why for one in INPUTS.values())
-
-
-def test_ordinary_inputs_must_be_taken_and_broken_ones_refused():
-    for name, one in INPUTS.items():
-        assert name.startswith("broken/") == one.must_refuse
-        assert name.startswith("nasty/") == one.may_refuse
-
-
-@pytest.mark.parametrize("name", [name for name in ENCODABLE if name != DEGREE_4])
-def test_an_input_is_the_scene_that_it_says(tmp_path, name):
-    # Written by hand there, read by our reader here: the two know nothing of each other.
-    one = ENCODABLE[name]
-    (tmp_path / "in.ply").write_bytes(one.make())
-    found, wanted = Source.of(csplat.read_ply(tmp_path / "in.ply", keep_extra=True)), one.source()
-
-    for array in ("means", "scales", "opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(found, array), getattr(wanted, array), array)
-    np.testing.assert_allclose(found.quats, wanted.quats, atol=1e-7)
-    assert {key: column.tobytes() for key, column in wanted.extra.items()} == {
-        key: column.tobytes() for key, column in found.extra.items()
-    }
-
-
-def test_degree_4_is_nothing_that_our_reader_says(tmp_path):
-    one = ENCODABLE[DEGREE_4]
-    (tmp_path / "in.ply").write_bytes(one.make())
-    rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
-    source = one.source()
-
-    assert (4, (64, 24, 3)) == (source.sh_degree, source.shN.shape)
-    np.testing.assert_array_equal(rows["f_rest_49"], source.shN[:, 1, 2])  # blue comes after 48 of red and green
-    with pytest.raises(InputError, match="SH degree 4"):
-        csplat.read_ply(tmp_path / "in.ply")
-
-
-def test_far_doubles_are_what_no_origin_brings_into_single_precision(tmp_path):
-    model = csplat.read_ply(written(tmp_path, "nasty/far_doubles"))
-    means = ENCODABLE["nasty/far_doubles"].source().means
-
-    assert np.float64 == means.dtype
-    assert model.means_double is not None
-    for origin in (means[0], np.median(means, axis=0), np.round(means.mean(axis=0))):
-        near = means - origin
-        assert (near != near.astype(np.float32)).any()
-
-
-@pytest.mark.parametrize(
-    ("name", "left_out"),
-    [("nasty/not_a_number", 3), ("nasty/infinities", 4), ("nasty/infinite_scales", 4), ("nasty/beyond_float", 2)],
-)
-def test_rows_that_are_no_splats_are_not_in_the_source(name, left_out):
-    # SRC-1
-    assert 64 - left_out == len(ENCODABLE[name].source())
-    assert {64} == {len(ENCODABLE[name].source()) for name in ("nasty/nan_normals", "nasty/nan_extra")}
-
-
-def test_inputs_show_what_lint_knows(tmp_path):
-    found = set()
-    for one in INPUTS.values():
-        (tmp_path / "in.ply").write_bytes(one.make())
-        with contextlib.suppress(InputError):
-            found |= {finding.id for finding in lint_ply(tmp_path / "in.ply")}
-    known = set(re.findall(r"^\| `([a-z0-9-]+)` \|", lint.__doc__, re.MULTILINE))
-
-    # Discs (2DGS) have a third scale that no column says, and a source cannot either.
-    assert {"flat-scales"} == known - found
-
-
-@pytest.mark.parametrize("name", [name for name in ENCODABLE if name != "ordinary/two_tiles"])
-def test_different_splats_keep_their_distance(name):
-    one = ENCODABLE[name]
-    means = np.unique(one.source().means.astype(np.float64), axis=0)
-    distances = np.sqrt(sum(np.square(np.subtract.outer(column, column)) for column in means.T))
-    np.fill_diagonal(distances, np.inf)
-
-    assert distances.min(initial=np.inf) >= one.apart * (1 - 1e-5)  # the lattice of float32
-
-
-@pytest.mark.parametrize("name", ["ordinary/degree_3", "nasty/duplicates", "broken/cut"])
-def test_an_input_is_the_same_every_time(name):
-    assert INPUTS[name].make() == {one.name: one for one in all_inputs()}[name].make()
-
-
-@pytest.mark.parametrize("name", [name for name, one in INPUTS.items() if one.must_refuse])
-def test_broken_inputs_are_broken(tmp_path, name):
-    path = written(tmp_path, name)
-
-    with pytest.raises(InputError):
-        csplat.read_ply(path)
 
 
 # Pairs and errors ----------------------------------------------------------------------------------
@@ -241,130 +129,6 @@ def test_what_harms_pictures_shows_in_those_of_surfaces():
     }
 
     assert {"16 alphas", "means in float16"} == unseen
-
-
-def test_another_quality_moves_what_is_wanted_of_all_pictures():
-    assert (30.0, 28.0, 32.0) == tuple(
-        INPUTS[f"ordinary/{name}"].psnr_wanted(30.0) for name in ("degree_3", "needles_and_discs", "surfaces")
-    )
-    assert (25.0, 27.0) == tuple(INPUTS[f"ordinary/{name}"].psnr_wanted(25.0) for name in ("degree_3", "glossy"))
-
-
-def test_figures_beside_ones_own_are_those_of_the_inputs():
-    # Written by `python -m csplat_bench.codec.inputs --write`
-    figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
-
-    assert set(ENCODABLE) - {DEGREE_4} == set(figures)
-    for name, by in figures.items():
-        assert {"csplat"} <= set(by) <= {"csplat", "spz"}, name
-        assert all((numbers["psnr"] is not None) == ENCODABLE[name].renders for numbers in by.values()), name
-
-
-@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/glossy", "nasty/far_doubles"])
-def test_figures_of_ours_are_of_this_encoder(tmp_path, name):
-    figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
-    size = len(csplat.encode(csplat.read_ply(written(tmp_path, name))))
-
-    assert size == pytest.approx(figures[name]["csplat"]["bytes"], rel=0.01)
-
-
-# Wrong encoders ------------------------------------------------------------------------------------
-
-
-def marked(name):
-    """A parameter: with what keeps the suite from finding it, if something does."""
-    marks = [pytest.mark.xfail(strict=True, reason=why) for why, names in UNNOTICED.items() if name in names]
-    if MISTAKES[name].caught[0] == "L4" and not HAS_RENDERER:
-        marks = [pytest.mark.skip(reason="pictures want the extra [render]")]
-    return pytest.param(name, marks=marks)
-
-
-@pytest.fixture(scope="module")
-def report_of():
-    """What the suite says of a mistake."""
-    return cache(finding.find)
-
-
-def test_there_are_wrong_encoders_of_every_harm():
-    harms = Counter(one.harm for one in MISTAKES.values())
-
-    assert set(Harm) == set(harms)
-    assert len(MISTAKES) - harms[Harm.HARMLESS] >= 55
-    assert {name for names in UNNOTICED.values() for name in names} < set(MISTAKES)
-
-
-def test_mistakes_are_made(tmp_path):
-    # One that changes nothing would go unnoticed for no fault of the suite.
-    ply, out, index = tmp_path / "in.ply", tmp_path / "out", tmp_path / "index.npy"
-    for name, mistake in MISTAKES.items():
-        only_options = dataclasses.replace(mistake, options={}) == Mistake(
-            mistake.why, mistake.harm, mistake.caught, mistake.inputs
-        )
-        large = mistake.inputs == "ordinary/two_tiles"
-        if mistake.harm is Harm.HARMLESS or mistake.end is not None or only_options or large:
-            continue
-        for one in finding.inputs_of(mistake):
-            ours = ours_of(written(tmp_path, one), mistake.options)
-            encode_wrongly(mistake, ply, out, index)
-            if ours.data != out.read_bytes() or ours.source_index.tobytes() != np.load(index).tobytes():
-                break
-        else:
-            assert name in UNNOTICED["no input shows it"], name
-
-
-def ours_of(ply, options):
-    model = csplat.read_ply(ply, keep_extra=True)
-    return encode_with_report(model, csplat.EncodeOptions(**options))
-
-
-@pytest.mark.parametrize("name", [marked(name) for name, one in MISTAKES.items() if one.harm is not Harm.HARMLESS])
-def test_a_wrong_encoder_is_caught(report_of, name):
-    level, clause = MISTAKES[name].caught
-    sign = finding.first_sign(report_of(name))
-
-    assert sign is not None, "not caught"
-    assert level == sign.level
-    assert not clause or clause in sign.clauses
-    if level == "L4":
-        assert " dB, wanted " in sign.message
-
-
-@pytest.mark.parametrize("name", [name for name, one in MISTAKES.items() if one.harm is Harm.HARMLESS])
-def test_what_encoders_are_free_to_do_passes(report_of, name):
-    report = report_of(name)
-
-    assert report.passed
-    assert finding.first_sign(report) is None
-
-
-@pytest.mark.parametrize(
-    ("name", "status"),
-    [
-        ("half_a_file", Status.PARTIAL_OUTPUT),
-        ("leaves_half", Status.PARTIAL_OUTPUT),
-        ("writes_nothing", Status.NO_OUTPUT),
-        ("crashes", Status.CRASHED),
-        ("hangs", Status.HUNG),
-        ("status_3", Status.WRONG_STATUS),
-        ("silent_refusal", Status.WRONG_ANSWER),
-        ("max_halved", Status.FAILED),
-    ],
-)
-def test_ends_are_told_apart(report_of, name, status):
-    assert status is report_of(name).failures[0].status
-
-
-def test_our_encoder_without_a_mistake_passes_what_catches_them(tmp_path):
-    # The mistakes are what fails, not the way of making them.
-    data = csplat.encode(csplat.read_ply(written(tmp_path, "ordinary/degree_1")))
-    for change in (serr.stated(lambda record: record), serr.counts(0, 0)):
-        assert data == change(data)
-
-
-def written(folder, name):
-    path = folder / "in.ply"
-    path.write_bytes(INPUTS[name].make())
-    return path
 
 
 # Refusals ------------------------------------------------------------------------------------------

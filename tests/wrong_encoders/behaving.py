@@ -116,7 +116,7 @@ MISTAKES = {
     "status_3": Mistake("3 is a status like any other", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(3)),
     "silent_refusal": Mistake("status 1 says enough", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(1)),
     "refuses_the_unusual": Mistake(
-        "whatever is unusual may be refused", FILES, ("L1", ""), "nasty/*", end=refuses_the_unusual
+        "whatever is unusual may be refused", Harm.COARSE, ("L1", ""), "nasty/*", end=refuses_the_unusual
     ),
     "refuses_on_stdout": Mistake(
         "a refusal may be said on either stream", Harm.HARMLESS, inputs="nasty/empty", end=refuses_without_splats

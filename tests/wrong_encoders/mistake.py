@@ -16,8 +16,8 @@ import csplat
 
 PLAIN, DEGREE_2, DEGREE_3 = "ordinary/degree_1", "ordinary/degree_2", "ordinary/degree_3"
 STRONG = "ordinary/strong_colours"
-#: Shapes are seen where splats are slender, contrasts strong, or splats many.
-SHAPES = f"ordinary/needles_and_discs,{STRONG},*/*dense*"
+#: What is wrong throughout is seen where splats are many and slender.
+DENSE = "ordinary/surfaces"
 
 Scene = csplat.SplatModel
 Bytes = Callable[[bytes], bytes]
@@ -32,7 +32,7 @@ class Harm(StrEnum):
     FACTS = "facts"  #: it says of the source, or of its splats, what is not so
     DETERMINISM = "determinism"  #: the same input gives other bytes
     FILES = "files"  #: files of the user are changed or left about, or cannot be encoded
-    COARSE = "coarse"  #: legal and honest, and far worse than need be: worth a warning
+    COARSE = "coarse"  #: legal and honest, and far worse than need be, or refused though it need not: worth a warning
     HARMLESS = "harmless"  #: no mistake at all: a freedom that encoders have, and that the suite must leave them
 
 

@@ -8,7 +8,7 @@ from csplat.model import SplatModel
 from wrong_encoders.mistake import (
     DEGREE_2,
     DEGREE_3,
-    SHAPES,
+    DENSE,
     STRONG,
     Harm,
     Mistake,
@@ -145,12 +145,12 @@ MISTAKES = {
     "all_bands_dropped": Mistake(
         "colour is sh0, and errors say so", Harm.COARSE, ("L3", ""), DEGREE_2, options={"sh_degree": 0}
     ),
-    "alpha_of_eight": Mistake(
-        "eight levels of alpha will do, and errors say so", Harm.COARSE, ("L3", ""), options={"opacity_levels": 8}
+    "alpha_of_three": Mistake(
+        "three levels of alpha will do, and errors say so", Harm.COARSE, ("L3", ""), options={"opacity_levels": 2}
     ),
     "coarse": Mistake(
         "honest errors may be of any size",
-        Harm.COARSE,
+        Harm.PICTURE,
         ("L4", ""),
         options={"attribute_psnr": 16.0, "sh_coding": "none"},
     ),
@@ -165,7 +165,7 @@ MISTAKES = {
         "y and z point the other way, and only rotations notice",
         Harm.PICTURE,
         ("L4", ""),
-        SHAPES,
+        DENSE,
         scene=mirrored,
         honest=as_read,
     ),

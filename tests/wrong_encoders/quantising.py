@@ -6,7 +6,7 @@ from unittest import mock
 import numpy as np
 
 from csplat.encoder import coded, colour, geometry, quantise, tile
-from wrong_encoders.mistake import DEGREE_3, SHAPES, Harm, Mistake, replaced
+from wrong_encoders.mistake import DEGREE_3, DENSE, Harm, Mistake, replaced
 
 PICTURE = (Harm.PICTURE, ("L4", ""))
 COARSE = (Harm.COARSE, ("L3", ""))
@@ -122,16 +122,16 @@ MISTAKES = {
     "gauge_not_fixed": Mistake(
         "w need not be the largest, and what leaves ±M is clipped",
         *PICTURE,
-        SHAPES,
+        DENSE,
         stage=replaced(geometry, "fix_gauge", no_gauge),
     ),
     "w_sign_lost": Mistake(
-        "w is what is left of length 1", *PICTURE, SHAPES, stage=replaced(geometry, "fix_gauge", sign_of_w_lost)
+        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(geometry, "fix_gauge", sign_of_w_lost)
     ),
     "scales_sorted_alone": Mistake(
         "the order of scales has nothing to do with rotations",
         *PICTURE,
-        SHAPES,
+        "ordinary/needles_and_discs",
         stage=replaced(geometry, "fix_gauge", sorted_alone),
     ),
     # rounding

@@ -7,7 +7,7 @@ import numpy as np
 from csplat import ply, ply_columns
 from csplat.model import normalise_quats
 from wrong_encoders import plyrows
-from wrong_encoders.mistake import DEGREE_2, SHAPES, Harm, Mistake, changed, floats, replaced
+from wrong_encoders.mistake import DENSE, Harm, Mistake, changed, floats, replaced
 from wrong_encoders.truth import as_read
 
 QUATS = "ordinary/quaternions,*/*tiny*quat*,*/*huge*quat*,*/*quat*tiny*,*/*quat*huge*"
@@ -109,6 +109,7 @@ def counted_by_size(head, body):
 def whole_bands(data):
     """Take as many columns f_rest as make whole bands."""
     names = [name for name in plyrows.parsed(data).dtype.names if name.startswith("f_rest_")]
+    names.sort(key=lambda name: int(name.removeprefix("f_rest_")))
     for name in names[max(k for k in (0, 9, 24, 45) if k <= len(names)) :]:
         data = plyrows.without(name)(data)
     return data
@@ -151,7 +152,7 @@ MISTAKES = {
         "the same, and errors are measured from the file",
         Harm.PICTURE,
         ("L4", ""),
-        f"{DEGREE_2},*/*dense*",
+        DENSE,
         scene=changed(opacities=sigmoid),
         honest=as_read,
     ),
@@ -193,7 +194,7 @@ MISTAKES = {
         "the same, and errors are measured from the file",
         Harm.PICTURE,
         ("L4", ""),
-        SHAPES,
+        DENSE,
         scene=changed(quats=lambda m: m.quats * np.float32([1, -1, -1, -1])),
         honest=as_read,
     ),
@@ -248,7 +249,7 @@ MISTAKES = {
     "infinite_scales_kept": Mistake(
         "a scale of -inf is the smallest that float32 holds",
         Harm.FACTS,
-        ("L2", "SER-5"),
+        ("L2", "SRC-1"),
         "nasty/*inf*scale*,nasty/*scale*inf*,nasty/flat*",
         ply=plyrows.each("scale_", lambda column: np.maximum(column, -88)),
     ),

@@ -7,7 +7,7 @@ import numpy as np
 
 from csplat import _spec, ply
 from csplat.encoder import coded, measure, scene, tile
-from wrong_encoders.mistake import DEGREE_3, PLAIN, SHAPES, STRONG, Harm, Mistake, changed, replaced
+from wrong_encoders.mistake import DEGREE_3, DENSE, PLAIN, STRONG, Harm, Mistake, changed, replaced
 from wrong_encoders.reading import without_band_sign
 from wrong_encoders.serr import counts, head, refitted, stated
 from wrong_encoders.truth import in_binary64
@@ -244,7 +244,7 @@ MISTAKES = {
         "the flag is for rotations, too",
         Harm.PICTURE,
         ("L4", ""),
-        SHAPES,
+        DENSE,
         scene=changed(quats=lambda m: m.quats * np.float32([1, -1, -1, -1])),
         stage=none_of("covariance"),
         data=refitted,

@@ -22,7 +22,8 @@ def nasty_values() -> list[Input]:
             "nasty/tiny_and_huge_quaternions", "lengths of 1e−45 to 6e38, whose squares leave binary32", _extreme_quats
         ),
         made("nasty/huge_scales", "logarithms of ±60", _huge_scales, renders=False),
-        made("nasty/scales_beyond_88", "logarithms of ±88 to ±3e38, of which SER-5 speaks", _scales_88, renders=False),
+        made("nasty/scales_beyond_88", "logarithms beyond ±88, which count as ±88", _scales_88, renders=False),
+        made("nasty/scales_of_float", "logarithms of ±1e4 and ±3e38", _scales_of_float, renders=False),
         made("nasty/needles", "one axis 1e5 to 1e30 times the others", _needles, renders=False),
         made("nasty/far_coordinates", "centres about 1,000,000", _far, apart=30.0),
         made(
@@ -73,10 +74,20 @@ def _huge_scales() -> Splats:
 
 
 def _scales_88() -> Splats:
+    """Half of the splats lie beyond with all their scales: their errors are 0, whatever becomes of the scales."""
     splats = cloud(64, 0, 33)
-    ends = np.array([88.0, 88.5, 88.7229, 89.0, 104.0, 1e4, 3e38], np.float32)
-    splats.scales[:7, 0], splats.scales[7:14, 1] = ends, -ends
-    splats.scales[14:21], splats.scales[21:28] = ends[:, None], -ends[:, None]
+    ends = np.array([88.0, 88.5, 88.7229, 89.0, 104.0], np.float32)
+    splats.scales[:5, 0], splats.scales[5:10, 1] = ends, -ends
+    splats.scales[32:48] += np.float32(94.0)
+    splats.scales[48:] -= np.float32(94.0)
+    return splats
+
+
+def _scales_of_float() -> Splats:
+    splats = cloud(64, 0, 33)
+    ends = np.array([1e4, 3e38], np.float32)
+    splats.scales[:2, 0], splats.scales[2:4, 1] = ends, -ends
+    splats.scales[4:6], splats.scales[6:8] = ends[:, None], -ends[:, None]
     return splats
 
 
