@@ -23,6 +23,7 @@ __all__ = ["judge_content", "judge_stream"]
 
 _CUT_SHORT = frozenset((_spec.ERROR_TRUNCATED,))
 _SHOWN = 3
+_NORMALS = frozenset(("nx", "ny", "nz"))
 
 
 def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
@@ -131,6 +132,8 @@ def _wrong_facts(source: Source, decoded: SplatModel) -> list[Wrong]:
 def _wrong_extras(source: Source, decoded: SplatModel, pairs: Pairs) -> list[Wrong]:
     wrong = []
     for name, column in decoded.extra.items():
+        if name in _NORMALS:  # every splat PLY may have them, and nobody cares what they hold
+            continue
         other = source.extra.get(name)
         if other is None:
             wrong.append(("SRC-3", f"the extra column {name!r} is none of the source's"))
