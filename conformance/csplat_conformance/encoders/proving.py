@@ -43,9 +43,10 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
         clause = "SER-6" if proof.unproved and not stated.refitted else "SER-5"
         return Verdict(Status.FAILED, in_short(proof.failures), (clause,), details=details), why
     coarse = coarse_errors(one, source, proof)
-    names = frozenset(record.measure for record in stated.records) - coarse.keys()
     warnings = [*coarse.values()]
-    warnings += find_cuts(source, scene.model, scene.header, pairs.source_index, names) if len(scene.model) else []
+    if len(scene.model) and not stated.refitted:  # what was fitted anew moved on purpose
+        names = frozenset(record.measure for record in stated.records) - coarse.keys()
+        warnings += find_cuts(source, scene.model, scene.header, pairs.source_index, names)
     message = in_short((unproved,) * bool(unproved) + tuple(warnings))
     status = Status.NOT_PROVED if unproved else Status.WARNED if warnings else Status.PASSED
     return Verdict(status, message, details=details), why
