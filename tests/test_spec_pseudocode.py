@@ -224,10 +224,11 @@ def test_colours_there_and_back(spec):
         assert tuple(rgb) == spec.rgb_from_ycocg(*spec.ycocg_from_rgb(*rgb, 0), 0)
 
 
-@pytest.mark.parametrize("levels", [3, 127, 32767])
+@pytest.mark.parametrize("levels", [3, 4, 5, 127, 32767])
 def test_rotations_there_and_back(spec, levels):
     rng = np.random.default_rng(levels)
-    quats = rng.normal(0, 1, (300, 4))
+    quats = rng.normal(0, 1, (2000, 4))
+    quats[4:1000] = 1 + rng.normal(0, 0.02, (996, 4))  # about w = ½, where all four are equal
     quats[:4] = [[0, 0, 1, 1], [-1, 0, 0, 0], [1, -1, 1, -1], [0, 1, 0, -1]]
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     for quat in quats:
@@ -238,8 +239,22 @@ def test_rotations_there_and_back(spec, levels):
         np.testing.assert_allclose(axes, np.eye(3), atol=1e-12)
         q = spec.quat_integers(turned, levels)
         assert max(map(abs, q)) <= levels
+        assert sum(v * v for v in q) <= 2 * levels**2
         found = np.array(spec.quat(*q, levels), np.float64)
         assert np.linalg.norm(found - turned) < 2.0 / levels
+
+
+def test_axes_are_exchanged_with_their_scales(spec):
+    rng = np.random.default_rng(6)
+    for quat, scales in zip(rng.normal(0, 1, (200, 4)), rng.normal(0, 1, (200, 3)), strict=True):
+        quat /= np.linalg.norm(quat)
+        turned, ordered = spec.with_scales_sorted(quat.tolist(), scales.tolist())
+        assert sorted(scales.tolist(), reverse=True) == ordered
+        before, after = (
+            rotation_of(q) @ np.diag(np.exp(2 * np.array(s))) @ rotation_of(q).T
+            for q, s in ((quat, scales), (turned, ordered))
+        )
+        np.testing.assert_allclose(after, before, atol=1e-12)
 
 
 def rotation_of(quat):

@@ -6,7 +6,7 @@ from unittest import mock
 import numpy as np
 
 from csplat import _spec, ply
-from csplat.encoder import coded, measure, scene, tile
+from csplat.encoder import coded, draft, measure, scene, tile
 from wrong_encoders.mistake import DEGREE_3, DENSE, PLAIN, STRONG, Harm, Mistake, changed, replaced
 from wrong_encoders.reading import without_band_sign
 from wrong_encoders.serr import counts, head, refitted, stated
@@ -119,6 +119,12 @@ def none_of(*names):
     return told(lambda bounds: {name: pair for name, pair in bounds.items() if name not in names})
 
 
+@contextlib.contextmanager
+def scales_without_bound():
+    with mock.patch.object(measure, "SCALE_MOST", 340.0), mock.patch.object(draft, "SCALE_MOST", 340.0):
+        yield
+
+
 def one_number_less(measure_name, kind):
     words = {"max": "the largest error of a sample is the largest", "rms": "a sample says what the mean is"}
     return Mistake(words[kind], Harm.BOUND, L3, DEGREE_3, stage=scaled((measure_name,), kind, 0.99))
@@ -190,7 +196,7 @@ MISTAKES = {
         Harm.BOUND,
         L3,
         "nasty/*scale*",
-        stage=replaced(measure, "_SCALE_MOST", lambda _: 340.0),
+        stage=scales_without_bound,
     ),
     "covariance_not_normalised": Mistake(
         "w of the source is as good as the decoded one",

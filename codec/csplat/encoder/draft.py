@@ -36,6 +36,7 @@ from csplat.encoder.importance import (
     shape_weights,
     splat_weights,
 )
+from csplat.encoder.measure import SCALE_MOST
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress, make_plan
 from csplat.encoder.scene import extra_columns
@@ -123,6 +124,7 @@ class Draft:
         options, origin = options or EncodeOptions(), origin or Origin(len(model), np.arange(len(model)))
         if len(origin.source_index) != len(model):
             raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
+        model = _within_binary32(model)
         plan = make_plan(model, options, importance_given=importance is not None)
         extras = extra_columns(model, options)
         curvatures = known_curvatures(model, importance) if graded else None
@@ -225,3 +227,10 @@ def sample_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None)
 
 def _silent(stage: str, done: float) -> None:
     """Report to nobody."""
+
+
+def _within_binary32(model: SplatModel) -> SplatModel:
+    """Write scales beyond ±88 as ±88, as they count (CNF-6): no other splat's lattice has to be coarser for them."""
+    if not len(model) or float(np.abs(model.scales).max()) <= SCALE_MOST:
+        return model
+    return replace(model, scales=np.clip(model.scales, -SCALE_MOST, SCALE_MOST))

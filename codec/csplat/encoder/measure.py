@@ -17,6 +17,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 
 __all__ = [
+    "SCALE_MOST",
     "ErrorSums",
     "covariance_entries",
     "covariance_errors",
@@ -30,7 +31,7 @@ __all__ = [
 Floats = NDArray[Any]
 F64 = NDArray[np.float64]
 
-_SCALE_MOST = 88.0  # logarithm of a standard deviation beyond which binary32 does not hold it
+SCALE_MOST = 88.0  # logarithm of a standard deviation beyond which binary32 does not hold it
 _BLOCK = 8192  # splats at a time: the temporaries of a covariance stay in the second-level cache
 _ROUNDING = 2.0**-40  # relative
 
@@ -122,11 +123,11 @@ def covariance_errors(
     largest = squares = 0.0
     for at in range(0, source_quats.shape[1], _BLOCK):
         part = slice(at, at + _BLOCK)
-        reference = np.clip(source_scales[:, part], -_SCALE_MOST, _SCALE_MOST).astype(np.float64)
+        reference = np.clip(source_scales[:, part], -SCALE_MOST, SCALE_MOST).astype(np.float64)
         top = reference.max(axis=0)
         reference -= top
         variances = np.exp(2.0 * reference)
-        decoded = np.exp(2.0 * (np.clip(scales[:, part], -_SCALE_MOST, _SCALE_MOST) - top))
+        decoded = np.exp(2.0 * (np.clip(scales[:, part], -SCALE_MOST, SCALE_MOST) - top))
         difference = covariance_entries(quats[:, part], decoded)
         difference -= covariance_entries(source_quats[:, part], variances)
         with np.errstate(over="ignore"):  # infinity is what `stated` refuses

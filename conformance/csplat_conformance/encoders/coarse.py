@@ -1,11 +1,11 @@
 """What is legal, honest, and so coarse that hardly anyone means it: the suite warns of it, and passes it.
 
-The bounds are for ordinary inputs, whose centres keep a distance (`Input.apart`), and whose colours are about 1:
+Centres of the inputs keep a distance (`Input.apart`):
 
 | what | warned beyond | csplat's coarsest preset reaches |
 |---|---|---|
 | means, largest error | a quarter of `apart` | 0.07 |
-| covariance, largest | 1.15 | 0.57 |
+| covariance, largest | 1.15 | 0.63 |
 | covariance, rms | 0.65 | 0.31 |
 | opacities, largest | 0.25 | 0.12 |
 | sh0 and bands, largest | 0.3, or a 25th of the source's largest coefficient | 0.13 |
@@ -32,16 +32,15 @@ PRUNED_MAX = 0.25
 
 
 def coarse_errors(one: Input, source: Source, proof: Proof) -> dict[str, str]:
-    """Return by measure a line for each stated error that is beyond its bound; none if the input is not ordinary."""
+    """Return by measure a line for each stated error that is beyond its bound."""
     lines: dict[str, str] = {}
-    if one.may_refuse:
-        return lines
     for measure in proof.measures:
         if measure.stated_max is None or measure.stated_rms is None:
             continue
         bound = _bound(measure, one, source)
         if measure.stated_max > bound:
-            what = f"an error of {measure.stated_max:.3g}, beyond {bound:.3g} is coarse{_whose(measure)}"
+            coarse = "coarse, or a wrong rotation" if measure.name == "covariance" else "coarse"
+            what = f"an error of {measure.stated_max:.3g}, beyond {bound:.3g} is {coarse}{_whose(measure)}"
         elif measure.name == "covariance" and measure.stated_rms > COVARIANCE_RMS:
             what = f"an rms of {measure.stated_rms:.3g}, beyond {COVARIANCE_RMS:g} is coarse"
         else:
@@ -50,9 +49,9 @@ def coarse_errors(one: Input, source: Source, proof: Proof) -> dict[str, str]:
     return lines
 
 
-def coarse_pruning(one: Input, missing: int, count: int) -> str:
-    """Return a line if much of an ordinary input was left out."""
-    if one.may_refuse or missing <= PRUNED_MAX * count:
+def coarse_pruning(missing: int, count: int) -> str:
+    """Return a line if much of an input was left out."""
+    if missing <= PRUNED_MAX * count:
         return ""
     return f"{missing} of {count} splats left out"
 

@@ -73,7 +73,7 @@ def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) 
         wrong += _wrong_extras(source, decoded, pairs)
     if wrong:
         return failed(wrong, details), pairs
-    coarse = coarse_pruning(one, pairs.missing, len(source))
+    coarse = coarse_pruning(pairs.missing, len(source))
     remark = f"{pairs.missing} splats pruned" if pairs.missing else ""
     return Verdict(Status.WARNED if coarse else Status.PASSED, coarse or remark, details=details), pairs
 

@@ -9,6 +9,7 @@ from csplat.decoder import Scene
 from csplat_conformance.encoders.ending import judge_end, wrong_habits
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.encoders.judge import judge_content, judge_stream
+from csplat_conformance.encoders.matching import Pairs
 from csplat_conformance.encoders.picturing import PictureJudge, judge_pictures
 from csplat_conformance.encoders.proving import judge_errors
 from csplat_conformance.encoders.trial import Trial
@@ -78,15 +79,16 @@ def _verdicts(one: Input, first: Trial, again: Trial | None, asked: Asked) -> It
     yield "L2", content
     errors, alone = judge_errors(one, scene, pairs)
     yield "L3", errors
-    yield "L4", _judge_pictures(one, scene, len(data), alone if "L3" in asked.levels else "", asked)
+    yield "L4", _judge_pictures(one, scene, pairs, len(data), alone if "L3" in asked.levels else "", asked)
 
 
-def _judge_pictures(one: Input, scene: Scene, size_bytes: int, alone: str, asked: Asked) -> Verdict:
+def _judge_pictures(one: Input, scene: Scene, pairs: Pairs, size_bytes: int, alone: str, asked: Asked) -> Verdict:
     """Judge L4.
 
     Args:
         one: the input.
         scene: what the file holds.
+        pairs: which splat of the source each of the file's is.
         size_bytes: of the file.
         alone: why nothing but pictures can judge it; nothing where errors are proved.
         asked: what is asked.
@@ -96,7 +98,7 @@ def _judge_pictures(one: Input, scene: Scene, size_bytes: int, alone: str, asked
     if not (alone or "L4" in asked.levels):
         return Verdict(Status.SKIPPED)
     if asked.pictures is not None:
-        return judge_pictures(one, one.source(), scene, size_bytes, asked.pictures, asked.psnr_min)
+        return judge_pictures(one, one.source(), scene, pairs, size_bytes, asked.pictures, asked.psnr_min)
     if alone:
         return Verdict(Status.FAILED, f"{alone}: only pictures can judge it, and {asked.no_pictures}")
     return Verdict(Status.SKIPPED, asked.no_pictures)

@@ -28,7 +28,7 @@ def nasty_values() -> list[Input]:
         made("nasty/far_coordinates", "centres about 1,000,000", _far, apart=30.0),
         made(
             "nasty/far_doubles",
-            "centres about 4,000,000 in doubles, which binary32 does not hold relative to any origin",
+            "centres about 4,000,000 in doubles: binary32 holds them not exactly, relative to any origin",
             _far_doubles,
             Layout(means_dtype="f8"),
         ),
@@ -145,6 +145,7 @@ def _tiny() -> Splats:
 def _huge_colours() -> Splats:
     splats = cloud(64, 1, 28)
     splats.sh0[3], splats.sh0[4], splats.shN[5] = 1e6, -1e6, 1e6
+    splats.sh0[6] = (1e6, -1e6, 1e6)  # grey has no chroma
     return splats
 
 

@@ -62,10 +62,11 @@ def _scene(gloss: float, noise: float, seed: int) -> Splats:
     texture = np.sin(means @ rng.normal(0.0, 5.0, (3, 3))) + 0.8 * np.sign(np.sin(12.0 * means))
     logits = rng.normal(4.0, 1.5, count)
     logits[rng.random(count) < 0.3] -= 4.0
+    quats, scales = _permuted(_facing(normals, rng), np.log(np.stack([long, short, 0.1 * long], axis=1)), rng)
     return Splats(
         means=means.astype(np.float32),
-        quats=_facing(normals, rng),
-        scales=np.log(np.stack([long, short, 0.1 * long], axis=1)).astype(np.float32),
+        quats=quats.astype(np.float32),
+        scales=scales.astype(np.float32),
         logits=logits.astype(np.float32),
         sh0=(0.7 * texture + rng.normal(0.0, 0.3, (count, 3))).astype(np.float32),
         shN=(gloss * _highlights(_faceted(normals)) + rng.normal(0.0, noise, (count, 15, 3))).astype(np.float32),
@@ -110,7 +111,7 @@ def _box(side: int) -> list[Surface]:
     return faces
 
 
-def _facing(normals: F64, rng: np.random.Generator) -> NDArray[np.float32]:
+def _facing(normals: F64, rng: np.random.Generator) -> F64:
     """Return rotations that bring z to the normals, turned about them at random, of either sign and any length."""
     # Half-way between z and the normal is half the turn; to the opposite of z one turns about x.
     half = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
@@ -119,7 +120,20 @@ def _facing(normals: F64, rng: np.random.Generator) -> NDArray[np.float32]:
     cos, sin, (w, x, y, z) = np.cos(twist), np.sin(twist), half.T
     quats = np.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], axis=1)
     quats *= rng.choice((-1.0, 1.0), (len(normals), 1))
-    return quats.astype(np.float32)
+    return quats
+
+
+def _permuted(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Return the same splats with their axes in any of the six orders: trained scenes have them so."""
+    quats, scales = quats.copy(), scales.copy()
+    for first in (0, 1, 0):
+        rows = rng.random(len(quats)) < 0.5
+        w, x, y, z = quats[rows].T
+        # Half a turn about the bisector of two axes exchanges them.
+        turned = (-x - y, w - z, w + z, x - y) if first == 0 else (-y - z, y - z, w - x, w + x)
+        quats[rows] = np.sqrt(0.5) * np.stack(turned, axis=1)
+        scales[rows, first : first + 2] = scales[rows, first : first + 2][:, ::-1]
+    return quats, scales
 
 
 # Colours -------------------------------------------------------------------------------------------
