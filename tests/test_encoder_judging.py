@@ -16,7 +16,6 @@ import csplat
 from csplat.decoder import decode_scene
 from csplat.encoder import PRESETS, geometry, quantise
 from csplat_conformance.encoders import EncoderChoice, all_inputs, figures, run_encoder
-from csplat_conformance.encoders.coarse import coarse_errors
 from csplat_conformance.encoders.cut import find_cuts
 from csplat_conformance.encoders.judge import judge_content
 from csplat_conformance.encoders.proving import judge_errors
@@ -354,6 +353,15 @@ def test_sizes_and_figures_of_others_stand_beside_the_picture(altered, tmp_path,
         ) == short.message
     finally:
         figures._all.cache_clear()
+
+
+def test_what_cannot_be_drawn_fails_alone(altered):
+    def far(scene):
+        return dataclasses.replace(scene, model=dataclasses.replace(scene.model, origin=(1e300, 0.0, 0.0)))
+
+    report = altered(far, ("L1", "L2", "L3", "L4"), lambda *_: 40.0)
+
+    assert [Status.FAILED] == [one.status for one in report.outcomes if one.level == "L4"]
 
 
 # Reports -------------------------------------------------------------------------------------------

@@ -223,6 +223,15 @@ def test_what_is_not_kept_leaves_nothing_and_what_is_kept_lies_apart(encoded, tm
         assert ["in.ply", "out.csplat", "out.npy"] == sorted(path.name for path in tmp_path.glob("*/*"))
 
 
+def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
+    choice = EncoderChoice(PLAIN, ("L1",), keep=tmp_path)
+    for _ in range(2):
+        report = run_encoder(
+            COMMAND, choice, run=running(encoded, lambda at: (at.out.parent / "tmp").write_text("") and None)
+        )
+        assert "left tmp beside the output" in first(report)[2]
+
+
 # The source index ----------------------------------------------------------------------------------
 
 
@@ -234,8 +243,14 @@ def test_what_is_not_kept_leaves_nothing_and_what_is_kept_lies_apart(encoded, tm
         (lambda index: index[:-1], "wanted integers of shape [216]"),
         (lambda index: index.astype(np.float64), "the source index is float64"),
         (lambda index: index[:, None], "shape [216, 1]"),
-        (lambda index: np.where(np.arange(216) == 5, index[6], index), "splats 5 and 6 are both called splat"),
-        (lambda index: np.where(np.arange(216) == 5, -1, index), "splat 5 is called splat -1 of the source, which has"),
+        (
+            lambda index: np.where(np.arange(216) == 5, index[6], index),
+            "the source index calls splats 5 and 6 both splat",
+        ),
+        (
+            lambda index: np.where(np.arange(216) == 5, -1, index),
+            "the source index calls splat 5 splat -1 of the source, which has",
+        ),
         (lambda index: np.where(np.arange(216) == 5, 2**40, index), "which has 216, from 0 on"),
     ],
 )
@@ -258,14 +273,21 @@ def test_a_wrong_number_names_splat_claim_and_nearest(encoded):
     ) == first(report)[2]
 
 
+def npy(text):
+    """A file of version 1.0 whose header is some text."""
+    return b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text
+
+
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         (lambda path: path.unlink(), "no source index was written"),
-        (lambda path: path.write_bytes(b"\x93NUMPY"), "is no .npy file"),
-        (lambda path: path.write_bytes(b""), "is no .npy file"),
-        (lambda path: path.write_bytes(b"PK\3\4" * 9), "is no .npy file"),
-        (lambda path: np.save(path, np.array([None] * 216)), "is no .npy file"),
+        (lambda path: path.write_bytes(b"\x93NUMPY"), "is not a NumPy array file"),
+        (lambda path: path.write_bytes(b""), "is not a NumPy array file"),
+        (lambda path: path.write_bytes(b"PK\3\4" * 9), "is not a NumPy array file"),
+        (lambda path: np.save(path, np.array([None] * 216)), "is not a NumPy array file"),
+        (lambda path: path.write_bytes(npy(b"{'descr': '<u4', 'shape': (216,),")), "is not a NumPy array file"),
+        (lambda path: path.write_bytes(npy(b"{[]: 1}")), "is not a NumPy array file"),
     ],
 )
 def test_an_index_is_an_npy_file(encoded, write, message):

@@ -292,6 +292,28 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
     assert f"above the stated {wrong[0].stated_max:.9g}" in line
 
 
+def test_a_statement_of_any_size_is_judged(make_model):
+    source = make_model(50, 0)
+    scene = decode_scene(encode(source))
+    vast = tuple(replace(one, max=1e200, rms=1e200) for one in scene.stated_errors.records)
+    stated = replace(scene.stated_errors, records=vast)
+    assert prove(Source.of(source), scene.model, scene.header, stated).holds  # nobody knows which splat is which
+    assert not prove(Source.of(source), scene.model, scene.header, stated, np.arange(50)).holds
+
+
+def test_errors_beyond_float64_are_infinite(make_model):
+    low, high = (make_model(9000, 0, scales=np.full((9000, 3), scale, np.float32)) for scale in (-88.0, 88.0))
+    assert measure_pairs(low, high, np.arange(9000))["covariance"][1] == np.inf
+
+
+def test_normals_are_nobodys_business(make_model):
+    source = make_model(50, 0)
+    kept = replace(source, extra={"nx": np.zeros(50, np.float32)})
+    result = encode_with_report(kept, EncodeOptions(keep_extra=True))
+    scene = decode_scene(result.data)
+    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
+
+
 def test_extra_columns_are_part_of_the_proof(make_model):
     source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
@@ -299,7 +321,8 @@ def test_extra_columns_are_part_of_the_proof(make_model):
     assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
     other = replace(source, extra={"label": np.zeros(50, np.int16)})
     proof = prove(Source.of(other), scene.model, scene.header, scene.stated_errors, result.source_index)
-    assert proof.failures == ("the extra column 'label' is not the source's",)
+    assert proof.failures == ("the extra column 'label' does not hold what the source's does",)
+    assert proof.clauses == ("SRC-3",)
 
 
 # The walk through the blocks ----------------------------------------------------------------------

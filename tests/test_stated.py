@@ -7,8 +7,8 @@ import pytest
 
 from csplat.model import SplatModel, normalise_quats
 from csplat_conformance.encoders.plyfile import Splats, is_splat, meaning
+from csplat_conformance.room import may_be_stated, room
 from csplat_conformance.stated import Source, measure_pairs
-from csplat_conformance.stated.room import may_be_stated, room
 
 ORIGIN = (481_250.0, 5_467_100.0, 310.0)
 

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Writing files so that a reader never sees half of one, and reading arrays."""
 
 from __future__ import annotations
 
@@ -6,9 +6,15 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from tokenize import TokenError
+from typing import Any, BinaryIO
 
-__all__ = ["atomic_writer"]
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+
+__all__ = ["atomic_writer", "read_array"]
 
 
 @contextmanager
@@ -43,3 +49,28 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             temporary.unlink()
         raise
+
+
+def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
+    """Read one array from a .npy file.
+
+    Raises:
+        InputError: it is not one.
+        OSError: it cannot be read.
+    """
+    if Path(path).exists() and not Path(path).is_file():
+        raise InputError(f"{path} is not a file")
+    try:
+        with Path(path).open("rb") as stream:
+            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    except (
+        ValueError,
+        EOFError,
+        SyntaxError,
+        TokenError,
+        TypeError,
+        MemoryError,
+    ) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
+    return array

@@ -30,14 +30,18 @@ def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tup
         what is left of them.
     """
     with np.errstate(over="ignore"):  # the model refuses what leaves float32
-        if facts.origin is not None and not facts.origin_is_added:
-            return means.astype(np.float32, copy=False), facts.origin, None
         if means.dtype == np.float32:
-            return means, (0.0, 0.0, 0.0), None
-        origin = facts.origin if facts.origin is not None else _origin_for(means)
-        rounded = (means - np.array(origin)).astype(np.float32)
-        exact = np.array_equal(rounded + np.array(origin), means)
-        return rounded, origin, None if exact else means
+            origin = None if facts.origin_is_added else facts.origin
+            return means, origin or (0.0, 0.0, 0.0), None
+        positions = means
+        origin = facts.origin
+        if origin is None:
+            origin = _origin_for(means)
+        elif not facts.origin_is_added:
+            positions = means + np.array(origin)
+        rounded = (positions - np.array(origin)).astype(np.float32)
+        exact = np.array_equal(rounded + np.array(origin), positions)
+        return rounded, origin, None if exact else positions
 
 
 def _origin_for(positions: F64) -> tuple[float, float, float]:

@@ -89,7 +89,10 @@ def status_of(name, ply, out, index=None):
 
 def psnr(source, decoded):
     """PSNR of renders; those of a source are made once."""
-    key = b"".join(values.tobytes() for values in (source.means, source.quats, source.sh0, source.shN))
+    key = b"".join(
+        values.tobytes()
+        for values in (source.means, source.quats, source.scales, source.opacities, source.sh0, source.shN)
+    )
     judge = _judges().get(key)
     if judge is None:
         from csplat_render.judge import Judge

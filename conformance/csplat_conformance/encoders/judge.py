@@ -16,14 +16,13 @@ from csplat_conformance.encoders.mapping import check_index
 from csplat_conformance.encoders.matching import Pairs, pair
 from csplat_conformance.encoders.verdict import Verdict, Wrong, failed
 from csplat_conformance.report import Status
-from csplat_conformance.stated import Source
+from csplat_conformance.stated import Source, wrong_extras
 from csplat_conformance.validator import validate
 
 __all__ = ["judge_content", "judge_stream"]
 
 _CUT_SHORT = frozenset((_spec.ERROR_TRUNCATED,))
 _SHOWN = 3
-_NORMALS = frozenset(("nx", "ny", "nz"))
 
 
 def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
@@ -70,7 +69,7 @@ def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) 
         details["source_index"] = not wrong_numbers
         wrong += wrong_numbers
     if pairs.strays == pairs.surplus == 0:
-        wrong += _wrong_extras(source, decoded, pairs)
+        wrong += [("SRC-3", line) for line in wrong_extras(source, decoded, pairs.source_index)]
     if wrong:
         return failed(wrong, details), pairs
     coarse = coarse_pruning(pairs.missing, len(source))
@@ -126,17 +125,4 @@ def _wrong_facts(source: Source, decoded: SplatModel) -> list[Wrong]:
     ]
     if decoded.sh_degree > source.sh_degree:
         wrong.append(("SRC-3", f"SH degree {decoded.sh_degree}, the source has {source.sh_degree}"))
-    return wrong
-
-
-def _wrong_extras(source: Source, decoded: SplatModel, pairs: Pairs) -> list[Wrong]:
-    wrong = []
-    for name, column in decoded.extra.items():
-        if name in _NORMALS:  # every splat PLY may have them, and nobody cares what they hold
-            continue
-        other = source.extra.get(name)
-        if other is None:
-            wrong.append(("SRC-3", f"the extra column {name!r} is none of the source's"))
-        elif column.tobytes() != other[pairs.source_index].astype(column.dtype).tobytes():
-            wrong.append(("SRC-3", f"the extra column {name!r} does not hold what the source's does"))
     return wrong

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from csplat.errors import InputError
+from csplat.files import read_array
 from csplat_conformance.encoders.matching import Pairs
 from csplat_conformance.encoders.verdict import Wrong
-from csplat_conformance.stated import Source
+from csplat_conformance.stated import Source, check_source_index
 
 __all__ = ["check_index"]
 
@@ -30,10 +30,13 @@ def check_index(path: Path, source: Source, count: int, pairs: Pairs) -> tuple[P
     Returns:
         The pairs with the encoder's own index if it is right, as they are if not; and what is wrong.
     """
-    found = _read(path)
-    text = found if isinstance(found, str) else _wrong_form(found, count, len(source))
-    if text or isinstance(found, str):
-        return pairs, [(CLAUSE, text)]
+    if not path.exists():
+        return pairs, [(CLAUSE, "no source index was written")]
+    try:
+        found = read_array(path)
+        check_source_index(found, len(source), count)
+    except (InputError, OSError) as error:
+        return pairs, [(CLAUSE, str(error).replace(str(path), "the source index"))]
     index = found.astype(np.int64)
     paired = np.flatnonzero(pairs.source_index >= 0)
     near = pairs.source_index[paired]
@@ -46,33 +49,3 @@ def check_index(path: Path, source: Source, count: int, pairs: Pairs) -> tuple[P
         )
         return pairs, [(CLAUSE, text)]
     return replace(pairs, source_index=index) if len(paired) == count else pairs, []
-
-
-def _read(path: Path) -> NDArray[Any] | str:
-    """Return the array, or why there is none."""
-    try:
-        with path.open("rb") as stream:
-            result: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    except FileNotFoundError:
-        return "no source index was written"
-    except (ValueError, OSError, EOFError, MemoryError, SyntaxError) as error:
-        return f"the source index is no .npy file: {error}"
-    return result
-
-
-def _wrong_form(index: NDArray[Any], count: int, source_count: int) -> str:
-    """Say what is wrong with an index as such; nothing where nothing is."""
-    if index.dtype.kind not in "iu" or index.shape != (count,):
-        return f"the source index is {index.dtype} of shape {list(index.shape)}, wanted integers of shape [{count}]"
-    if not count:
-        return ""
-    outside = (index < 0) | (index >= source_count)
-    if outside.any():
-        first = int(outside.argmax())
-        return f"splat {first} is called splat {index[first]} of the source, which has {source_count}, from 0 on"
-    values, counts = np.unique(index, return_counts=True)
-    if len(values) != count:
-        twice = values[counts.argmax()]
-        first, second = np.flatnonzero(index == twice)[:2]
-        return f"splats {first} and {second} are both called splat {twice} of the source"
-    return ""

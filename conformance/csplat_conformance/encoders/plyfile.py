@@ -73,8 +73,8 @@ def meaning(splats: Splats) -> Source:
     """Return the source that the rows stand for (spec SRC-1, SRC-2): alpha of the logits, unit quaternions."""
     splats = splats.select(np.flatnonzero(is_splat(splats)))
     with np.errstate(over="ignore"):
-        alpha = 1.0 / (1.0 + np.exp(-splats.logits.astype(np.float64)))  # ±Inf are alpha 1 and 0
-    quats = splats.quats.astype(np.float64)
+        alpha = 1.0 / (1.0 + np.exp(-splats.logits.astype(np.float32).astype(np.float64)))  # ±Inf are alpha 1 and 0
+    quats = splats.quats.astype(np.float32).astype(np.float64)
     lengths = np.sqrt(np.square(quats).sum(axis=1, keepdims=True))
     quats = np.where(lengths > 0.0, quats / np.where(lengths > 0.0, lengths, 1.0), [[1.0, 0.0, 0.0, 0.0]])
     return Source(

@@ -40,8 +40,7 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
     unproved = f"{', '.join(proof.unproved)}: fitted anew, nothing is stated" if proof.unproved else ""
     why = f"{', '.join(proof.unproved)} fitted anew" if proof.unproved and stated.refitted else ""
     if not proof.holds:
-        clause = "SER-6" if proof.unproved and not stated.refitted else "SER-5"
-        return Verdict(Status.FAILED, in_short(proof.failures), (clause,), details=details), why
+        return Verdict(Status.FAILED, in_short(proof.failures), proof.clauses, details=details), why
     coarse = coarse_errors(one, source, proof)
     warnings = [*coarse.values()]
     if len(scene.model) and not stated.refitted:  # what was fitted anew moved on purpose

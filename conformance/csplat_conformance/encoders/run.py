@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,10 +96,11 @@ def run_encoder(
             for one, first, future in zip(inputs, firsts, repeated, strict=True):
                 # Judged here, one after the other: rendering uses all cores by itself.
                 again = future.result() if future is not None else None
-                outcomes += judge_input(one, first, again, asked)
+                outcomes += _judged(one, first, again, asked)
                 if one.may_refuse:
                     declined[one.name] = first.ended.status is None and first.ended.returncode == 1
-                _forget(folder, one, first, again)
+                with suppress(OSError):
+                    _forget(folder, one, first, again)
                 steps.go()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -108,6 +109,17 @@ def run_encoder(
         notes.append(f"L4 SKIPPED: {no_pictures}")
     extra = (Status.WARNED, Status.DECLINED, Status.NOT_PROVED)
     return Report("encoder", command, outcomes, notes, extra)
+
+
+def _judged(one: Input, first: Trial, again: Trial | None, asked: Asked) -> list[Outcome]:
+    """Judge an input; what cannot be read or drawn is a failure of this one alone."""
+    outcomes: list[Outcome] = []
+    try:
+        outcomes.extend(judge_input(one, first, again, asked))
+    except (InputError, OSError) as error:
+        level = LEVELS[min(len(outcomes), len(LEVELS) - 1)]
+        outcomes.append(Outcome(one.name, level, Status.FAILED, message=str(error)))
+    return outcomes
 
 
 def chosen_inputs(pattern: str | None) -> list[Input]:

@@ -63,13 +63,12 @@ def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner
         InputError: there is no such program.
     """
     ply = one.make()
-    folder.mkdir(parents=True, exist_ok=True)
+    if folder.is_dir():
+        shutil.rmtree(folder)  # of an earlier run that was kept
+    folder.mkdir(parents=True)
     places = {
         name: folder / _NAMES[name] for name in (*PLACES, *OPTIONAL_PLACES) if name in PLACES or _has(command, name)
     }
-    for name in _NAMES.values():
-        _remove(folder / name)
-    before = {path.name for path in folder.iterdir()}
     places["ply"].write_bytes(ply)
     named = {name: str(path) for name, path in places.items()}
     traces: list[str] = []
@@ -80,21 +79,15 @@ def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner
         with tempfile.TemporaryDirectory(prefix="csplat-cwd-") as cwd:
             ended = run_program(command, named, seconds, cwd=Path(cwd))
             traces += [f"left {name} in its working directory" for name in _names(Path(cwd))]
-    outputs = {_NAMES["out"], _NAMES["index"]} if ended.returncode == 0 else {_NAMES["out"]}  # that is told apart
-    left = [name for name in _names(folder) if name not in before | outputs | {_NAMES["ply"]}]
+    # A refusal that leaves its output is a status of its own.
+    outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if ended.returncode == 0 else set())
+    left = [name for name in _names(folder) if name not in outputs]
     traces = [*_harm(places["ply"], ply), *(f"left {name} beside the output" for name in left), *traces]
     return Trial(ended, places["out"], places.get("index"), tuple(traces), started)
 
 
 def _has(command: str, name: str) -> bool:
     return f"{{{name}}}" in command
-
-
-def _remove(path: Path) -> None:
-    """Remove what an earlier run left that was kept."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
 
 
 def _names(folder: Path) -> list[str]:

@@ -250,7 +250,7 @@ def _files() -> list[Recipe]:
     columns = tuple(Block(_spec.CODING_RAW, [[2 ** (8 * k) - 1], [3]], Stream(k)) for k in sizes)
     text = '{"title":"\\u00e9 é","comments":["a","b"],"n":[1,2.5e3,null,true,{}]}'.encode()
     camera = b'[{"K":[[9,0,4],[0,9,3],[0,0,1]],"viewmat":[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"W":8,"H":6}]'
-    stated = StatedErrors(9, 7, 4, _spec.ERROR_FLAG_REFITTED, tuple((m, 0.5, 0.25) for m in _spec.MEASURE_NAMES))
+    stated = StatedErrors(9, 7, 4, _spec.ERROR_FLAG_REFITTED, tuple((m, 0.5, 0.375) for m in _spec.MEASURE_NAMES))
     bounds = tuple(
         (measure, largest, largest * math.sqrt(components) * (1.0 + 2.0**-20))
         for measure, components, largest in (

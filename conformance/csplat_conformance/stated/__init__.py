@@ -10,8 +10,19 @@
 from __future__ import annotations
 
 from csplat_conformance.stated.matching import lattice_radii, match
-from csplat_conformance.stated.pairs import measure_pairs
+from csplat_conformance.stated.pairs import check_source_index, measure_pairs, wrong_extras
 from csplat_conformance.stated.proof import MeasureProof, Proof, Worst, prove
 from csplat_conformance.stated.source import Source
 
-__all__ = ["MeasureProof", "Proof", "Source", "Worst", "lattice_radii", "match", "measure_pairs", "prove"]
+__all__ = [
+    "MeasureProof",
+    "Proof",
+    "Source",
+    "Worst",
+    "check_source_index",
+    "lattice_radii",
+    "match",
+    "measure_pairs",
+    "prove",
+    "wrong_extras",
+]

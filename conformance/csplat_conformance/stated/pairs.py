@@ -17,12 +17,13 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat_conformance.stated.source import Source
 
-__all__ = ["Measured", "differences", "measure_names", "measure_pairs"]
+__all__ = ["Measured", "check_source_index", "differences", "measure_names", "measure_pairs", "wrong_extras"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # integers that name splats
 
+_NORMALS = frozenset(("nx", "ny", "nz"))
 _BLOCK = 4096  # splats: 45 float64 SH coefficients of each are 1.5 MB
 
 
@@ -68,7 +69,7 @@ def measure_pairs(
     Raises:
         InputError: `source_index` is not one valid index for each decoded splat.
     """
-    _check_index(source_index, len(source), len(decoded))
+    check_source_index(source_index, len(source), len(decoded), once=False)
 
     def measure_block(start: int) -> dict[str, tuple[float, float, int]]:
         rows = slice(start, min(start + _BLOCK, len(decoded)))
@@ -82,7 +83,11 @@ def measure_pairs(
 
 def _together(blocks: list[tuple[float, float, int]], count: int) -> Measured:
     largest, _, worst = max(blocks, key=lambda block: block[0], default=(0.0, 0.0, 0))
-    return Measured(largest, math.sqrt(math.fsum(squares for _, squares, _ in blocks) / max(1, count)), worst)
+    try:
+        squares = math.fsum(block[1] for block in blocks)
+    except OverflowError:
+        squares = math.inf
+    return Measured(largest, math.sqrt(squares / max(1, count)), worst)
 
 
 def differences(source: Source, decoded: SplatModel, source_rows: Rows, decoded_rows: Rows | slice) -> dict[str, F64]:
@@ -111,16 +116,33 @@ def differences(source: Source, decoded: SplatModel, source_rows: Rows, decoded_
     return result
 
 
-def _check_index(source_index: Rows, source_count: int, decoded_count: int) -> None:
-    if source_index.shape != (decoded_count,) or source_index.dtype.kind not in "iu":
-        raise InputError(
-            f"the source index is {source_index.dtype} of shape {list(source_index.shape)}, wanted"
-            f" integers [{decoded_count}], one for each splat of the file"
-        )
-    if decoded_count:
-        low, high = int(source_index.min()), int(source_index.max())
-        if low < 0 or high >= source_count:
-            raise InputError(f"the source index reaches from {low} to {high}, the source holds {source_count} splats")
+def check_source_index(index: Rows, source_count: int, decoded_count: int, *, once: bool = True) -> None:
+    """See to it that a source index may be one (SRC-4).
+
+    Args:
+        index: of any type and shape.
+        source_count: splats of the source.
+        decoded_count: splats of the file.
+        once: no number occurs twice.
+
+    Raises:
+        InputError: it is not one number of a splat of the source for each splat of the file, or one occurs twice.
+    """
+    if index.shape != (decoded_count,) or index.dtype.kind not in "iu":
+        found = f"{index.dtype} of shape {list(index.shape)}"
+        raise InputError(f"the source index is {found}, wanted integers of shape [{decoded_count}]")
+    outside = (index < 0) | (index >= source_count)
+    if outside.any():
+        first = int(outside.argmax())
+        what = f"splat {first} splat {index[first]} of the source, which has {source_count}, from 0 on"
+        raise InputError(f"the source index calls {what}")
+    if not once:
+        return
+    values, counts = np.unique(index, return_counts=True)
+    if len(values) != decoded_count:
+        twice = values[counts.argmax()]
+        first, second = np.flatnonzero(index == twice)[:2]
+        raise InputError(f"the source index calls splats {first} and {second} both splat {twice} of the source")
 
 
 def _reduce(values: F64, start: int) -> tuple[float, float, int]:
@@ -148,8 +170,9 @@ def _distances(source: Source, decoded: SplatModel, source_rows: Rows, decoded_r
     shift = np.subtract(decoded.origin, source.origin)
     if shift.any():
         moved += shift
-    # Squares of float32 values neither overflow nor vanish in float64: 1e-45 squared is 1e-90.
-    distances: F64 = np.sqrt(np.einsum("ij,ij->i", moved, moved))
+    # Squares of float32 values neither overflow nor vanish in float64; those of an origin of 1e200 are infinite.
+    with np.errstate(over="ignore"):
+        distances: F64 = np.sqrt(np.einsum("ij,ij->i", moved, moved))
     return distances
 
 
@@ -190,3 +213,20 @@ def _frobenius(entries: F64) -> F64:
     squares = np.square(entries)
     norms: F64 = np.sqrt(squares[:3].sum(axis=0) + 2.0 * squares[3:].sum(axis=0))
     return norms
+
+
+def wrong_extras(source: Source, decoded: SplatModel, source_index: Rows) -> list[str]:
+    """Say which extra columns a file has that are not its source's (SRC-3), a line each.
+
+    Normals are left alone: every splat PLY may have them, and nobody cares what they hold.
+    """
+    lines = []
+    for name, column in decoded.extra.items():
+        other = source.extra.get(name)
+        if name in _NORMALS:
+            continue
+        if other is None:
+            lines.append(f"the extra column {name!r} is none of the source's")
+        elif column.tobytes() != other[source_index].astype(column.dtype).tobytes():
+            lines.append(f"the extra column {name!r} does not hold what the source's does")
+    return lines

@@ -16,9 +16,15 @@ from numpy.typing import NDArray
 
 from csplat.decoder import SceneHeader, StatedErrors
 from csplat.model import SplatModel
+from csplat_conformance.room import may_be_stated, room
 from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED, Progress, lattice_radii, match
-from csplat_conformance.stated.pairs import differences, measure_names, measure_pairs
-from csplat_conformance.stated.room import may_be_stated, room
+from csplat_conformance.stated.pairs import (
+    check_source_index,
+    differences,
+    measure_names,
+    measure_pairs,
+    wrong_extras,
+)
 from csplat_conformance.stated.source import Source
 
 __all__ = ["MeasureProof", "Proof", "Worst", "prove"]
@@ -26,7 +32,8 @@ __all__ = ["MeasureProof", "Proof", "Worst", "prove"]
 I64 = NDArray[np.int64]
 
 _NOT_WITHOUT_INDEX = "rms and counts are not proved without a source index"
-_LOOKED_AT = 100  # splats without a partner whose nearest source splats are looked for
+_LOOKED_AT, _LOOKED_AT_LEAST = 100, 10  # splats without a partner whose nearest source splats are looked for
+_PASSES = 10**8  # distances that this may take
 _NEAREST = 8  # source splats that are compared with each of them
 
 
@@ -76,12 +83,14 @@ class Proof:
     Attributes:
         measures: in the order of the registry.
         failures: one line each; none when the file's statement holds.
+        clauses: of the spec, that they break.
         unproved: measures of which nothing is stated: what was fitted anew, or everything.
         rms_proved: whether rms and counts were proved too.
     """
 
     measures: tuple[MeasureProof, ...] = ()
     failures: tuple[str, ...] = ()
+    clauses: tuple[str, ...] = ()
     unproved: tuple[str, ...] = ()
     rms_proved: bool = False
 
@@ -149,23 +158,23 @@ def prove(
     """
     names = measure_names(source, decoded)
     if stated is None:
-        return Proof(failures=("the file states no errors",), unproved=tuple(names))
+        return Proof(failures=("the file states no errors",), clauses=("SER-6",), unproved=tuple(names))
     bounds = {record.measure: (record.max, record.rms) for record in stated.records}
     silent = tuple(name for name in names if name not in bounds) if len(decoded) else ()
-    failures = list(_different_scenes(source, stated))
-    if not stated.refitted:  # SER-6
-        failures += [f"the file states no error of {name}" for name in silent]
-    if failures:
-        return Proof(failures=tuple(failures), unproved=silent)
-    if source_index is not None:
-        measures, failures = _prove_pairs(source, decoded, header, bounds, source_index)
-    elif bounds:
-        measures, failures = _prove_matches(source, decoded, header, bounds, progress)
-    else:
-        measures = []
-    order = {name: place for place, name in enumerate(names)}
-    measures.sort(key=lambda one: order[one.name])
-    return Proof(tuple(measures), tuple(failures), silent, rms_proved=source_index is not None)
+    wrong = [("SER-5", line) for line in _different_scenes(source, stated)]
+    if not stated.refitted:
+        wrong += [("SER-6", f"the file states no error of {name}") for name in silent]
+    measures: list[MeasureProof] = []
+    if not wrong and source_index is not None:
+        measures, wrong = _prove_pairs(source, decoded, header, bounds, source_index)
+    elif not wrong and "means" in bounds:
+        measures, wrong = _prove_matches(source, decoded, header, bounds, progress)
+    elif not wrong:  # nothing says how far to look
+        silent = tuple(names) if len(decoded) else ()
+    measures.sort(key=lambda one: names.index(one.name))
+    clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
+    proved = source_index is not None and bool(measures)
+    return Proof(tuple(measures), tuple(line for _, line in wrong), clauses, silent, rms_proved=proved)
 
 
 def _different_scenes(source: Source, stated: StatedErrors) -> Iterator[str]:
@@ -177,22 +186,15 @@ def _different_scenes(source: Source, stated: StatedErrors) -> Iterator[str]:
 
 
 Bounds = dict[str, tuple[float, float]]
+Wrong = list[tuple[str, str]]  # clause and line
 
 
 def _prove_pairs(
     source: Source, decoded: SplatModel, header: SceneHeader, bounds: Bounds, source_index: NDArray[Any]
-) -> tuple[list[MeasureProof], list[str]]:
+) -> tuple[list[MeasureProof], Wrong]:
+    check_source_index(source_index, len(source), len(decoded))
     measured = measure_pairs(source, decoded, source_index)
-    failures = []
-    different = len(np.unique(source_index))
-    if different != len(decoded):
-        failures.append(
-            f"the source index names {different} splats for {len(decoded)}: counts of kept and pruned are wrong"
-        )
-    for name, column in decoded.extra.items():
-        other = source.extra.get(name)
-        if other is None or column.tobytes() != other[source_index].astype(column.dtype).tobytes():
-            failures.append(f"the extra column {name!r} is not the source's")
+    failures = [("SRC-3", line) for line in wrong_extras(source, decoded, source_index)]
     reach, measures = source.reach(decoded.origin), []
     for name, found in measured.items():
         worst = None
@@ -203,7 +205,7 @@ def _prove_pairs(
             measures.append(MeasureProof(name, None, None, found.max, found.rms, None, worst))
             continue
         wrong = contradictions(name, found[:2], bounds[name], reach, worst)
-        failures += wrong
+        failures += [("SER-5", line) for line in wrong]
         measures.append(MeasureProof(name, *bounds[name], found.max, found.rms, not wrong, worst))
     return measures, failures
 
@@ -241,39 +243,43 @@ def _tile_of(header: SceneHeader, splat: int) -> int:
 
 def _prove_matches(
     source: Source, decoded: SplatModel, header: SceneHeader, bounds: Bounds, progress: Progress | None
-) -> tuple[list[MeasureProof], list[str]]:
+) -> tuple[list[MeasureProof], Wrong]:
     largest = {name: pair[0] for name, pair in bounds.items()}
-    if "means" not in largest:  # nothing says how far to look
-        return [], ["nothing is stated of the means: give a source index"]
     found = match(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
     alone = np.flatnonzero(found == UNMATCHED)
     undecided = int(np.count_nonzero(found == UNDECIDED))
-    failures = []
+    lines = []
     if undecided:
-        failures.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
+        lines.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
     worst: dict[str, Worst] = {}
+    some = min(_LOOKED_AT, max(_LOOKED_AT_LEAST, _PASSES // max(1, len(source))))
     if len(alone):
-        worst = _farthest(source, decoded, header, largest, alone[:_LOOKED_AT])
+        worst = _farthest(source, decoded, header, largest, alone[:some], progress)
         many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
-        failures.append(f"{many} no splat of the source within the stated maxima")
-        failures += [
+        lines.append(f"{many} no splat of the source within the stated maxima")
+        lines += [
             f"{name}: {one.found:.9g} is above the stated {largest[name]:.9g}: splat {one.splat} (tile {one.tile}),"
             f" nearest source splat {one.source_splat}"
             for name, one in worst.items()
         ]
-    # Splats beyond those that were looked at may contradict any measure.
-    open_ = len(alone) > _LOOKED_AT
+    # Of which measures the others are beyond is not known.
+    open_ = len(alone) > some
     measures = [
         MeasureProof(
             name, *bounds[name], None, None, False if name in worst else None if open_ else True, worst.get(name)
         )
         for name in bounds
     ]
-    return measures, failures
+    return measures, [("SER-5", line) for line in lines]
 
 
 def _farthest(
-    source: Source, decoded: SplatModel, header: SceneHeader, bounds: dict[str, float], rows: I64
+    source: Source,
+    decoded: SplatModel,
+    header: SceneHeader,
+    bounds: dict[str, float],
+    rows: I64,
+    progress: Progress | None,
 ) -> dict[str, Worst]:
     """Return by measure the splat that is farthest beyond its bound, of some that have no partner.
 
@@ -284,8 +290,11 @@ def _farthest(
         return worst
     reach, source = source.reach(decoded.origin), source.about(decoded.origin)
     means = source.means.astype(np.float64)
-    for row in rows.tolist():
-        distances = np.square(means - decoded.means[row]).sum(axis=1)
+    for done, row in enumerate(rows.tolist()):
+        if progress is not None:
+            progress("looking for what is nearest", done / len(rows))
+        with np.errstate(over="ignore"):
+            distances = np.square(means - decoded.means[row]).sum(axis=1)
         near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
         near = near[np.argsort(distances[near], kind="stable")]
         errors = differences(source, decoded, near, np.full(len(near), row))

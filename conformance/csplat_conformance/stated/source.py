@@ -1,4 +1,4 @@
-"""What a file is compared with: the splats of its source (spec 5.5)."""
+"""What a file is compared with: the splats of its source (spec 5.6)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """M splats as section 5.5 of the spec has them, of SH degree 0 to 4.
+    """M splats as section 5.6 of the spec has them, of SH degree 0 to 4.
 
     Attributes:
         means: [M, 3] float32 or float64, centres relative to `origin`.
@@ -74,8 +74,10 @@ class Source:
     def model(self, origin: tuple[float, float, float]) -> SplatModel:
         """Return it for renders beside a file of this origin: centres in float32 relative to it, degree 3 at most."""
         near = self.about(origin)
+        with np.errstate(over="ignore"):  # the model refuses what leaves float32
+            means = near.means.astype(np.float32)
         return SplatModel(
-            near.means.astype(np.float32),
+            means,
             self.quats,
             self.scales,
             self.opacities,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
+from csplat_conformance.room import least_true, room
 from csplat_conformance.validator.findings import Findings, Placed
 from csplat_conformance.validator.index import Index
 from csplat_conformance.validator.jsontext import JsonError, parse
@@ -18,7 +19,6 @@ __all__ = ["read_stated_errors", "read_text"]
 
 _COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
 _ROOM = 1.0 + 2.0**-20  # SER-2
-_EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
 _CAMERA_KEYS = ("K", "viewmat", "W", "H")
 _TEXT_WIDTH = 1
 
@@ -82,9 +82,7 @@ def read_stated_errors(payload: Payload, index: Index) -> None:
             findings.of("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
         last = max(last, measure)
         if _check_pair(findings, record) and measure in _spec.MEASURE_NAMES:
-            refitted = bool(stated.error_flags & _spec.ERROR_FLAG_REFITTED)
-            if not refitted:
-                _check_possible(findings, record, index, stated.source_sh_degree)
+            _check_possible(findings, record, index, stated.source_sh_degree)
     payload.finish()
 
 
@@ -109,13 +107,13 @@ def _check_possible(
 ) -> None:
     """SER-5 without the source: no pair of scenes has these errors, or they exceed the true ones by too much.
 
-    The true maximum is at least (max − 10^−12) / (1 + 10^−4); one splat has it, so the true rms, and the stated one
-    which is no less, is at least that over √N.
+    One splat has the true maximum, which the stated one exceeds by little; so the true rms is at least that over √N,
+    and the stated one is hardly less (SER-7).
     """
     largest, rms = record.record.max, record.record.rms
-    least = max(0.0, (largest - _EXCESS_FLOOR) / (1.0 + _EXCESS))
     splats, measure = index.head.record.splat_count, _spec.MEASURE_NAMES[record.record.measure]
-    if splats and rms * _ROOM < least / math.sqrt(splats):
+    least = least_true(measure, largest)
+    if splats and rms * _ROOM + room(measure, rms, 0.0) < least / math.sqrt(splats):
         message = f"{rms:.9g} is too small for max {largest:.9g} over {splats} splats"
         findings.of("SER-5", record, "rms", message)
     if measure == "opacities" and least > 1.0:

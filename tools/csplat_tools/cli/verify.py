@@ -77,8 +77,14 @@ def _report(verified: Verified) -> str:
     if proof is not None:
         lines += [_table(proof)] * bool(proof.measures) + list(proof.notes)
         if proof.holds:
-            lines.append("the stated errors hold" if proof.rms_proved else "the stated maxima hold")
+            lines.append(_said(proof))
     return "\n".join(lines)
+
+
+def _said(proof: Proof) -> str:
+    if not any(one.holds for one in proof.measures):
+        return "nothing is stated that could be proved"
+    return "the stated errors hold" if proof.rms_proved else "the stated maxima hold"
 
 
 def _table(proof: Proof) -> str:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
 from csplat.errors import InputError
+from csplat.files import read_array
 from csplat.model import SplatModel
 from csplat_render.virtual import scene_frame
 from csplat_tools.files.console import Progress
-from csplat_tools.files.streams import read_array
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 __all__ = ["encode_by_importance", "read_importance", "read_weights", "weights_of"]

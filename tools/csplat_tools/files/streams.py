@@ -34,7 +34,6 @@ __all__ = [
     "local_path",
     "mapped_csplat",
     "ply_path",
-    "read_array",
     "write_array",
     "write_bytes",
     "write_json",
@@ -178,24 +177,6 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap.mmap]:
             yield mapped
         finally:
             _close(mapped)
-
-
-def read_array(path: str) -> NDArray[Any]:
-    """Read one array from a .npy file.
-
-    Raises:
-        InputError: it is not one.
-        OSError: it cannot be read.
-    """
-    try:
-        with Path(path).open("rb") as stream:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, EOFError, SyntaxError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
-    if not isinstance(array, np.ndarray):
-        raise InputError(f"{path} is not a NumPy array file (.npy)")
-    return array
 
 
 def write_array(path: str, array: NDArray[Any]) -> None:

@@ -77,7 +77,7 @@ def attribute_errors(
     if _same_order(source.model, theirs):
         return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
     stated, header = other.stated_errors, other.header
-    if header is None or stated is None or stated.refitted or not len(theirs):
+    if header is None or stated is None or not len(theirs):
         return None
     bounds = {record.measure: record.max for record in stated.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.files import read_array
 from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
@@ -18,7 +19,6 @@ from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
 from csplat_tools.files.scenes import LoadedModel, load_model
-from csplat_tools.files.streams import read_array
 from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors
 from csplat_tools.views import Colour, DataOptions, find_view_set
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from csplat.decoder import decode_scene
+from csplat.files import read_array
 from csplat.ply import read_ply
 from csplat_conformance.stated import Proof, Source, prove
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import limits_for
-from csplat_tools.files.streams import mapped_csplat, ply_path, read_array
+from csplat_tools.files.streams import mapped_csplat, ply_path
 
 __all__ = ["Verified", "verify_file"]
 

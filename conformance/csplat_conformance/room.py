@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["may_be_stated", "room"]
+__all__ = ["least_true", "may_be_stated", "room"]
 
 _EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
 _ROUNDING = 1e-9  # SER-7: relative, sums in binary64 in another order
@@ -34,3 +34,13 @@ def may_be_stated(measure: str, stated: float, found: float, reach: float) -> bo
     """
     open_ = room(measure, found, reach)
     return found - open_ <= stated <= found * (1.0 + _EXCESS) + _EXCESS_FLOOR + open_
+
+
+def least_true(measure: str, stated: float) -> float:
+    """Return what an error is at least, of which this may be stated; of centres that are not far from 0.
+
+    Args:
+        measure: of the registry of stated errors.
+        stated: maximum or rms, as the file has it.
+    """
+    return max(0.0, (stated - _EXCESS_FLOOR - room(measure, 0.0, 0.0)) / (1.0 + _EXCESS + _ROUNDING))
