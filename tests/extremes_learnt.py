@@ -18,11 +18,11 @@ from csplat_render.virtual import virtual_cameras
 from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
 from csplat_tools.optimise.target import Target
 from csplat_trainer.data import DataSet
-from csplat_trainer.finetune import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import TrainResult
 from csplat_trainer.pictures import Picture
+from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
 
 COPIES = 2_000  # of a million: learning looks at each splat again and again, and all are alike
 SMALL = (160, 120)

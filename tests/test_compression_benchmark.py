@@ -25,7 +25,7 @@ from csplat_bench.compression.controls import Unquantised, eight_bits
 from csplat_bench.compression.memory import finetuned
 from csplat_bench.compression.sizes import Book, books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 from csplat_bench.compression.tables import tables
-from csplat_trainer.finetune import FinetuneOptions, finetune, renders_of, split_views
+from csplat_trainer.tuning import FinetuneOptions, finetune, renders_of, split_views
 
 BLACK = np.zeros(3, np.float32)
 BOOKS = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)

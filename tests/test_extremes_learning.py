@@ -37,12 +37,12 @@ from csplat_tools.optimise.simplify import simplify
 from csplat_tools.optimise.target import Target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
-from csplat_trainer.finetune import finetune, renders_of, split_views
 from csplat_trainer.loop import train
 from csplat_trainer.parameters import Parameters, from_model
 from csplat_trainer.resume import adapt
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.tuning import finetune, renders_of, split_views
 
 pytestmark = pytest.mark.extremes
 

@@ -26,10 +26,10 @@ from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.training.report import ply_splat_bytes
-from csplat_trainer.finetune import FinetuneOptions, View, Views, finetune, renders_of, split_views
-from csplat_trainer.finetune.rate import Costs, colour_integers_of, cost_slopes
-from csplat_trainer.finetune.state import TunedScene, sum_by_entry, sum_by_entry_twin
 from csplat_trainer.loss import PhotometricLoss
+from csplat_trainer.tuning import FinetuneOptions, View, Views, finetune, renders_of, split_views
+from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
+from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
 
 BLACK = np.zeros(3, np.float32)
 QUICK = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, log_every=10)

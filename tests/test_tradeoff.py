@@ -25,14 +25,14 @@ from csplat.errors import InputError
 from csplat_render.cameras import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.files.scenes import without_bands
-from csplat_tools.tradeoff.measuring import StageClock, fetched_bytes
-from csplat_tools.tradeoff.options import USUAL, Wanted, parse_what
-from csplat_tools.tradeoff.page import make_page, shown_points
-from csplat_tools.tradeoff.plots import PLOTS, draw_plot
-from csplat_tools.tradeoff.points import Failure, pareto_front
-from csplat_tools.tradeoff.running import measure_tradeoff
-from csplat_tools.tradeoff.setting import read_setting
-from csplat_tools.tradeoff.tables import format_tradeoff
+from csplat_tools.tradeoffs.measuring import StageClock, fetched_bytes
+from csplat_tools.tradeoffs.options import USUAL, Wanted, parse_what
+from csplat_tools.tradeoffs.page import make_page, shown_points
+from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
+from csplat_tools.tradeoffs.points import Failure, pareto_front
+from csplat_tools.tradeoffs.running import measure_tradeoff
+from csplat_tools.tradeoffs.setting import read_setting
+from csplat_tools.tradeoffs.tables import format_tradeoff
 
 POINT = {
     "name", "family", "error", "settings", "size_bytes", "sha256", "bytes_per_source_splat", "ratio", "splats",
@@ -198,7 +198,7 @@ def test_codebooks_are_fetched_with_their_layers():
 
 def test_stages_are_timed_by_their_names(monkeypatch):
     now = iter([0.0, 1.0, 3.0, 3.5, 4.5, 9.0])
-    monkeypatch.setattr("csplat_tools.tradeoff.measuring.time.perf_counter", lambda: next(now))
+    monkeypatch.setattr("csplat_tools.tradeoffs.measuring.time.perf_counter", lambda: next(now))
     heard = []
     clock = StageClock()
     told = clock.listening(lambda stage, done: heard.append((stage, done)))
@@ -326,13 +326,13 @@ def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
     def fail(*_args, **_options):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("csplat_tools.tradeoff.sweep.encode_with_report", fail)
+    monkeypatch.setattr("csplat_tools.tradeoffs.sweep.encode_with_report", fail)
     with pytest.raises(RuntimeError, match="a defect"):
         measure_tradeoff(setting, Wanted(what=("presets",)))
 
 
 def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
-    from csplat_tools.tradeoff import sweep
+    from csplat_tools.tradeoffs import sweep
 
     whole = sweep.encode_with_report
 

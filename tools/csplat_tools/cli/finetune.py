@@ -34,7 +34,7 @@ _MOST_ASIDE = 16  # but no more than these
 @command(
     one_of=(("data", "itself"), ("data", "views"), ("data", "view_size")),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
-    settings=(ENCODER, "csplat_trainer.finetune.options:FinetuneOptions"),
+    settings=(ENCODER, "csplat_trainer.tuning.options:FinetuneOptions"),
 )
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
@@ -103,8 +103,8 @@ def finetune(
     from csplat_render.lpips import load_lpips
     from csplat_tools.training import finetune as tuning
     from csplat_tools.training.report import format_report
-    from csplat_trainer.finetune.options import FinetuneOptions
     from csplat_trainer.outputs import Outputs
+    from csplat_trainer.tuning.options import FinetuneOptions
 
     if views.data is None and not itself:
         raise typer.BadParameter("wanted one of --data and --self")

@@ -13,7 +13,7 @@ from csplat_tools.cli.parsing import parse_mode
 from csplat_tools.cli.view_options import Views
 from csplat_tools.files.extras import need_pictures, need_plots, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM
-from csplat_tools.tradeoff.options import FAMILIES, Wanted, parse_what
+from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
 
 __all__ = ["tradeoff"]
 
@@ -81,10 +81,10 @@ def tradeoff(
         need_plots()
     prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
     need_pictures()
-    from csplat_tools.tradeoff.page import check_plots, write_page, write_plots
-    from csplat_tools.tradeoff.running import measure_tradeoff
-    from csplat_tools.tradeoff.setting import read_setting
-    from csplat_tools.tradeoff.tables import format_tradeoff
+    from csplat_tools.tradeoffs.page import check_plots, write_page, write_plots
+    from csplat_tools.tradeoffs.running import measure_tradeoff
+    from csplat_tools.tradeoffs.setting import read_setting
+    from csplat_tools.tradeoffs.tables import format_tradeoff
 
     check_plots(plots, force=out.force)
     setting = read_setting(

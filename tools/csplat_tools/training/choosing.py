@@ -20,9 +20,9 @@ from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optimise.target import Target
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
-from csplat_trainer.finetune import View, Views, renders_of, split_views
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.tuning import View, Views, renders_of, split_views
 
 __all__ = ["Chosen", "choose_splats", "training_views"]
 

@@ -22,8 +22,8 @@ from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.views import ViewSet
-from csplat_trainer.finetune import FinetuneOptions, TuningStep, Views, finetune
 from csplat_trainer.outputs import Outputs
+from csplat_trainer.tuning import FinetuneOptions, TuningStep, Views, finetune
 
 __all__ = [
     "BYTE_COST",

@@ -12,7 +12,7 @@ from typing import Any
 from csplat.files import atomic_writer
 from csplat_bench.common.command import tell
 from csplat_tools.files.console import format_table
-from csplat_tools.tradeoff.machine import describe_machine
+from csplat_tools.tradeoffs.machine import describe_machine
 
 __all__ = ["Machine", "Table", "describe", "laid_out", "machines", "optional", "table", "tell_machine", "write_json"]
 

@@ -38,7 +38,7 @@ from csplat_bench.compression.tables import tables
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
-from csplat_trainer.finetune import FinetuneOptions
+from csplat_trainer.tuning import FinetuneOptions
 
 _SCENES = ",".join(CAPTURES)
 _PARTS = (*KINDS, "memory")

@@ -14,7 +14,7 @@ from csplat.model import SplatModel
 from csplat_bench.common.measuring import timed
 from csplat_bench.compression.rows import Control
 from csplat_bench.compression.runs import Bench
-from csplat_trainer.finetune import finetune
+from csplat_trainer.tuning import finetune
 
 __all__ = ["Unquantised", "control", "eight_bits"]
 

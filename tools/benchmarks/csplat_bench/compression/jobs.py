@@ -13,8 +13,8 @@ from csplat_bench.compression.ablation import ablation
 from csplat_bench.compression.controls import control, eight_bits
 from csplat_bench.compression.rows import Facts, Row
 from csplat_bench.compression.runs import Bench
-from csplat_trainer.finetune import FinetuneOptions, finetune
 from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.tuning import FinetuneOptions, finetune
 
 __all__ = ["KINDS", "Lists", "facts_of", "find_jobs", "variants", "warm"]
 

@@ -28,7 +28,7 @@ from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.finetune import Clock
 from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
-from csplat_trainer.finetune import FinetuneOptions, Views, finetune
+from csplat_trainer.tuning import FinetuneOptions, Views, finetune
 
 __all__ = ["Bench", "Tuned"]
 

@@ -31,7 +31,7 @@ from csplat_render.judge import Judge
 from csplat_tools.files.scenes import without_bands
 from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.optimise.target import Target
-from csplat_tools.tradeoff.measuring import fetched_bytes
+from csplat_tools.tradeoffs.measuring import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras, find_view_set
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k,statue"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat_render.arrays import Gradients
 from csplat_render.jit import parallel_kernel
-from csplat_trainer.finetune.rate import Costs, Stored
 from csplat_trainer.parameters import Parameters, Splats, adam_step, sigmoid
+from csplat_trainer.tuning.rate import Costs, Stored
 
 __all__ = ["TunedScene", "sum_by_entry", "sum_by_entry_twin"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from csplat_render.metrics import psnr
 from csplat_tools.files.pictures import panels
-from csplat_tools.tradeoff.points import Shown
+from csplat_tools.tradeoffs.points import Shown
 
 __all__ = ["AMPLIFICATION", "WorstView", "as_data_uri"]
 

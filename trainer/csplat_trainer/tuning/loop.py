@@ -17,13 +17,13 @@ from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasterise import Rasteriser, Splats
-from csplat_trainer.finetune.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
-from csplat_trainer.finetune.options import FinetuneOptions
-from csplat_trainer.finetune.rate import Costs
-from csplat_trainer.finetune.state import TunedScene
-from csplat_trainer.finetune.views import View, Views
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
+from csplat_trainer.tuning.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
+from csplat_trainer.tuning.options import FinetuneOptions
+from csplat_trainer.tuning.rate import Costs
+from csplat_trainer.tuning.state import TunedScene
+from csplat_trainer.tuning.views import View, Views
 
 __all__ = ["FinetuneResult", "TuningStep", "finetune"]
 

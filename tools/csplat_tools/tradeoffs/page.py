@@ -8,13 +8,13 @@ from html import escape
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.pictures import check_folder
 from csplat_tools.files.streams import write_bytes
-from csplat_tools.tradeoff.measuring import DECODE_RUNS
-from csplat_tools.tradeoff.page_parts import SCRIPT, STYLE, policy
-from csplat_tools.tradeoff.plots import PLOTS, draw_plot
-from csplat_tools.tradeoff.points import Point
-from csplat_tools.tradeoff.running import Tradeoff
-from csplat_tools.tradeoff.showing import AMPLIFICATION, as_data_uri
-from csplat_tools.tradeoff.tables import columns_of, mode_rows, partial_rows, views_line
+from csplat_tools.tradeoffs.measuring import DECODE_RUNS
+from csplat_tools.tradeoffs.page_parts import SCRIPT, STYLE, policy
+from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
+from csplat_tools.tradeoffs.points import Point
+from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.tradeoffs.showing import AMPLIFICATION, as_data_uri
+from csplat_tools.tradeoffs.tables import columns_of, mode_rows, partial_rows, views_line
 
 __all__ = ["check_plots", "make_page", "write_page", "write_plots"]
 

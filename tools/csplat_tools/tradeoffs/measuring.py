@@ -20,10 +20,10 @@ from csplat_render.judge import renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_tools.files.console import Progress
 from csplat_tools.inspect.info import byte_shares
-from csplat_tools.tradeoff.points import ModeTime, Partial, Point, TriedFile
-from csplat_tools.tradeoff.setting import Setting
-from csplat_tools.tradeoff.showing import WorstView
-from csplat_tools.tradeoff.sweep import Candidate
+from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile
+from csplat_tools.tradeoffs.setting import Setting
+from csplat_tools.tradeoffs.showing import WorstView
+from csplat_tools.tradeoffs.sweep import Candidate
 from csplat_tools.views import evenly
 
 __all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer", "fetched_bytes"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from csplat_tools.tradeoff.points import Point
-from csplat_tools.tradeoff.running import Tradeoff
-from csplat_tools.tradeoff.svg import INK, drawn, hover
+from csplat_tools.tradeoffs.points import Point
+from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.tradeoffs.svg import INK, drawn, hover
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

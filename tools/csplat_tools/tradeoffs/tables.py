@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from csplat_tools.files.console import format_bytes, format_table
-from csplat_tools.tradeoff.points import Partial, Point
-from csplat_tools.tradeoff.running import Tradeoff
+from csplat_tools.tradeoffs.points import Partial, Point
+from csplat_tools.tradeoffs.running import Tradeoff
 
 __all__ = ["MARK", "Column", "columns_of", "format_tradeoff", "mode_rows", "partial_rows", "views_line"]
 

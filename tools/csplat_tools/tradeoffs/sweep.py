@@ -13,9 +13,9 @@ from csplat_tools.files.console import Progress, format_bytes
 from csplat_tools.optimise.optimiser import optimise
 from csplat_tools.optimise.target import Target
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
-from csplat_tools.tradeoff.options import Wanted
-from csplat_tools.tradeoff.points import TriedFile
-from csplat_tools.tradeoff.setting import Setting
+from csplat_tools.tradeoffs.options import Wanted
+from csplat_tools.tradeoffs.points import TriedFile
+from csplat_tools.tradeoffs.setting import Setting
 from csplat_tools.training.finetune import (
     BYTE_COST,
     LEARNING_FACTOR,
@@ -28,7 +28,7 @@ from csplat_tools.training.finetune import (
 )
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
-from csplat_trainer.finetune import FinetuneOptions, TuningStep
+from csplat_trainer.tuning import FinetuneOptions, TuningStep
 
 __all__ = ["Candidate", "candidates"]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from csplat_trainer.finetune.loop import FinetuneResult, TuningStep, finetune
-from csplat_trainer.finetune.options import FinetuneOptions
-from csplat_trainer.finetune.views import View, Views, renders_of, split_views
+from csplat_trainer.tuning.loop import FinetuneResult, TuningStep, finetune
+from csplat_trainer.tuning.options import FinetuneOptions
+from csplat_trainer.tuning.views import View, Views, renders_of, split_views
 
 __all__ = ["FinetuneOptions", "FinetuneResult", "TuningStep", "View", "Views", "finetune", "renders_of", "split_views"]

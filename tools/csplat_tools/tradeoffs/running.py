@@ -10,12 +10,12 @@ from csplat.errors import CsplatError, InputError
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
 from csplat_tools.files.console import Progress, format_bytes, note, progress_bar
-from csplat_tools.tradeoff.machine import describe_machine
-from csplat_tools.tradeoff.measuring import DECODE_RUNS, Measurer
-from csplat_tools.tradeoff.options import Wanted
-from csplat_tools.tradeoff.points import Failure, ModeTime, Point, pareto_front
-from csplat_tools.tradeoff.setting import Setting
-from csplat_tools.tradeoff.sweep import Candidate, candidates
+from csplat_tools.tradeoffs.machine import describe_machine
+from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
+from csplat_tools.tradeoffs.options import Wanted
+from csplat_tools.tradeoffs.points import Failure, ModeTime, Point, pareto_front
+from csplat_tools.tradeoffs.setting import Setting
+from csplat_tools.tradeoffs.sweep import Candidate, candidates
 
 __all__ = ["Tradeoff", "estimated_seconds", "measure_tradeoff"]
 
