@@ -70,7 +70,7 @@ class SplatModel:
         cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
             with OpenCV axes, pixel centres at +0.5; `None` where there are none.
         metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str),
-            `training` (see `csplat.training`).
+            `training` (see `csplat.training`), `up` (see `csplat.upright`).
         extra: further columns by name, each [N], integer or floating.
 
     Raises:

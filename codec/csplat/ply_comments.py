@@ -11,6 +11,7 @@ from typing import Any
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.training import TRAINING, TrainedOn
+from csplat.upright import UP, unit_up, up_of
 
 __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
@@ -26,7 +27,7 @@ class SceneFacts:
         origin: `None` where no comment names one.
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments`, the lines that are not ours; `licence`; `training`.
+        metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -74,6 +75,9 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
         lines.append(f"{_PREFIX} {key} {' '.join(repr(value) for value in model.origin)}")
     if model.coordinate_system != UNSPECIFIED:
         lines.append(f"{_PREFIX} coordinate_system {model.coordinate_system}")
+    up = up_of(model.metadata)
+    if up is not None:
+        lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in up)}")
     if model.unit_metres is not None:
         lines.append(f"{_PREFIX} unit_metres {model.unit_metres!r}")
     if model.antialiased:
@@ -96,6 +100,8 @@ def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
         facts.origin, facts.origin_is_added = (x, y, z), key == "absolute_origin"
     elif key == "coordinate_system" and len(values) == 1:
         facts.coordinate_system = values[0]
+    elif key == UP:
+        facts.metadata[UP] = _up(values)
     elif key == "unit_metres":
         (facts.unit_metres,) = _numbers(key, values, 1)
     elif key == "antialiased" and not values:
@@ -107,6 +113,14 @@ def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
     else:
         return False
     return True
+
+
+def _up(values: Sequence[str]) -> list[float]:
+    numbers = _numbers(UP, values, 3)
+    try:
+        return list(unit_up(numbers))
+    except InputError as error:
+        raise InputError(f"the header comment {' '.join((_PREFIX, UP, *values))!r}: {error}") from None
 
 
 def _training(comment: str) -> TrainedOn:

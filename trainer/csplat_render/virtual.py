@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.model import UNSPECIFIED, SplatModel
+from csplat.model import SplatModel
+from csplat.upright import up_of
 from csplat_render.camera import DEFAULT_NEAR, Camera
 from csplat_render.cameras import direction, intrinsics, look_at, orbit
 from csplat_render.cloud import (
@@ -254,12 +255,12 @@ def _far_apart(points: F64, first: int, count: int) -> list[int]:
 
 def _up(model: SplatModel, half: F64) -> F64:
     """Which way is up: what the scene says; the short axis of a flat one; else −y, as in a PLY."""
+    said = up_of(model.metadata, model.coordinate_system)
+    if said is not None:
+        named: F64 = np.array(said)
+        named /= np.sqrt(np.sum(named**2))  # six digits are not unit length
+        return named
     up = np.zeros(3)
-    if model.coordinate_system != UNSPECIFIED:
-        letters = model.coordinate_system
-        axis = next(i for i, letter in enumerate(letters) if letter in "UD")
-        up[axis] = 1.0 if letters[axis] == "U" else -1.0
-        return up
     order = np.argsort(half, kind="stable")
     axis = int(order[0]) if half[order[0]] < _FLAT * half[order[1]] else 1
     up[axis] = -1.0 if axis == 1 else 1.0

@@ -10,6 +10,7 @@ import typer
 
 from csplat.decoder import StatedErrors
 from csplat.training import TRAINING, TrainedOn
+from csplat.upright import UP, up_of
 from csplat_tools.cli.options import Output, command
 from csplat_tools.files.console import format_bytes, format_table
 from csplat_tools.files.streams import mapped_csplat
@@ -54,6 +55,8 @@ def _format(facts: FileFacts) -> str:
     metadata = dict(facts.metadata or {})
     if TrainedOn.of(metadata) is not None:  # in words above
         del metadata[TRAINING]
+    if up_of(metadata) is not None:
+        del metadata[UP]
     parts += [
         f"{title}  {json.dumps(value, sort_keys=True)}"
         for title, value in (("options ", facts.options), ("metadata", metadata))
@@ -67,10 +70,12 @@ def _scene(facts: FileFacts) -> str:
     average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
     version = f"csplat {header.version[0]}.{header.version[1]}"
     flags = [name for name in ("antialiased", "flat") if getattr(header, name)]
+    up = up_of(facts.metadata or {}, header.coordinate_system)
     lines = [
         f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}",
         f"splats       {header.splat_count}, SH degree {header.sh_degree}",
         f"axes         {header.coordinate_system}",
+        f"up           {'unknown' if up is None else ' '.join(f'{value:g}' for value in up)}",
         f"unit         {'unknown' if header.unit_metres is None else f'{header.unit_metres:g} m'}",
         f"origin       {' '.join(f'{value:.17g}' for value in header.origin)}",
         f"flags        {', '.join(flags) or 'none'}",

@@ -18,6 +18,7 @@ from csplat.decoder import (
     read_options,
     read_stated_errors,
 )
+from csplat.upright import up_of
 from csplat_tools.files.console import finite
 from csplat_tools.inspect.blocks import AttributeUse, attribute_use
 
@@ -121,6 +122,7 @@ class FileFacts:
     def as_json(self) -> dict[str, Any]:
         """Everything, JSON-compatible."""
         header, tiles = self.header, self.header.tiles
+        up = up_of(self.metadata or {}, header.coordinate_system)
         largest = {"max_scale": finite(max(tile.max_scale for tile in tiles))} if tiles else {}
         return {
             "format": f"csplat {header.version[0]}.{header.version[1]}",
@@ -130,6 +132,7 @@ class FileFacts:
             "splats": header.splat_count,
             "sh_degree": header.sh_degree,
             "coordinate_system": header.coordinate_system,
+            "up": None if up is None else list(up),
             "unit_metres": header.unit_metres,
             "origin": list(header.origin),
             "antialiased": header.antialiased,

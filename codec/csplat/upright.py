@@ -1,0 +1,91 @@
+"""Which way is up in a scene, and how it says so (spec 5.4).
+
+The axes of a scene say where +x, +y and +z point; they can say up only along one of these. The member `up` of the
+metadata names any direction, and comes before them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from csplat.errors import InputError
+from csplat.model import UNSPECIFIED, SplatModel
+
+__all__ = ["UP", "Direction", "unit_up", "up_of", "up_of_axes", "with_up"]
+
+Direction = tuple[float, float, float]
+
+#: The key of the metadata under which it stands.
+UP = "up"
+
+_DIGITS = 6  # a millionth of a radian: the same text on machines whose last bits differ
+_UNIT = 1e-5  # how far from 1 the length of a unit vector of six digits may lie
+_CONTRADICTS = math.cos(math.radians(45.0))  # beyond that angle another letter of the axes is up
+
+
+def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> Direction | None:
+    """The direction that is up by what a scene says; `None` where it says nothing, or nothing that is understood.
+
+    Args:
+        metadata: of the scene; its `up` comes first.
+        coordinate_system: as in `SplatModel`.
+    """
+    try:
+        return unit_up(metadata[UP]) if UP in metadata else up_of_axes(coordinate_system)
+    except InputError:
+        return up_of_axes(coordinate_system)
+
+
+def up_of_axes(coordinate_system: str) -> Direction | None:
+    """The axis, or its opposite, that three letters call up; `None` where there are none."""
+    if coordinate_system == UNSPECIFIED:
+        return None
+    x, y, z = ({"U": 1.0, "D": -1.0}.get(letter, 0.0) for letter in coordinate_system)
+    return x, y, z
+
+
+def unit_up(values: object) -> Direction:
+    """A direction at unit length, to six digits.
+
+    Args:
+        values: three finite numbers, not all 0.
+
+    Raises:
+        InputError: they are something else.
+    """
+    numbers = list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
+    if len(numbers) == 3 and all(type(value) in (int, float) and abs(value) < math.inf for value in numbers):
+        largest = max(abs(value) for value in numbers)
+        if largest > 0.0:
+            parts = [value / largest for value in numbers]  # squares of large ones are infinite
+            length = math.hypot(*parts)
+            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # what it said stays as it is
+            x, y, z = (round(part / length, _DIGITS) + 0.0 for part in parts)
+            return x, y, z
+    raise InputError(f"{UP} is {values!r}, wanted three finite numbers, not all 0")
+
+
+def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: str | None = None) -> SplatModel:
+    """The same scene, which says another direction or other axes; what that contradicts it no longer says.
+
+    Args:
+        model: the scene.
+        up: three finite numbers, not all 0. Axes of which another one is up go, where none are given.
+        coordinate_system: as in `SplatModel`. An `up` that was there goes, where none is given.
+
+    Raises:
+        InputError: one of them says nothing.
+    """
+    metadata = dict(model.metadata)
+    letters = model.coordinate_system if coordinate_system is None else coordinate_system
+    if coordinate_system is not None:
+        metadata.pop(UP, None)
+    if up is not None:
+        metadata[UP] = list(unit_up(up))
+        before = up_of_axes(letters) if coordinate_system is None else None
+        if before is not None and sum(a * b for a, b in zip(before, metadata[UP], strict=True)) < _CONTRADICTS:
+            letters = UNSPECIFIED
+    return replace(model, metadata=metadata, coordinate_system=letters)
