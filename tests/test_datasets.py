@@ -1,7 +1,6 @@
 """Readers of data sets, on tiny ones made here and on the shared ones."""
 
 import json
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -15,143 +14,48 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 
 # Importing them needs what is looked for above.
 from PIL import ImageFile  # noqa: E402
+from posed_sets import (  # noqa: E402
+    COLOURS,
+    POINTS,
+    H,
+    W,
+    assert_dots_are_where_points_fall,
+    cameras,
+    to_opengl,
+    write_blender,
+    write_colmap,
+    write_colmap_set,
+    write_picture,
+    write_transforms,
+)
 
-from csplat_render.cameras import intrinsics, look_at  # noqa: E402
 from csplat_trainer.data import load  # noqa: E402
 from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
 from csplat_trainer.data.dataset import Lens  # noqa: E402
 from csplat_trainer.data.pixels import _distort, undistorted_lens  # noqa: E402
 
-W, H = 48, 32
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-POINTS = np.array([[0.05, 0.03, -0.04], [0.4, 0.1, 0.2], [-0.3, 0.2, -0.1]])
-COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]])
-
-
-def cameras(count, width=W, height=H):
-    """Around the origin, z up."""
-    K = intrinsics(width, height, 50.0)
-    angles = np.linspace(0.3, 5.0, count)
-    return [look_at([3 * np.cos(a), 3 * np.sin(a), 1.0], [0, 0, 0], [0, 0, 1], K, width, height) for a in angles]
-
-
-def write_picture(path, camera, mode="RGB", scale=1):
-    """Black, with a dot where each point falls."""
-    width, height = camera.W // scale, camera.H // scale
-    pixels = np.zeros((height, width, len(mode)), np.uint8)
-    for point, colour in zip(POINTS, COLOURS, strict=True):
-        c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
-        u, v = (camera.K @ (c / c[2]))[:2] / scale
-        pixels[int(v), int(u), :3] = colour
-        if mode == "RGBA":
-            pixels[int(v), int(u), 3] = 255
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels, mode).save(path)
-
-
-def assert_dots_are_where_points_fall(pictures):
-    for picture in pictures:
-        camera = picture.camera
-        for point, colour in zip(POINTS, COLOURS, strict=True):
-            c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
-            u, v = (camera.K @ (c / c[2]))[:2]
-            assert (picture.pixels[int(v), int(u), :3] == colour).all()
-
-
-def to_opengl(camera):
-    return (np.linalg.inv(camera.viewmat) @ FLIP).tolist()
-
 
 @pytest.fixture
 def blender(tmp_path):
-    for part, count in (("train", 5), ("test", 3)):
-        frames = []
-        for i, camera in enumerate(cameras(count)):
-            write_picture(tmp_path / part / f"r_{i}.png", camera, "RGBA")
-            frames.append({"file_path": f"./{part}/r_{i}", "transform_matrix": to_opengl(camera)})
-        document = {"camera_angle_x": float(np.radians(50.0)), "frames": frames}
-        (tmp_path / f"transforms_{part}.json").write_text(json.dumps(document))
+    write_blender(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
 def ngp(tmp_path):
-    frames = []
-    for i, camera in enumerate(cameras(10)):
-        if i != 4:
-            write_picture(tmp_path / "images" / f"{i:04}.png", camera)
-        frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": to_opengl(camera)})
-    K = intrinsics(W, H, 50.0)
-    intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
-    document = {**intrinsic, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    write_transforms(tmp_path, missing=(4,))
     return tmp_path
-
-
-def quaternion(rotation):
-    """w x y z (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    lower = [
-        [xx + yy + zz, 0, 0, 0],
-        [zy - yz, xx - yy - zz, 0, 0],
-        [xz - zx, yx + xy, yy - xx - zz, 0],
-        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
-    ]
-    return np.linalg.eigh(np.array(lower))[1][:, -1]
-
-
-MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}
-
-
-def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H):
-    """A sparse model of cameras and the three points."""
-    folder.mkdir(parents=True, exist_ok=True)
-    K = shots[0].K
-    parameters = parameters or [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    poses = [(*quaternion(c.viewmat[:3, :3]), *c.viewmat[:3, 3]) for c in shots]
-    names = [f"im {i:03}.png" for i in range(len(shots))]
-    if text:
-        words = " ".join(str(float(p)) for p in parameters)
-        (folder / "cameras.txt").write_text(f"# comment\n7 {model} {width} {height} {words}\n")
-        lines = [
-            f"{i + 1} {' '.join(str(float(v)) for v in pose)} 7 {name}\n{'1.5 2.5 -1' if i % 2 else ''}\n"
-            for i, (pose, name) in enumerate(zip(poses, names, strict=True))
-        ]
-        (folder / "images.txt").write_text("# comment\n# another\n" + "".join(lines))
-        rows = [
-            f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 0 2 0\n"
-            for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
-        ]
-        (folder / "points3D.txt").write_text("# comment\n" + "".join(rows))
-        return
-    data = struct.pack("<QiiQQ", 1, 7, MODELS[model], width, height) + struct.pack(f"<{len(parameters)}d", *parameters)
-    (folder / "cameras.bin").write_bytes(data)
-    data = struct.pack("<Q", len(shots))
-    for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
-        data += struct.pack("<i7di", i + 1, *pose, 7) + name.encode() + b"\0"
-        data += struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
-    (folder / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(POINTS))
-    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
-        data += struct.pack("<Q3d3BdQ", i, *point, *map(int, colour), 0.5, i) + struct.pack("<ii", 1, 2) * i
-    (folder / "points3D.bin").write_bytes(data)
 
 
 @pytest.fixture
 def colmap_set(tmp_path):
-    shots = cameras(9)
-    for i, camera in enumerate(shots):
-        write_picture(tmp_path / "images" / f"im {i:03}.png", camera)
-    write_colmap(tmp_path / "sparse" / "0", shots)
+    write_colmap_set(tmp_path)
     return tmp_path
 
 
 @pytest.fixture(params=["binary", "text"])
 def colmap(tmp_path, request):
-    shots = cameras(9)
-    for i, camera in enumerate(shots):
-        write_picture(tmp_path / "images" / f"im {i:03}.png", camera)
-    write_colmap(tmp_path / "sparse" / "0", shots, text=request.param == "text")
+    write_colmap_set(tmp_path, text=request.param == "text")
     return tmp_path
 
 
@@ -453,6 +357,15 @@ def test_a_set_says_how_it_was_read(request, kind, options, expected):
     assert expected == {name: said[name] for name in expected}
     assert {"background", "near", *expected, *(("test_every",) if kind != "blender" else ())} == set(said)
     assert data.coordinate_system == ("RFU" if kind == "blender" else "unspecified")
+    assert (0, 0, 1) == data.up
+    assert any("up is 0 0 1 by the cameras" in line for line in data.report) == (kind != "blender")
+
+
+def test_a_blender_set_in_other_coordinates_does_not_get_the_axes_of_blender(tmp_path):
+    write_blender(tmp_path, up=(0, -1, 0))
+    data = load(tmp_path)
+    assert ("unspecified", (0, -1, 0)) == (data.coordinate_system, data.up)
+    assert any("mostly have other axes" in line for line in data.report)
 
 
 def test_refuses_text_that_is_no_json(tmp_path):

@@ -14,10 +14,12 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+import typer
 from interrupts import heed_interrupts
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
+from csplat_tools.cli.view_options import Upright
 from csplat_tools.present.server import byte_range, open_server
 from csplat_tools.present.viewing import open_scene, view_wishes
 from csplat_tools.present.webroot import web_files
@@ -206,7 +208,7 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
     entry = {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
     cameras = tmp_path / "cameras.json"
     cameras.write_text(json.dumps([entry, entry]))
-    with served(scene_path, wishes=view_wishes(str(cameras), None)) as server:
+    with served(scene_path, wishes=view_wishes(str(cameras))) as server:
         query = parse_qs(urlsplit(ask(server, "/")[1]["Location"]).query)
         status, headers, body = ask(server, query["camera"][0])
         assert (200, "application/json") == (status, headers["Content-Type"])
@@ -215,8 +217,28 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
 
 @pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
 def test_axes_that_are_none_are_refused(axes):
-    with pytest.raises(InputError, match="wanted one of R and L"):
-        view_wishes(None, axes)
+    with pytest.raises(typer.BadParameter, match="wanted three letters"):
+        Upright(axes=axes).parse()
+
+
+@pytest.mark.parametrize("up", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"])
+def test_directions_that_are_none_are_refused(up):
+    with pytest.raises(typer.BadParameter, match="three numbers as"):
+        Upright(up=up).parse()
+
+
+@pytest.mark.parametrize(
+    ("words", "wishes"),
+    [
+        ({}, {}),
+        ({"axes": "RFU"}, {"axes": "RFU"}),
+        ({"up": "-y"}, {"up": "0,-1,0"}),
+        ({"up": "+Z"}, {"up": "0,0,1"}),
+        ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
+    ],
+)
+def test_the_page_is_told_what_the_user_says_of_up(words, wishes):
+    assert wishes == view_wishes(None, Upright(**words).upright())
 
 
 def refused(path):
@@ -331,7 +353,7 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
     [
         (["absent.csplat"], 1, "No such file"),
         (["SAMPLE", "--preset", "tiny"], 2, "preset is 'tiny'"),
-        (["SAMPLE", "--axes", "RRR"], 1, "the axes are 'RRR'"),
+        (["SAMPLE", "--axes", "RRR"], 2, "the axes are 'RRR'"),
         (["SAMPLE", "--cameras", "absent.json"], 1, "absent.json"),
         (["SAMPLE", "--port", "70000"], 2, "65535"),
     ],

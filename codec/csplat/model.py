@@ -22,6 +22,7 @@ __all__ = [
     "QUAT_LENGTH_TOLERANCE",
     "UNSPECIFIED",
     "SplatModel",
+    "check_axes",
     "normalise_quats",
     "sh_degree_of",
 ]
@@ -111,7 +112,8 @@ class SplatModel:
         object.__setattr__(self, "origin", _checked_origin(self.origin))
         if self.means_double is not None:
             _check_doubles(self.means, self.means_double, self.origin)
-        _check_coordinate_system(self.coordinate_system)
+        if self.coordinate_system != UNSPECIFIED:
+            check_axes(self.coordinate_system)
         unit = self.unit_metres
         if unit is not None and not (math.isfinite(unit) and unit > 0):
             raise InputError(f"unit_metres is {unit}, wanted a length above 0 or None")
@@ -259,11 +261,12 @@ def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float])
         raise InputError("means_double is not the centres of which means are the float32 less the origin")
 
 
-def _check_coordinate_system(letters: str) -> None:
-    if letters == UNSPECIFIED:
-        return
+def check_axes(letters: str) -> None:
+    """Refuse what is no directions of +x, +y and +z.
+
+    Raises:
+        InputError: they are not three letters, one each of R/L, U/D and F/B.
+    """
     axes = {_AXIS_OF_LETTER.get(letter) for letter in letters}
     if len(letters) != 3 or axes != {"x", "y", "z"}:
-        raise InputError(
-            f"coordinate_system is {letters!r}, wanted {UNSPECIFIED!r} or three letters, one each of R/L, U/D and F/B"
-        )
+        raise InputError(f"the axes are {letters!r}, wanted three letters, one each of R/L, U/D and F/B, as RDF")

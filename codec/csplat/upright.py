@@ -73,12 +73,15 @@ def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: s
 
     Args:
         model: the scene.
-        up: three finite numbers, not all 0. Axes of which another one is up go, where none are given.
-        coordinate_system: as in `SplatModel`. An `up` that was there goes, where none is given.
+        up: three finite numbers, not all 0; `None`: what it says. Axes of which another one is up go, where none are
+            given.
+        coordinate_system: as in `SplatModel`; `None`: what it says. An `up` that was there goes, where none is given.
 
     Raises:
         InputError: one of them says nothing.
     """
+    if up is None and coordinate_system is None:
+        return model
     metadata = dict(model.metadata)
     letters = model.coordinate_system if coordinate_system is None else coordinate_system
     if coordinate_system is not None:

@@ -18,6 +18,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TRAINING
+from csplat.upright import with_up
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -253,7 +254,8 @@ class _Run:
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
         said = {TRAINING: self._data.trained_on(self._behind).as_json()}
-        return replace(model, coordinate_system=self._data.coordinate_system, metadata=said)
+        model = replace(model, metadata=said)
+        return with_up(model, self._data.up, self._data.coordinate_system)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
         return {

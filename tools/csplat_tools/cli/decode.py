@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli.options import Output, ShDegree, command
+from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import decode_file
 
 __all__ = ["decode"]
@@ -16,6 +17,7 @@ __all__ = ["decode"]
 def decode(
     source: Annotated[str, typer.Argument(metavar="IN.csplat", help="A .csplat file, or - for standard input.")],
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The file to write, or -.")],
+    upright: Upright,
     out: Output,
     sh_degree: ShDegree = None,
     absolute: Annotated[
@@ -37,6 +39,7 @@ def decode(
     out.check(output, inputs=(source,))
     with out.bar() as progress:
         model = decode_file(
-            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, progress=progress
-        )
+            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, facts=upright.upright(),
+            progress=progress,
+        )  # fmt: skip
     out.publish({"splats": len(model), "sh_degree": model.sh_degree})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 import typer
@@ -10,6 +10,7 @@ import typer
 from csplat.encoder import PRESETS, EncodeOptions
 from csplat_tools.cli.options import Group, chosen
 from csplat_tools.cli.settings import Settings
+from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import SceneOverrides
 
 __all__ = ["ENCODER", "Encoding", "Facts", "Preset", "check_preset"]
@@ -23,7 +24,7 @@ Preset = Annotated[str, typer.Option(metavar="|".join(PRESETS), help="Speed agai
 
 
 @dataclass(frozen=True)
-class Facts(Group):
+class Facts(Upright):
     """How a PLY is read, and what it may not say."""
 
     strict: Annotated[
@@ -32,12 +33,6 @@ class Facts(Group):
     keep_extra: Annotated[
         bool, typer.Option("--keep-extra", hidden=True, help="Carry columns that splats do not have, bit for bit.")
     ] = False
-    axes: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RDF", rich_help_panel=_SCENE, hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B."
-        ),
-    ] = None
     unit_metres: Annotated[
         float | None,
         typer.Option(metavar="METRES", rich_help_panel=_SCENE, hidden=True, help="Length of one scene unit."),
@@ -54,7 +49,7 @@ class Facts(Group):
 
     def read(self) -> SceneOverrides:
         """What the scene is told."""
-        return SceneOverrides(self.axes, self.unit_metres, self.antialiased, self.licence)
+        return replace(self.upright(), unit_metres=self.unit_metres, antialiased=self.antialiased, licence=self.licence)
 
 
 @dataclass(frozen=True)

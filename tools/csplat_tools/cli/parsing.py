@@ -7,7 +7,11 @@ import re
 
 import typer
 
-__all__ = ["parse_colour", "parse_decibels", "parse_mode", "parse_size"]
+from csplat.errors import InputError
+from csplat.model import check_axes
+from csplat.upright import Direction, unit_up
+
+__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_mode", "parse_size", "parse_up"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -40,6 +44,35 @@ def parse_colour(text: str) -> tuple[float, float, float]:
         raise typer.BadParameter(f"a colour is {text!r}, wanted red,green,blue from 0 to 1, or black, or white")
     red, green, blue = values
     return red, green, blue
+
+
+def parse_up(text: str) -> Direction:
+    """A direction from `y`, `-y`, or `0,-1,0.1`, at unit length.
+
+    Raises:
+        typer.BadParameter: it is something else.
+    """
+    found = re.fullmatch(r"([+-]?)([xyz])", text.strip().lower())
+    if found is not None:
+        x, y, z = ((-1.0 if found[1] == "-" else 1.0) * (found[2] == axis) + 0.0 for axis in "xyz")
+        return x, y, z
+    try:
+        return unit_up([float(part) for part in text.split(",")])
+    except (ValueError, InputError):
+        raise typer.BadParameter(f"up is {text!r}, wanted x, -x, y, -y, z, -z, or three numbers as 0,-1,0.1") from None
+
+
+def parse_axes(text: str) -> str:
+    """Three letters: directions of +x, +y and +z.
+
+    Raises:
+        typer.BadParameter: they are something else.
+    """
+    try:
+        check_axes(text)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    return text
 
 
 def parse_mode(text: str) -> str:

@@ -11,7 +11,7 @@ import typer
 
 from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_mode, parse_size
-from csplat_tools.cli.view_options import Split, Views, check_split
+from csplat_tools.cli.view_options import Split, Upright, Views, check_split
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
@@ -43,13 +43,14 @@ class _Views(Views):
     )
 
 
-@command()
+@command(needs={"up": ("orbit",), "axes": ("orbit",)})
 def render(
     source: Scene,
     output: Annotated[
         str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.webp, .gif, .png: a film.")
     ],
     views: _Views,
+    upright: Upright,
     out: Output,
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras on a circle around the scene.")
@@ -88,7 +89,7 @@ def render(
     shots = views.photographs()
     out.check(output if film else None, inputs=(source, views.cameras))
     need_renderer()
-    model = load_model(source).model
+    model = upright.upright().applied(load_model(source).model)
     if sh_degree is not None:
         model = without_bands(model, sh_degree)
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=check_split(split))

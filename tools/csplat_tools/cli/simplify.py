@@ -11,7 +11,7 @@ import typer
 from csplat_tools.cli.options import Output, Scene, Seed, SourceIndex, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
-from csplat_tools.cli.view_options import Views, Virtual
+from csplat_tools.cli.view_options import Upright, Views, Virtual
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.scenes import load_model
@@ -29,6 +29,7 @@ def simplify(
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],
     views: Views,
     virtual: Virtual,
+    upright: Upright,
     out: Output,
     settings: Settings,
     keep: Annotated[
@@ -74,7 +75,7 @@ def simplify(
     target = chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
     out.check(output, inputs=(source, views.cameras), named={"--source-index": source_index})
-    model = load_model(source).model
+    model = upright.upright().applied(load_model(source).model)
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])

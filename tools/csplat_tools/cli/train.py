@@ -10,6 +10,7 @@ import typer
 from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Output, Resume, Seed, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.settings import Settings
+from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.extras import need_trainer
 from csplat_tools.views import DataOptions
 from csplat_trainer.options import BACKGROUNDS, DEVICES, TrainOptions
@@ -27,6 +28,7 @@ _DEFAULT = TrainOptions()
 def train(
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed pictures.")],
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The scene to write.")],
+    upright: Upright,
     out: Output,
     settings: Settings,
     max_splats: Annotated[int, typer.Option(metavar="N", help="No more splats than this.")] = _DEFAULT.max_splats,
@@ -72,7 +74,8 @@ def train(
     What is behind the splats is white where pictures have an alpha channel
     and black where they have none. A comment in OUT.ply says so, and which
     pictures were held out, their size and the near plane: other commands read
-    it and judge the scene alike; encode and decode keep it.
+    it and judge the scene alike; encode and decode keep it. Another says which
+    way is up, by the kind of set or by how its cameras were held.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000
@@ -98,4 +101,6 @@ def train(
     )  # fmt: skip
     data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
     files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
-    out.publish(run_training(data, output, options, files, plot=plot, threads=threads, quiet=out.quiet))
+    out.publish(
+        run_training(data, output, options, files, facts=upright.upright(), plot=plot, threads=threads, quiet=out.quiet)
+    )

@@ -11,6 +11,7 @@ import typer
 from csplat.decoder import decode_scene
 from csplat_tools.cli.encoder_options import Preset, check_preset
 from csplat_tools.cli.options import Output, Scene, command
+from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, note
 from csplat_tools.files.streams import write_bytes
 from csplat_tools.present.export import export_page
@@ -22,18 +23,15 @@ __all__ = ["export_html", "view"]
 _Cameras = Annotated[
     str | None, typer.Option(metavar="FILE.json", help="Look from these cameras: a list of {K, viewmat, W, H, near}.")
 ]
-_Axes = Annotated[
-    str | None, typer.Option(metavar="RDF", help="Directions of +x, +y, +z, instead of the scene's: R/L, U/D, F/B.")
-]
 
 
 @command()
 def view(
     source: Scene,
+    upright: Upright,
     out: Output,
     preset: Preset = "fast",
     cameras: _Cameras = None,
-    axes: _Axes = None,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 finds one that is free.")] = 0,
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Who can see the scene: this machine; 0.0.0.0: the network.")
@@ -48,12 +46,12 @@ def view(
 
     Examples:
       csplat view scene.csplat
-      csplat view scene.ply --preset small --axes RFU
+      csplat view scene.ply --preset small --up z
       csplat view scene.csplat --no-browser --port 8000
     """
     check_preset(preset)
     out.check(inputs=(source, cameras))
-    wishes = view_wishes(cameras, axes)
+    wishes = view_wishes(cameras, upright.upright())
     with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
@@ -74,10 +72,10 @@ def view(
 def export_html(
     source: Scene,
     output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -.")],
+    upright: Upright,
     out: Output,
     preset: Preset = "balanced",
     cameras: _Cameras = None,
-    axes: _Axes = None,
 ) -> None:
     """Write one page that shows a scene, with everything inside.
 
@@ -91,7 +89,7 @@ def export_html(
       csplat export-html scene.csplat scene.html --cameras views.json
     """
     check_preset(preset)
-    wishes = view_wishes(cameras, axes)
+    wishes = view_wishes(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
     with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         data = scene.read()

@@ -10,12 +10,13 @@ import typer
 
 from csplat.model import SplatModel
 from csplat_tools.cli.options import Group, Output
-from csplat_tools.cli.parsing import parse_colour, parse_size
+from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up
+from csplat_tools.files.convert import SceneOverrides
 
 if TYPE_CHECKING:
     from csplat_tools.views import DataOptions, ViewSet
 
-__all__ = ["Near", "Split", "Views", "Virtual", "check_split"]
+__all__ = ["Near", "Split", "Upright", "Views", "Virtual", "check_split"]
 
 _DATA = "Photographs of --data (by default as the scene was trained)"
 _VIEWS = "Views (virtual ones by default)"
@@ -24,6 +25,25 @@ Split = Annotated[str, typer.Option(metavar="test|train", rich_help_panel=_DATA,
 Near = Annotated[
     float | None, typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Their near plane.")
 ]
+
+
+@dataclass(frozen=True)
+class Upright(Group):
+    """How a scene stands, instead of how it says it does."""
+
+    up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Which way is up.")] = None
+    axes: Annotated[
+        str | None, typer.Option(metavar="RDF", hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B.")
+    ] = None
+
+    def parse(self) -> None:
+        """Refuse a direction or axes that are none."""
+        self.upright()
+
+    def upright(self) -> SceneOverrides:
+        """What the scene is told."""
+        up = None if self.up is None else parse_up(self.up)
+        return SceneOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat.upright import Direction, with_up
 from csplat_tools.files.console import Progress
 from csplat_tools.files.scenes import without_bands
 from csplat_tools.files.streams import STANDARD_STREAM, mapped_csplat, ply_path, write_array, write_bytes, write_model
@@ -62,23 +63,24 @@ class SceneOverrides:
     Attributes:
         coordinate_system, unit_metres, antialiased: as in `SplatModel`.
         licence: goes into the metadata.
+        up: which direction is up, see `with_up`.
     """
 
     coordinate_system: str | None = None
     unit_metres: float | None = None
     antialiased: bool | None = None
     licence: str | None = None
+    up: Direction | None = None
 
     def applied(self, model: SplatModel) -> SplatModel:
         """Return the model with these facts."""
         changes: dict[str, Any] = {
-            name: value
-            for name in ("coordinate_system", "unit_metres", "antialiased")
-            if (value := getattr(self, name)) is not None
+            name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
         }
         if self.licence is not None:
             changes["metadata"] = {**model.metadata, "licence": self.licence}
-        return replace(model, **changes) if changes else model
+        model = replace(model, **changes) if changes else model
+        return with_up(model, self.up, self.coordinate_system)
 
 
 @dataclass(frozen=True)
@@ -229,6 +231,7 @@ def decode_file(
     sh_degree: int | None = None,
     absolute: bool = False,
     max_splats: int | None = None,
+    facts: SceneOverrides | None = None,
     progress: Progress | None = None,
 ) -> SplatModel:
     """Read a .csplat file, write a PLY.
@@ -239,6 +242,7 @@ def decode_file(
         sh_degree: leave out the bands above.
         absolute: add the origin and write doubles.
         max_splats: budget; the default is the decoder's.
+        facts: what the PLY is to say instead of what the file does.
         progress: called with the stage's name and the share done.
 
     Returns:
@@ -252,7 +256,7 @@ def decode_file(
     report("decoding", 0.0)
     with mapped_csplat(source) as data:
         # All bands, even if not all are wanted: damage anywhere gives no PLY.
-        model = decode(data, limits=limits_for(max_splats))
+        model = (facts or SceneOverrides()).applied(decode(data, limits=limits_for(max_splats)))
     if sh_degree is not None:
         model = without_bands(model, sh_degree)
     report("decoding", 1.0)

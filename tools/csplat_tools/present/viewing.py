@@ -11,11 +11,11 @@ from pathlib import Path
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, read_header
 from csplat.encoder import EncodeOptions, encode_with_report
-from csplat.errors import FormatError, InputError
+from csplat.errors import FormatError
 from csplat.lint import Finding
 from csplat_render.cameras import load_cameras
 from csplat_tools.files.console import Progress
-from csplat_tools.files.convert import read_source
+from csplat_tools.files.convert import SceneOverrides, read_source
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 
 __all__ = ["ViewScene", "open_scene", "view_wishes"]
@@ -67,28 +67,28 @@ def open_scene(path: str, *, preset: str, progress: Progress | None = None) -> I
         yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
 
 
-def view_wishes(camera: str | None, axes: str | None) -> dict[str, str]:
+def view_wishes(camera: str | None, facts: SceneOverrides | None = None) -> dict[str, str]:
     """Put options into words that the page understands.
 
     Args:
         camera: a camera file: a list of {K, viewmat, W, H, near}. The page looks from the first and steps through
             all of them.
-        axes: directions of +x, +y, +z instead of the scene's, as `RDF`.
+        facts: axes and up instead of the scene's.
 
     Returns:
         Parameters of the page.
 
     Raises:
-        InputError: the camera file holds no cameras, or the axes are none.
+        InputError: the camera file holds no cameras.
     """
     wishes = {}
     if camera is not None:
         entries = [one.to_json() for one in load_cameras(camera)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
-    if axes is not None:
-        if sorted(axes.translate(str.maketrans("LDB", "RUF"))) != ["F", "R", "U"]:
-            raise InputError(f"the axes are {axes!r}, wanted one of R and L, of U and D, of F and B, as RDF")
-        wishes["axes"] = axes
+    if facts is not None and facts.coordinate_system is not None:
+        wishes["axes"] = facts.coordinate_system
+    if facts is not None and facts.up is not None:
+        wishes["up"] = ",".join(f"{value:g}" for value in facts.up)
     return wishes
 
 

@@ -11,6 +11,7 @@ from csplat_render import warmup
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.files.console import note, step_progress
+from csplat_tools.files.convert import SceneOverrides
 from csplat_tools.files.streams import write_model
 from csplat_tools.views import DataOptions
 from csplat_trainer.checkpoint import load_checkpoint
@@ -30,6 +31,7 @@ def run_training(
     options: TrainOptions,
     files: Outputs,
     *,
+    facts: SceneOverrides | None = None,
     plot: str | None = None,
     threads: int | None = None,
     quiet: bool = False,
@@ -41,6 +43,7 @@ def run_training(
         output: the PLY to write, or `-`.
         options: of the training.
         files: that are written, and read, on the way.
+        facts: what the scene is to say instead of what the set does.
         plot: a PNG of the loss over the steps.
         threads: how many; `None` for all.
         quiet: say nothing.
@@ -64,7 +67,7 @@ def run_training(
             warmup.warm_up(None if quiet else note)
         with shown as show:
             result = train(pictures, options, show, files)
-    write_model(output, result.model, absolute=False)
+    write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data.path).name)
     if not quiet:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
+from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR
 from csplat_trainer.pictures import Picture
 
@@ -36,6 +37,7 @@ class DataSet:
         points_rgb: [P, 3] float32 in 0..1, their colours.
         report: what was found, left out and changed, a line each.
         coordinate_system: as in `SplatModel`, where the kind of set has a custom.
+        up: which direction is up; `None` where neither the kind of set nor its cameras say it.
         test_every: every so-manieth picture was held out; `None` where the set names its test pictures.
         size: what the pictures are scaled to, width and height; `None`: they are not.
         images: the folder of pictures that was asked for; `None`: the reader chose.
@@ -48,6 +50,7 @@ class DataSet:
     points_rgb: F32 | None = None
     report: tuple[str, ...] = ()
     coordinate_system: str = UNSPECIFIED
+    up: Direction | None = None
     test_every: int | None = None
     size: tuple[int, int] | None = None
     images: str | None = None

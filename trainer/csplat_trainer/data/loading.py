@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from csplat.errors import InputError
+from csplat.model import UNSPECIFIED
+from csplat.upright import Direction, up_of_axes
 from csplat_render.camera import MAX_IMAGE_SIZE
 from csplat_trainer.data.colmap import find_model, read_colmap
-from csplat_trainer.data.dataset import DataSet, Found, near_plane
+from csplat_trainer.data.dataset import DataSet, Found, Shot, near_plane
+from csplat_trainer.data.level import find_level
 from csplat_trainer.data.pixels import picture_of, undistorted_lens
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["load"]
+
+_AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with its cameras
 
 
 def load(
@@ -63,18 +70,38 @@ def load(
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
         report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
+    axes, up, said = _upright(found.coordinate_system, shots)
     return DataSet(
         name,
         train,
         test,
         found.points,
         found.points_rgb,
-        tuple(report),
-        found.coordinate_system,
+        tuple(line for line in (*report, said) if line),
+        axes,
+        up,
         found.test_every,
         size,
         images,
     )
+
+
+def _upright(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None, str]:
+    """The axes of a set, which way is up, and that in words.
+
+    Args:
+        custom: axes that sets of this kind have. Some people keep other coordinates in its files: then the cameras
+            say up.
+        shots: all of the set.
+    """
+    level, usual = find_level([shot.viewmat for shot in shots]), up_of_axes(custom)
+    if level is None:
+        return custom, usual, "" if usual else "which way is up is not known: the cameras were held at all angles"
+    if usual is None:
+        return custom, level.up, str(level)
+    if sum(a * b for a, b in zip(usual, level.up, strict=True)) < _AGREES:
+        return UNSPECIFIED, level.up, f"{level}; sets of this kind mostly have other axes"
+    return custom, usual, ""
 
 
 def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> Found:

@@ -1,0 +1,129 @@
+"""Tiny data sets of each kind, written to disk: a few cameras that look at three dots."""
+
+import json
+import struct
+
+import numpy as np
+from PIL import Image
+
+from csplat_render.cameras import intrinsics, look_at
+
+W, H = 48, 32
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+POINTS = np.array([[0.05, 0.03, -0.04], [0.4, 0.1, 0.2], [-0.3, 0.2, -0.1]])
+COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]])
+
+
+def cameras(count, width=W, height=H, up=(0, 0, 1)):
+    """Around the origin, z up or another axis."""
+    K = intrinsics(width, height, 50.0)
+    angles = np.linspace(0.3, 5.0, count)
+    above = np.array(up, np.float64)
+    first = np.roll(above, 1)
+    places = [3 * (np.cos(a) * first + np.sin(a) * np.cross(above, first)) + above for a in angles]
+    return [look_at(place, [0, 0, 0], above, K, width, height) for place in places]
+
+
+def write_picture(path, camera, mode="RGB", scale=1):
+    """Black, with a dot where each point falls."""
+    width, height = camera.W // scale, camera.H // scale
+    pixels = np.zeros((height, width, len(mode)), np.uint8)
+    for point, colour in zip(POINTS, COLOURS, strict=True):
+        c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+        u, v = (camera.K @ (c / c[2]))[:2] / scale
+        pixels[int(v), int(u), :3] = colour
+        if mode == "RGBA":
+            pixels[int(v), int(u), 3] = 255
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels, mode).save(path)
+
+
+def assert_dots_are_where_points_fall(pictures):
+    for picture in pictures:
+        camera = picture.camera
+        for point, colour in zip(POINTS, COLOURS, strict=True):
+            c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+            u, v = (camera.K @ (c / c[2]))[:2]
+            assert (picture.pixels[int(v), int(u), :3] == colour).all()
+
+
+def to_opengl(camera):
+    return (np.linalg.inv(camera.viewmat) @ FLIP).tolist()
+
+
+def write_blender(folder, up=(0, 0, 1)):
+    for part, count in (("train", 5), ("test", 3)):
+        frames = []
+        for i, camera in enumerate(cameras(count, up=up)):
+            write_picture(folder / part / f"r_{i}.png", camera, "RGBA")
+            frames.append({"file_path": f"./{part}/r_{i}", "transform_matrix": to_opengl(camera)})
+        document = {"camera_angle_x": float(np.radians(50.0)), "frames": frames}
+        (folder / f"transforms_{part}.json").write_text(json.dumps(document))
+
+
+def write_transforms(folder, missing=(), up=(0, 0, 1)):
+    frames = []
+    for i, camera in enumerate(cameras(10, up=up)):
+        if i not in missing:
+            write_picture(folder / "images" / f"{i:04}.png", camera)
+        frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": to_opengl(camera)})
+    K = intrinsics(W, H, 50.0)
+    intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
+    document = {**intrinsic, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+def quaternion(rotation):
+    """w x y z (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    lower = [
+        [xx + yy + zz, 0, 0, 0],
+        [zy - yz, xx - yy - zz, 0, 0],
+        [xz - zx, yx + xy, yy - xx - zz, 0],
+        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
+    ]
+    return np.linalg.eigh(np.array(lower))[1][:, -1]
+
+
+MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+
+def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H):
+    """A sparse model of cameras and the three points."""
+    folder.mkdir(parents=True, exist_ok=True)
+    K = shots[0].K
+    parameters = parameters or [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    poses = [(*quaternion(c.viewmat[:3, :3]), *c.viewmat[:3, 3]) for c in shots]
+    names = [f"im {i:03}.png" for i in range(len(shots))]
+    if text:
+        words = " ".join(str(float(p)) for p in parameters)
+        (folder / "cameras.txt").write_text(f"# comment\n7 {model} {width} {height} {words}\n")
+        lines = [
+            f"{i + 1} {' '.join(str(float(v)) for v in pose)} 7 {name}\n{'1.5 2.5 -1' if i % 2 else ''}\n"
+            for i, (pose, name) in enumerate(zip(poses, names, strict=True))
+        ]
+        (folder / "images.txt").write_text("# comment\n# another\n" + "".join(lines))
+        rows = [
+            f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 0 2 0\n"
+            for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+        ]
+        (folder / "points3D.txt").write_text("# comment\n" + "".join(rows))
+        return
+    data = struct.pack("<QiiQQ", 1, 7, MODELS[model], width, height) + struct.pack(f"<{len(parameters)}d", *parameters)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(shots))
+    for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
+        data += struct.pack("<i7di", i + 1, *pose, 7) + name.encode() + b"\0"
+        data += struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(POINTS))
+    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
+        data += struct.pack("<Q3d3BdQ", i, *point, *map(int, colour), 0.5, i) + struct.pack("<ii", 1, 2) * i
+    (folder / "points3D.bin").write_bytes(data)
+
+
+def write_colmap_set(folder, text=False, up=(0, 0, 1)):
+    shots = cameras(9, up=up)
+    for i, camera in enumerate(shots):
+        write_picture(folder / "images" / f"im {i:03}.png", camera)
+    write_colmap(folder / "sparse" / "0", shots, text=text)
