@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from csplat import encode, read_ply
 from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
-from csplat_tools.present.export import export_page, module_graph
-from csplat_tools.present.webroot import PAGE, web_files
+from csplat_tools.present.export import export_page, link_modules
+from csplat_tools.present.webroot import PAGE, WORKER, web_files
 
 SIZE = (200, 160)
 
@@ -55,8 +55,20 @@ def test_the_page_opens_from_a_file_without_a_network(tab, site, sample, tmp_pat
     np.testing.assert_array_equal(served, exported)
     assert page.locator("#error").is_hidden()
     assert "scene.csplat" == page.inner_text("#title")
-    assert {"file", "blob"} == {re.match(r"\w+", url)[0] for url in requests}
-    assert 1 == len([url for url in requests if url.startswith("file:")])
+    schemes = [re.match(r"\w+", url)[0] for url in requests]
+    assert ["blob", "file"] == sorted(schemes)  # the page, and its worker
+
+
+def test_the_page_from_a_file_opens_other_files(tab, make_model, tmp_path):
+    (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), "scene.csplat").page)
+    (tmp_path / "other.csplat").write_bytes(encode(make_model(70, 0)))
+    page = tab.page
+    page.goto((tmp_path / "page.html").as_uri())
+    tab.until("'csplatViewer' in window")
+    page.evaluate("csplatViewer.ready")
+    page.set_input_files("#file", tmp_path / "other.csplat")
+    tab.until("document.getElementById('summary').textContent.startsWith('70 splats')")
+    assert "other.csplat" == page.inner_text("#title")
 
 
 def test_the_page_is_forbidden_the_network(tab, site, make_model):
@@ -109,45 +121,36 @@ def test_names_with_markup_stay_text(tab, make_model, tmp_path):
 
 def test_every_module_is_in_the_page_once(sample):
     text = export_page(sample, "scene.csplat").page.decode()
-    described = json.loads(re.search(r'id="csplat-page">(.*?)</script>', text)[1])
     texts = {name: path.read_text("utf-8") for name, path in web_files().items() if name.endswith(".mjs")}
-    modules = ["".join(str(part) for part in parts) for parts in described["modules"]]
-    assert len(modules) == len(set(modules))
-    for number, parts in enumerate(described["modules"]):
-        assert all(part < number for part in parts if isinstance(part, int))
-        code = "".join(part for part in parts if isinstance(part, str))
-        assert not re.findall(r"^(?:import|export)\b[^;]*?from '\.", code, re.MULTILINE)
-        assert not re.findall(r"(?<![{.\w] )(?:await |= |return )import\('\.", code)
-    assert len(modules) <= len(texts)
+    paths = re.findall(r"^// (\S+\.mjs)\n\(link\) => \{$", text, re.MULTILINE)
+    assert len(paths) == len(set(paths))
+    assert {PAGE.replace("index.html", "main.mjs"), WORKER} < set(paths) <= set(texts)
+    assert not re.findall(r"^(?:import|export)\b.*", text, re.MULTILINE)
     assert "'self'" not in re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
     assert not re.findall(r'(?:src|href)="(?!data:)', text.partition('id="csplat-page"')[0])
 
 
 GRAPH = {
     "a/main.mjs": "import { x } from './b.mjs';\nimport '../c/d.mjs';\nconst text = \"import y from './none.mjs'\";\n",
-    "a/b.mjs": "import {\n  one,\n  two as three,\n} from '../c/d.mjs';\nexport * from \"./e.mjs\";\n",
-    "a/e.mjs": "// import { x } from './none.mjs';\nexport { one as x } from '../c/d.mjs';\nexport const from = 1;\n",
-    "c/d.mjs": "/** @typedef {import('./none.mjs').T} T */\nexport const one = 1, two = 2;\nexport default one;\n",
+    "a/b.mjs": (
+        "import {\n  one,\n  two as three,\n} from '../c/d.mjs';\nimport * as e from \"./e.mjs\";\n"
+        "export {\n  e,\n  three as x,\n};\n"
+    ),
+    "a/e.mjs": "// import { x } from './none.mjs';\nexport async function* f() {}\nexport const from = 1;\n",
+    "c/d.mjs": "/** @typedef {import('./none.mjs').T} T */\nexport const one = 1;\nexport class Two {}\n",
 }
 
 
-def test_the_graph_follows_imports_and_nothing_else():
-    assert {
-        "c/d.mjs": [GRAPH["c/d.mjs"]],
-        "a/e.mjs": [
-            "// import { x } from './none.mjs';\nexport { one as x } from '",
-            0,
-            "';\nexport const from = 1;\n",
-        ],
-        "a/b.mjs": ["import {\n  one,\n  two as three,\n} from '", 0, "';\nexport * from \"", 1, '";\n'],
-        "a/main.mjs": [
-            "import { x } from '",
-            2,
-            "';\nimport '",
-            0,
-            "';\nconst text = \"import y from './none.mjs'\";\n",
-        ],
-    } == module_graph(GRAPH, ["a/main.mjs"])
+def test_modules_become_functions_behind_those_that_they_import():
+    functions = link_modules(GRAPH, ["a/main.mjs"])
+    assert ["c/d.mjs", "a/e.mjs", "a/b.mjs", "a/main.mjs"] == list(functions)
+    bodies = [text.removeprefix(f"// {path}\n(link) => {{\n") for path, text in functions.items()]
+    assert [
+        "/** @typedef {import('./none.mjs').T} T */\nconst one = 1;\nclass Two {}\nreturn { one, Two };\n},\n",
+        "// import { x } from './none.mjs';\nasync function* f() {}\nconst from = 1;\nreturn { f, from };\n},\n",
+        "const {\n  one,\n  two: three,\n} = link(0);\nconst e = link(1);\n\nreturn { \n  e,\n  x: three };\n},\n",
+        "const { x } = link(2);\nlink(0);\nconst text = \"import y from './none.mjs'\";\nreturn {  };\n},\n",
+    ] == bodies
 
 
 @pytest.mark.parametrize(
@@ -158,11 +161,15 @@ def test_the_graph_follows_imports_and_nothing_else():
             r"import each other: a\.mjs -> b\.mjs -> a\.mjs",
         ),
         ({"a.mjs": "import './gone.mjs';"}, r"a\.mjs imports gone\.mjs, which is not there"),
+        ({"a.mjs": "export default 1;"}, r"a\.mjs has a statement that cannot be linked: export default 1;"),
+        ({"a.mjs": "export let n = 1;"}, r"a\.mjs has a statement that cannot be linked: export let n = 1;"),
+        ({"a.mjs": "export * from './b.mjs';"}, r"a\.mjs has a statement that cannot be linked: export \* from"),
+        ({"a.mjs": "import a from './b.mjs';"}, r"a\.mjs has a statement that cannot be linked: import a from"),
     ],
 )
-def test_a_graph_that_cannot_be_laid_out_is_noticed(texts, expected):
+def test_modules_that_cannot_be_linked_are_noticed(texts, expected):
     with pytest.raises(AssertionError, match=expected):
-        module_graph(texts, ["a.mjs"])
+        link_modules(texts, ["a.mjs"])
 
 
 def test_a_ply_is_encoded(sample_path, tmp_path):

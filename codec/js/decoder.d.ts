@@ -298,7 +298,7 @@ export interface LayerRequest {
 
 /** Reads tiles and layers of a file in any order; checks the CRC of each part. */
 export class CsplatReader {
-  static open(from: string | URL | Blob | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
+  static open(from: string | URL | Blob | ArrayBuffer | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
   readonly header: Header;
   readonly checks: Checks;
   /** Milliseconds that reads have waited for bytes so far, each for itself. */

@@ -1,4 +1,4 @@
-// Tiles and layers of a file, one by one and in any order, over HTTP Range or from a Blob.
+// Tiles and layers of a file, one by one and in any order, over HTTP Range, from a Blob or from memory.
 
 import { describe, emptyDescription } from './ancillary.mjs';
 import { arrayBytes, bandArray } from './arrays.mjs';
@@ -36,7 +36,7 @@ export class CsplatReader {
   /**
    * Open a file: one request for header and index of all but huge files.
    *
-   * @param {string | URL | Blob | ByteSource} from
+   * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
    * @param {ReaderOptions} [options]
    * @returns {Promise<CsplatReader>}
    */

@@ -1,7 +1,7 @@
 // Where the bytes of a file come from when they are not in memory: HTTP with Range, or what `whole.mjs` has.
 
 import { InputError } from './errors.mjs';
-import { BlobSource, WholeSource, asInputError, bodyParts, shortData } from './whole.mjs';
+import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortData } from './whole.mjs';
 
 const GAP_BYTES = 1 << 14; // ranges this close are fetched as one
 const REQUEST_BYTES = 1 << 23; // ranges are not joined beyond this
@@ -15,15 +15,16 @@ const REQUEST_BYTES = 1 << 23; // ranges are not joined beyond this
  */
 
 /**
- * @param {string | URL | Blob | ByteSource} from
+ * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
  * @param {Way} way how to fetch
  * @returns {Promise<ByteSource>}
  */
 export async function openSource(from, way) {
   if (typeof from === 'string' || from instanceof URL) return openUrl(from, way);
   if (from instanceof Blob) return new BlobSource(from);
+  if (from instanceof ArrayBuffer) return new MemorySource(new Uint8Array(from));
   if (typeof from?.read === 'function') return from;
-  throw new InputError('neither an address, nor a Blob, nor an object with a method read');
+  throw new InputError('neither an address, nor a Blob or ArrayBuffer, nor an object with a method read');
 }
 
 /**

@@ -1,4 +1,4 @@
-// Sources that have the whole file, sooner or later: a body from a server without ranges, a Blob.
+// Sources that have the whole file, sooner or later: a body from a server without ranges, memory, a Blob.
 
 import { readFileHeader } from './container.mjs';
 import { CsplatError, InputError, LimitError, allocate, fault } from './errors.mjs';
@@ -150,6 +150,25 @@ function copyParts(into, from) {
     const taken = part.subarray(0, into.length - filled);
     into.set(taken, filled);
     filled += taken.length;
+  }
+}
+
+/** Bytes in memory. */
+export class MemorySource {
+  /** @param {Bytes} bytes */
+  constructor(bytes) {
+    this.bytes = bytes;
+    this.size = bytes.length;
+  }
+
+  /**
+   * @param {number} offset
+   * @param {number} size
+   * @returns {Promise<Bytes>}
+   */
+  async read(offset, size) {
+    if (offset + size > this.size) throw shortData(this.size, size);
+    return this.bytes.subarray(offset, offset + size);
   }
 }
 

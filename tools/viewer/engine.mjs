@@ -7,7 +7,7 @@
 //   await engine.open('scene.csplat');
 
 import { viewOf } from './camera_maths.mjs';
-import { EngineError, E_CONTEXT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
+import { EngineError, E_CONTEXT, E_INPUT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
 import { Frames } from './frames.mjs';
 import { Opening } from './opening.mjs';
 import { createRenderer } from './renderer.mjs';
@@ -113,7 +113,15 @@ class SplatEngine {
   begin(source, resolve, reject) {
     this.opening = new Opening(source, ++this.sceneCount, resolve, reject);
     this.stats = emptyStats(this.renderer.capabilities);
-    this.tell({ type: 'open', scene: this.sceneCount, source });
+    const { opening } = this;
+    const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
+      if (this.opening === opening) this.tell({ type: 'open', scene: opening.scene, source: readable });
+    };
+    // WebKit lets no worker of a file: page read a Blob; the page itself may.
+    if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
+    source.arrayBuffer().then(tell, (error) => {
+      if (this.opening === opening) this.fail(new EngineError({ code: E_INPUT, message: String(error) }));
+    });
   }
 
   /** @param {Camera} camera */

@@ -10,6 +10,8 @@ export const E_CONTEXT = 'E_CONTEXT';
 export const E_REPLACED = 'E_REPLACED';
 /** The worker did not start, or broke. */
 export const E_WORKER = 'E_WORKER';
+/** The file cannot be read; as the format's. */
+export const E_INPUT = 'E_INPUT';
 /** More splats than the GPU has room for; as the format's. */
 export const E_LIMIT = 'E_LIMIT';
 

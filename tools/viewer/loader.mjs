@@ -44,7 +44,7 @@ export async function load(source, sink, signal) {
   const state = { received: 0, fileSize: 0, splatsDone: 0, splatCount: 0, decodeMs: 0 };
   const tell = (/** @type {number} */ layer) =>
     sink.progress({ phase: state.fileSize ? 'layers' : 'open', layer, ...state });
-  const reader = await CsplatReader.open(asSource(source), {
+  const reader = await CsplatReader.open(source, {
     signal,
     onProgress: (received) => {
       state.received = received;
@@ -76,17 +76,6 @@ export async function load(source, sink, signal) {
     state.received = header.fileSize;
     tell(header.shDegree);
   }
-}
-
-/**
- * What a reader takes.
- *
- * @param {string | Blob | ArrayBuffer} source
- */
-function asSource(source) {
-  if (!(source instanceof ArrayBuffer)) return source;
-  const bytes = new Uint8Array(source);
-  return new Blob([bytes]); // it notices reads beyond the end
 }
 
 /**

@@ -168,6 +168,18 @@ test('a codebook that is damaged is refused each time it is asked for', async ()
   for (let i = 0; i < 2; i++) assert.equal((await refusal(() => reader.readTile(0))).clause, 'CDB-1');
 });
 
+test('memory is a source as a Blob is', async () => {
+  const whole = await decode(rich);
+  const reader = await CsplatReader.open(rich.slice().buffer);
+  const { means } = await reader.readTile(0);
+  assert.deepEqual(means, whole.means.slice(0, means.length));
+  for (const kept of [0, 10, 70, rich.length - 1]) {
+    const cut = rich.slice(0, kept);
+    const refused = await Promise.all([cut.buffer, new Blob([cut])].map((from) => refusal(() => CsplatReader.open(from))));
+    assert.deepEqual(refused[0], refused[1]);
+  }
+});
+
 test('budgets hold for readers', async (t) => {
   const { url } = await serve(t, rich, { ranges: false });
   assert.equal((await refusal(() => CsplatReader.open(url, { limits: { bytes: rich.length - 1 } }))).code, 'E_LIMIT');

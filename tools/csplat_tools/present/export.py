@@ -1,8 +1,9 @@
 """One HTML file with a scene, the viewer and the decoder inside: it opens from a disk, without a network.
 
-A page that was opened as `file:` may not import modules from neighbouring files, so that every module goes into
-the page as text. A short script makes a blob: URL of each, those that others import first, and puts the URLs in the
-places of the import specifiers; the worker does the same for itself. A policy in the page forbids it the network.
+A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
+all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
+`import`, and Chromium to a worker that is a module. So the modules become functions of one classic script. The page
+runs it, and so does the worker, made from a blob of the same text. A policy in the page forbids it the network.
 """
 
 from __future__ import annotations
@@ -18,73 +19,48 @@ from dataclasses import dataclass
 
 from csplat_tools.present.webroot import PAGE, WORKER, web_files
 
-__all__ = ["Exported", "export_page", "module_graph"]
+__all__ = ["Exported", "export_page", "link_modules"]
 
-# The statements that import: `import … from '…'`, `import '…'`, `export … from '…'`, at the beginning of a line.
+# Statements that import: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
-    r"""^(?:import\s+(?:[\w$*{}\s,]+\sfrom\s+)?|export\s+(?:\*(?:\s+as\s+[\w$]+)?|\{[^}]*\})\s+from\s+)"""
-    r"""(?P<quote>['"])(?P<name>\.{1,2}/[^'"\n]+)(?P=quote)""",
+    r"""^import\s+(?:(?:\*\s+as\s+(?P<all>[\w$]+)|(?P<some>\{[^}]*\}))\s+from\s+)?(['"])(?P<name>[^'"\n]+)\3;""",
     re.MULTILINE,
 )
+# Statements that export: what is declared, and `export { a, b as c };`.
+_DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
+_LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
+_STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'
 _POLICY = re.compile(r'(<meta http-equiv="Content-Security-Policy" content=")[^"]*(">)')
-# Makes the modules of a page or a worker: text and numbers of modules come in turn. Blobs made elsewhere would do for a
-# page, but not for a worker of a file: page, whose origin is its own.
-_MODULES = """\
-const moduleUrls = (modules) => {
-  const urls = [];
-  for (const parts of modules) {
-    const text = parts.map((part) => (typeof part === 'number' ? urls[part] : part)).join('');
-    urls.push(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
-  }
-  return urls;
-};
-"""
-# A worker that is a module does not start from a file: page in every browser; a classic one that imports does. What
-# is sent to it before its module is there waits.
-_WORKER = """\
-const early = [];
-const keep = (event) => {
-  event.stopImmediatePropagation();
-  early.push(event);
-};
-addEventListener('message', keep);
-import(moduleUrls(modules)[entry]).then(
-  () => {
-    removeEventListener('message', keep);
-    for (const { data, ports } of early) dispatchEvent(new MessageEvent('message', { data, ports }));
-  },
-  (error) => setTimeout(() => { throw error; }),
-);
-"""
+# Runs in the page and in its worker, behind the functions of the modules.
 _BOOT = """\
-const { modules, main, worker, name, wishes, texts } = JSON.parse(document.getElementById('csplat-page').textContent);
-const urls = moduleUrls(modules.slice(0, main + 1));
-globalThis.csplatEmbedded = {
-  name,
-  wishes,
-  scene: () => {
-    const element = document.getElementById('csplat-scene');
-    const coded = element.textContent;
-    element.remove();
-    if (Uint8Array.fromBase64) return Uint8Array.fromBase64(coded).buffer;
-    const bytes = new Uint8Array(Math.floor((coded.length * 3) / 4));
-    const step = 1 << 16;
-    let filled = 0;
-    for (let at = 0; at < coded.length; at += step) {
-      const text = atob(coded.slice(at, at + step));
-      for (let i = 0; i < text.length; i++) bytes[filled++] = text.charCodeAt(i);
-    }
-    return bytes.buffer.slice(0, filled);
-  },
-  workerFactory: () => {
-    const constants = `const modules = ${JSON.stringify(modules)}, entry = ${worker};\\n`;
-    const blob = new Blob([constants, texts.modules, texts.worker], { type: 'text/javascript' });
-    return new Worker(URL.createObjectURL(blob));
-  },
-};
-import(urls[main]);
+const made = [];
+const link = (number) => (made[number] ??= modules[number](link));
+if (typeof document === 'undefined') {
+  link(WORKER);
+} else {
+  const { textContent } = document.currentScript;
+  globalThis.csplatEmbedded = {
+    ...JSON.parse(document.getElementById('csplat-page').textContent),
+    scene: () => {
+      const element = document.getElementById('csplat-scene');
+      const coded = element.textContent;
+      element.remove();
+      if (Uint8Array.fromBase64) return Uint8Array.fromBase64(coded).buffer;
+      const bytes = new Uint8Array(Math.floor((coded.length * 3) / 4));
+      const step = 1 << 16;
+      let filled = 0;
+      for (let at = 0; at < coded.length; at += step) {
+        const text = atob(coded.slice(at, at + step));
+        for (let i = 0; i < text.length; i++) bytes[filled++] = text.charCodeAt(i);
+      }
+      return bytes.buffer.slice(0, filled);
+    },
+    workerFactory: () => new Worker(URL.createObjectURL(new Blob([textContent], { type: 'text/javascript' }))),
+  };
+  link(MAIN);
+}
 """
 
 
@@ -116,76 +92,77 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     """
     texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
     folder = posixpath.dirname(PAGE)
-    modules = module_graph(
-        {path: text for path, text in texts.items() if path.endswith(".mjs")},
-        [
-            f"{folder}/main.mjs",
-            WORKER,
-        ],
-    )
+    main = f"{folder}/main.mjs"
+    modules = link_modules(texts, [main, WORKER])
     order = list(modules)
-    described = {
-        "modules": list(modules.values()),
-        "main": order.index(f"{folder}/main.mjs"),
-        "worker": order.index(WORKER),
-        "name": name,
-        "wishes": dict(wishes or {}),
-        "texts": {"modules": _MODULES, "worker": _WORKER},
-    }
-    boot = _MODULES + _BOOT
+    boot = _BOOT.replace("WORKER", str(order.index(WORKER))).replace("MAIN", str(order.index(main)))
+    script = f"'use strict';\n{{\nconst modules = [\n{''.join(modules.values())}];\n{boot}}}\n"
+    assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script can stand in an element"
     style = f"\n{texts[f'{folder}/viewer.css']}"
     coded = base64.b64encode(scene).decode()
+    described = _json({"name": name, "wishes": dict(wishes or {})})
     body = (
-        f'<script type="application/json" id="csplat-page">{_json(described)}</script>\n'
+        f'<script type="application/json" id="csplat-page">{described}</script>\n'
         f'<script type="application/octet-stream" id="csplat-scene">{coded}</script>\n'
-        f"<script>{boot}</script>\n"
+        f"<script>{script}</script>\n"
     )
     page = texts[PAGE]
     page = _replaced(page, _STYLE, f"<style>{style}</style>")
     page = _replaced(page, _SCRIPT, "")
     page = _replaced(page, "<title>csplat viewer</title>", f"<title>{html.escape(name)} – csplat viewer</title>")
     page = _replaced(page, "</body>", f"{body}</body>")
-    page, found = _POLICY.subn(lambda match: match[1] + _policy(style, boot) + match[2], page)
+    page, found = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
     assert found == 1, "the page has one policy"
     data = page.encode()
     return Exported(data, len(data) - len(coded), len(coded))
 
 
-def module_graph(texts: Mapping[str, str], entries: list[str]) -> dict[str, list[str | int]]:
-    """Find the modules that entries import, and what they import in turn.
+def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]:
+    """Make functions of the modules that entries import, and of those that these import in turn.
 
     Args:
         texts: source texts of modules by their paths.
         entries: paths of the modules to begin with.
 
     Returns:
-        By path, each module behind those that it imports: its text cut at the import specifiers, which are numbers
-        of modules in this order.
+        By path, each module behind those that it imports: an element of a list of functions, with its comma. Each
+        takes a function that gives what another one exports, by its number in this order, and returns what it
+        exports itself. (An import is no live binding then; modules export nothing that changes.)
     """
-    found: dict[str, list[str | int]] = {}
+    found: dict[str, str] = {}
     numbers: dict[str, int] = {}
     open_paths: list[str] = []
 
-    def visit(path: str) -> None:
-        if path in found:
-            return
+    def visit(path: str) -> int:
         assert path not in open_paths, f"modules import each other: {' -> '.join([*open_paths, path])}"
-        assert path in texts, f"{open_paths[-1] if open_paths else 'the page'} imports {path}, which is not there"
-        open_paths.append(path)
-        text, parts, at = texts[path], list[str | int](), 0
-        for match in _IMPORT.finditer(text):
-            target = posixpath.normpath(posixpath.join(posixpath.dirname(path), match["name"]))
-            visit(target)
-            parts += [text[at : match.start("name")], numbers[target]]
-            at = match.end("name")
-        parts.append(text[at:])
-        open_paths.pop()
-        numbers[path] = len(found)
-        found[path] = parts
+        if path not in numbers:
+            assert path in texts, f"{open_paths[-1] if open_paths else 'the page'} imports {path}, which is not there"
+            open_paths.append(path)
+            text = _IMPORT.sub(lambda match: taken(path, match), texts[path])
+            open_paths.pop()
+            numbers[path] = len(found)
+            found[path] = _as_function(path, text)
+        return numbers[path]
+
+    def taken(path: str, match: re.Match[str]) -> str:
+        target = f"link({visit(posixpath.normpath(posixpath.join(posixpath.dirname(path), match['name'])))});"
+        names = match["all"] or re.sub(r"\s+as\s+", ": ", match["some"] or "")
+        return f"const {names} = {target}" if names else target
 
     for entry in entries:
         visit(entry)
     return found
+
+
+def _as_function(path: str, text: str) -> str:
+    """A module without imports, as a function that returns what it exports."""
+    names = [match["name"] for match in _DECLARED.finditer(text)]
+    names += [re.sub(r"([\w$]+)\s+as\s+([\w$]+)", r"\2: \1", match["names"]) for match in _LISTED.finditer(text)]
+    text = _LISTED.sub("", _DECLARED.sub("", text))
+    left = _STATEMENT.search(text)
+    assert left is None, f"{path} has a statement that cannot be linked: {left[0] if left else ''}"
+    text = text.replace("import.meta.url", "document.baseURI")  # the module lies in the page
+    return f"// {path}\n(link) => {{\n{text}return {{ {', '.join(names)} }};\n}},\n"
 
 
 def _json(value: object) -> str:
@@ -197,7 +174,7 @@ def _policy(style: str, script: str) -> str:
     """A Content Security Policy that allows what is inside the page and nothing from elsewhere."""
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)]
     return (
-        f"default-src 'none'; script-src 'sha256-{hashes[0]}' blob:; worker-src blob:; style-src 'sha256-{hashes[1]}';"
+        f"default-src 'none'; script-src 'sha256-{hashes[0]}'; worker-src blob:; style-src 'sha256-{hashes[1]}';"
         " img-src data:; connect-src 'none'; base-uri 'none'; form-action 'none'"
     )
 
