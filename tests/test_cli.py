@@ -239,6 +239,15 @@ def test_repairs_are_reported_and_strict_refuses_them(tmp_path, make_model):
     assert sorted(kept) == list(range(20))
 
 
+@pytest.mark.parametrize(("length", "told"), [(0.3, False), (5.0, False), (1e-6, True), (1e6, True)])
+def test_lengths_of_rotations_are_told_where_no_training_leaves_them(tmp_path, ply, length, told):
+    data = bytearray(ply.read_bytes())
+    data[-16:] = np.array([length, 0, 0, 0], "<f4").tobytes()  # the last rotation
+    ply.write_bytes(data)
+    assert told == ("1 rotation not of unit length" in invoke("encode", ply, tmp_path / "out.csplat").stderr)
+    assert "1 rotation not of unit length" in call("lint", ply)
+
+
 def test_encode_replaces_none_of_its_own_files(tmp_path, ply):
     weights = tmp_path / "weights.npy"
     np.save(weights, np.ones(5))
@@ -613,6 +622,23 @@ def test_help_gives_an_example(command):
     assert "\\b" not in text  # click's mark for "do not wrap", which typer's rich mode prints as it stands
 
 
+def test_completes_commands_and_options():
+    def complete(*words):
+        asked = {"_CSPLAT_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
+        return program(env={**os.environ, **asked}).stdout.decode().split()
+
+    assert ["encode"] == complete("csplat", "enc")
+    assert ["--preset"] == complete("csplat", "encode", "--pre")
+
+
+def test_the_codec_is_the_program_too_and_does_not_import_it():
+    done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
+    assert call("--version") == done.stdout
+    code = "import sys, csplat.ply, csplat.encoder, csplat.decoder; print('csplat_tools' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "False\n" == done.stdout
+
+
 def test_version_names_program_and_format():
     assert call("--version").startswith("csplat 0.1.0, format 0.2")
 
@@ -661,24 +687,6 @@ def test_writes_no_binary_to_a_terminal(ply, csplat_file):
         os.close(main)
         assert done.returncode == 1
         assert b"terminal" in done.stderr
-
-
-def test_bars_are_for_terminals(tmp_path, ply):
-    main, terminal = pty.openpty()
-    done = subprocess.run(
-        [*PROGRAM, "encode", str(ply), str(tmp_path / "out.csplat")],
-        stderr=terminal,
-        stdout=subprocess.PIPE,
-        check=False,
-        env={**os.environ, "TERM": "xterm"},
-    )
-    os.close(terminal)
-    shown = os.read(main, 1 << 16)
-    os.close(main)
-    assert done.returncode == 0
-    assert b"tiles" in shown
-    assert b"\x1b" in shown
-    assert b"\x1b" not in program("encode", ply, tmp_path / "two.csplat").stderr
 
 
 def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):

@@ -103,7 +103,7 @@ def test_a_scene_of_nothing_but_nan_becomes_an_empty_file(tmp_path):
     columns = CONDITIONS["needles"].make()
     columns["means"][:] = np.nan
     ply, file = write_columns(tmp_path / "scene.ply", columns), tmp_path / "scene.csplat"
-    assert "300 splats hold NaN or infinity" in run("encode", ply, file).stderr
+    assert "300 splats with NaN or infinity" in run("encode", ply, file).stderr
     assert 0 == run("verify", file, "--source", ply).exit_code
     assert "without splats cannot be simplified" in refused("simplify", ply, tmp_path / "half.ply", "--keep", 0.5)
     assert 0 == run("render", file, "--orbit", 1, "--size", "32x24", "-o", tmp_path / "pictures").exit_code
@@ -118,4 +118,4 @@ def test_a_process_of_its_own_says_no_more_than_what_was_repaired(tmp_path):
         capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "100"},
     )  # fmt: skip
     assert (0, "") == (done.returncode, done.stdout)
-    assert "repair: nonfinite-rows: 150 splats hold NaN or infinity: dropped" == done.stderr.strip()
+    assert "repair: nonfinite-rows: 150 splats with NaN or infinity: dropped" == done.stderr.strip()

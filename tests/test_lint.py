@@ -52,7 +52,7 @@ def test_a_finding_says_what_it_is(path):
     (finding,) = lint_ply(path)
     assert ("trailing-bytes", 3, "repair") == (finding.id, finding.count, finding.kind)
     assert finding.repairable
-    assert "repair: trailing-bytes: 3 bytes follow the last row: ignored" == str(finding)
+    assert "repair: trailing-bytes: 3 bytes after the last row: ignored" == str(finding)
 
 
 def test_trailing_bytes_are_ignored_and_counted(path):

@@ -12,7 +12,7 @@ Every error has a `code`, a short constant string that programs may compare.
 
 from __future__ import annotations
 
-__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError"]
+__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError", "counted"]
 
 
 class CsplatError(Exception):
@@ -133,6 +133,17 @@ class InputError(CsplatError):
 
     def __init__(self, message: str) -> None:
         super().__init__(message)
+
+
+def counted(count: int, one: str, many: str | None = None) -> str:
+    """A number and what it counts, for messages: `1 tile`, `59,325 tiles`.
+
+    Args:
+        count: how many.
+        one: the word for one of them.
+        many: that for others; `None`: the same with an s.
+    """
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def _join(detail: str, found: object, wanted: object) -> str:

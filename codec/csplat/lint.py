@@ -36,7 +36,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 
 __all__ = ["Columns", "Finding", "find_columns", "refuse"]
 
@@ -62,12 +62,14 @@ class Finding:
         count: how many splats, columns, elements or bytes are concerned.
         text: one line, which says what was found and what becomes of it.
         kind: `note`, `repair` or `error`.
+        usual: trained scenes are like that: worth a word to who asks for all there is alone.
     """
 
     id: str
     count: int
     text: str
     kind: Kind
+    usual: bool = False
 
     @property
     def repairable(self) -> bool:
@@ -138,7 +140,7 @@ def find_columns(dtype: np.dtype[Any], *, keep_extra: bool = False) -> tuple[Col
     in_file = tuple(name for name in names if name in known)
     if in_file != usual:
         moved = sum(have != want for have, want in zip(in_file, usual, strict=True))
-        text = f"{moved} columns stand in another place than usual: read by name"
+        text = f"{counted(moved, 'column')} in another place than usual: read by name"
         findings.append(Finding("shuffled-columns", moved, text, "note"))
     double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in _MEANS)
     columns = Columns(_MEANS, scales, _QUATS, _SH0, rest, _OPACITY, normals, extra, double)

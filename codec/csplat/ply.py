@@ -23,7 +23,7 @@ from typing import IO, Any
 import numpy as np
 import plyfile
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_packed_header
 from csplat.lint import Finding, find_columns, refuse
 from csplat.model import SplatModel
@@ -186,7 +186,7 @@ def _header_findings(header: bytes, size: int) -> list[Finding]:
     findings = []
     if not header.isascii():
         count = sum(byte > 127 for byte in header)
-        text = f"the header holds {count} bytes that are not ASCII: read as question marks"
+        text = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
         findings.append(Finding("non-ascii-header", count, text, "note"))
     for line in header.splitlines():
         words = line.split()
@@ -222,7 +222,7 @@ def _trailing_findings(path: Path, header_size: int, end: int | None, row_count:
         count = len(b"".join(lines[row_count:]).strip())
     if count == 0:
         return []
-    text = f"{count} bytes follow the last row: ignored"
+    text = f"{counted(count, 'byte')} after the last row: ignored"
     return [Finding("trailing-bytes", count, text, "repair")]
 
 

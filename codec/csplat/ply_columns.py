@@ -7,6 +7,7 @@ whole file it takes ten times that.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.errors import counted
 from csplat.lint import Columns, Finding
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
@@ -32,6 +34,7 @@ _FLAT_SCALE_STEP = 4.605170
 
 _HUGE_LOG = 88.0  # standard deviations beyond leave float32
 _HUGE_COLOUR = 1e6
+_USUAL_LENGTHS = (1e-3, 1e3)  # of rotations: they grow and shrink while a scene is trained
 
 
 @dataclass(eq=False)
@@ -55,6 +58,7 @@ class _Counts:
     nonfinite: int = 0
     zero_quats: int = 0
     unnormalised: int = 0
+    quat_lengths: tuple[float, float] = (math.inf, 0.0)  # of those that are not 0
     infinite_logits: int = 0
     normals: int = 0
     huge: int = 0
@@ -233,6 +237,10 @@ def _repair_quats(quats: F32, counts: _Counts) -> None:
     other = int(np.count_nonzero(np.abs(squared - 1.0) > 2.0 * QUAT_LENGTH_TOLERANCE))
     counts.zero_quats += zero
     counts.unnormalised += other - zero
+    if other > zero:
+        low, high = counts.quat_lengths
+        least = float(squared.min(where=squared > 0.0, initial=math.inf))
+        counts.quat_lengths = (min(low, math.sqrt(least)), max(high, math.sqrt(float(squared.max()))))
     quats[:] = normalise_quats(quats)
 
 
@@ -241,37 +249,40 @@ def _findings(counts: _Counts) -> list[Finding]:
         Finding(
             "nonfinite-rows",
             counts.nonfinite,
-            f"{counts.nonfinite} splats hold NaN or infinity: dropped",
+            f"{counted(counts.nonfinite, 'splat')} with NaN or infinity: dropped",
             "repair",
         ),
         Finding(
             "zero-quats",
             counts.zero_quats,
-            f"{counts.zero_quats} rotations have length 0: set to the identity",
+            f"{counted(counts.zero_quats, 'rotation')} of length 0: set to the identity",
             "repair",
         ),
         Finding(
             "unnormalised-quats",
             counts.unnormalised,
-            f"{counts.unnormalised} rotations are not of unit length: normalised",
+            f"{counted(counts.unnormalised, 'rotation')} not of unit length"
+            f" ({counts.quat_lengths[0]:.3g} to {counts.quat_lengths[1]:.3g}): normalised",
             "note",
+            usual=_USUAL_LENGTHS[0] <= counts.quat_lengths[0] and counts.quat_lengths[1] <= _USUAL_LENGTHS[1],
         ),
         Finding(
             "infinite-logits",
             counts.infinite_logits,
-            f"{counts.infinite_logits} opacities are infinite logits: alpha 0 or 1",
+            f"{counted(counts.infinite_logits, 'infinite logit')} of opacity: alpha 0 or 1",
             "note",
         ),
         Finding(
             "nonzero-normals",
             counts.normals,
-            f"{counts.normals} splats have normals, which splats do not use: dropped",
+            f"{counted(counts.normals, 'splat')} with normals, which splats do not use: dropped",
             "note",
         ),
         Finding(
             "huge-values",
             counts.huge,
-            f"{counts.huge} splats have log scales beyond ± {_HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}",
+            f"{counted(counts.huge, 'splat')} with log scales beyond ± {_HUGE_LOG:g}"
+            f" or colours beyond ± {_HUGE_COLOUR:g}",
             "note",
         ),
     ]

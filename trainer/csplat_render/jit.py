@@ -14,6 +14,7 @@ import numba as typed_numba
 import numpy as np
 from numba import extending as typed_extending
 from numba.core import compiler as typed_compiler
+from numba.core import event as typed_event
 
 from csplat.errors import InputError
 
@@ -25,6 +26,7 @@ __all__ = [
     "inline",
     "kernel",
     "lane_run",
+    "on_compiling",
     "parallel_kernel",
     "python",
     "relaxed_kernel",
@@ -36,6 +38,7 @@ __all__ = [
 numba: Any = typed_numba
 extending: Any = typed_extending
 compiler: Any = typed_compiler
+event: Any = typed_event
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -128,6 +131,28 @@ def parallel_kernel(
         )
 
     return decorate
+
+
+class _First(event.Listener):  # type: ignore[misc]  # numba's types are those of each version
+    """Calls something when the first kernel is compiled. Owns whether that was."""
+
+    def __init__(self, call: Callable[[], object]) -> None:
+        self._call, self._called = call, False
+
+    def on_start(self, event: Any) -> None:  # noqa: ARG002  # numba's
+        if not self._called:
+            self._called = True
+            self._call()
+
+    def on_end(self, event: Any) -> None:
+        """Nothing is to be done."""
+
+
+@contextmanager
+def on_compiling(call: Callable[[], object]) -> Iterator[None]:
+    """Call something once when a kernel is compiled meanwhile: not where all of them come from numba's cache."""
+    with event.install_listener("numba:compile", _First(call)):
+        yield
 
 
 def fast_exp2(x: float) -> float:

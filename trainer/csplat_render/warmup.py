@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,11 +10,11 @@ import numpy as np
 
 from csplat_render.arrays import Array
 from csplat_render.camera import Camera
+from csplat_render.jit import on_compiling
 from csplat_render.rasterise import Rasteriser, Splats
 
 __all__ = ["warm_up"]
 
-_SILENT_SECONDS = 1.0  # what loading compiled kernels from the cache may take
 _SIZE = 16  # pixels on each side of what is rendered
 
 
@@ -32,7 +31,7 @@ def warm_up(
     """Compile kernels, or load them from numba's cache, by putting them to a single splat.
 
     Args:
-        announce: called with one line if it takes longer than a second, and with another at its end.
+        announce: called with one line if anything has to be compiled, and with another at its end.
         gradients: the backward pass of the renderer too.
         simplify: what `measure_removal` and `fit_colours` run.
         ssim: what `metrics.ssim` runs.
@@ -43,11 +42,15 @@ def warm_up(
     Returns:
         Seconds that it took.
     """
-    started = time.perf_counter()
-    timer = threading.Timer(_SILENT_SECONDS, _say, [announce])
-    timer.daemon = True
-    timer.start()
-    try:
+    started, is_compiled = time.perf_counter(), False
+
+    def say() -> None:
+        nonlocal is_compiled
+        is_compiled = True
+        if announce is not None:
+            announce("compiling the renderer for this machine: about a minute; the result is kept for the next time")
+
+    with on_compiling(say):
         viewmat = np.eye(4)
         viewmat[2, 3] = 5.0
         camera = Camera(np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _SIZE, _SIZE)
@@ -61,10 +64,8 @@ def warm_up(
             _warm_up_metrics(picture.rgb, ssim=ssim, lpips=lpips)
         for call in others:
             call()
-    finally:
-        timer.cancel()
     seconds = time.perf_counter() - started
-    if announce is not None and seconds > _SILENT_SECONDS:
+    if announce is not None and is_compiled:
         announce(f"the renderer is compiled, in {seconds:.0f} s")
     return seconds
 
@@ -95,8 +96,3 @@ def _one_splat(dtype: Any) -> Splats:
     quat, shN = np.array([[1.0, 0.0, 0.0, 0.0]], dtype), np.zeros((1, 0, 3), dtype)
     zeros = np.zeros((1, 3), dtype)
     return Splats(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)
-
-
-def _say(announce: Callable[[str], object] | None) -> None:
-    if announce is not None:
-        announce("compiling the renderer for this machine; the result is kept for the next time")

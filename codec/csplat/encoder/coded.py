@@ -19,6 +19,7 @@ from csplat.encoder.scene import chosen_settings, file_chunks, file_scene, state
 from csplat.encoder.shape_tables import shape_book
 from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile
+from csplat.errors import counted
 from csplat.model import SplatModel
 
 if TYPE_CHECKING:
@@ -160,10 +161,12 @@ def _notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
     notes = []
     splats = sum(len(part.rows) for part in tiles)
     if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
-        notes.append(f"means: so small an error takes {len(tiles)} tiles, each of which takes bytes of its own")
+        notes.append(
+            f"means: so small an error takes {counted(len(tiles), 'tile')}, each of which takes bytes of its own"
+        )
     counts = Counter(name for part in tiles for name in part.coarsened)
     notes += [
-        f"{name}: huge values coarsen {count} of {len(tiles)} tiles; remove them, or see the stated errors"
+        f"{name}: huge values coarsen {count} of {counted(len(tiles), 'tile')}; remove them, or see the stated errors"
         for name, count in sorted(counts.items())
     ]
     return tuple(notes)

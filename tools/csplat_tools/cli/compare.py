@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from csplat.errors import counted
 from csplat_tools.cli.options import Lpips, Mode, Output, command
 from csplat_tools.cli.parsing import parse_mode
 from csplat_tools.cli.view_options import Split, Views, check_split
@@ -68,7 +69,7 @@ def compare(
     out.remark(*compared.notes)
     out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
     if pictures is not None:
-        out.remark(f"{len(compared.quality.each)} files in {pictures}")
+        out.remark(f"{counted(len(compared.quality.each), 'file')} in {pictures}")
 
 
 def _format(compared: FileComparison, a: str, b: str) -> str:
@@ -99,7 +100,7 @@ def _attributes(attributes: AttributeErrors) -> str:
     rows = [(name, f"{largest:.4g}", f"{rms:.4g}") for name, (largest, rms) in attributes.errors.items()]
     remark = _PAIRING[attributes.pairing]
     if attributes.unmatched:
-        remark += f"; {attributes.unmatched} splats of B have none in A"
+        remark += f"; {counted(attributes.unmatched, 'splat')} of B without one in A"
     return format_table(("error", "max", "rms"), rows) + f"\n{remark}"
 
 
@@ -137,12 +138,14 @@ def _photographs(scores: dict[str, Any]) -> str:
 
 def _cameras(compared: FileComparison) -> str:
     views = len(compared.quality.each)
-    return f"{views} virtual views" if compared.cameras == "virtual" else f"{views} views of {compared.cameras}"
+    if compared.cameras == "virtual":
+        return counted(views, "virtual view")
+    return f"{counted(views, 'view')} of {compared.cameras}"
 
 
 def _ignored(compared: FileComparison) -> list[str]:
     return [
-        f"{count} splats of {name} hold NaN or infinities and are not drawn"
+        f"{counted(count, 'splat')} of {name} with NaN or infinities, not drawn"
         for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)
         if count
     ]

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder, write_inputs
 from csplat_conformance.encoders.picturing import PictureJudge
@@ -202,7 +202,7 @@ def encoder(
     run.check(out)
     if folder is not None:
         made = write_inputs(_checked_folder(folder, force=out.force), run.pattern)
-        out.publish(made, f"{len(made['inputs'])} inputs in {folder}")
+        out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
     levels = tuple(f"L{number}" for number in parse_levels(level))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None

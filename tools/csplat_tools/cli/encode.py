@@ -11,7 +11,7 @@ import typer
 
 from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.options import Group, Importance, Output, SourceIndex, command
@@ -230,7 +230,7 @@ def _summary(encoded: Encoded) -> list[str]:
     ratio = encoded.source_bytes / report.size_bytes
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}"
     times = f"({ratio:.1f} times smaller{per_splat}), {encoded.seconds:.2f} s"
-    lines = [f"{report.splat_count} splats in {report.tile_count} tiles: {sizes} {times}"]
+    lines = [f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}: {sizes} {times}"]
     if report.errors:
         names = sorted(report.errors, key=list(MEASURE_NAMES.values()).index)
         rows = [(name, *(f"{value:.4g}" for value in report.errors[name])) for name in names]

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from csplat.decoder import StatedErrors
+from csplat.errors import counted
 from csplat.training import TRAINING, TrainedOn
 from csplat.upright import UP, up_of
 from csplat_tools.cli.options import Output, command
@@ -45,7 +46,7 @@ def _format(facts: FileFacts) -> str:
     parts = [
         _scene(facts),
         _sizes("attribute", facts.attributes, size, [_coding(one) for one in facts.attributes.values()]),
-        _sizes("layer", facts.layers, size, [f"{one.tiles} tiles" for one in facts.layers.values()]),
+        _sizes("layer", facts.layers, size, [counted(one.tiles, "tile") for one in facts.layers.values()]),
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in facts.overhead.items()),
     ]
     if facts.codebooks:
@@ -73,7 +74,7 @@ def _scene(facts: FileFacts) -> str:
     up = up_of(facts.metadata or {}, header.coordinate_system)
     lines = [
         f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}",
-        f"splats       {header.splat_count}, SH degree {header.sh_degree}",
+        f"splats       {header.splat_count:,}, SH degree {header.sh_degree}",
         f"axes         {header.coordinate_system}",
         f"up           {'unknown' if up is None else ' '.join(f'{value:g}' for value in up)}",
         f"unit         {'unknown' if header.unit_metres is None else f'{header.unit_metres:g} m'}",
@@ -139,11 +140,12 @@ def _coding(attribute: AttributeFacts) -> str:
 
 def _codebook(codebook: CodebookFacts) -> str:
     bands = f" bands {codebook.bands[0]} to {codebook.bands[-1]}" if codebook.bands else ""
-    return f"codebook {codebook.id}: {codebook.kind}{bands}, {codebook.entries} entries, {codebook.size_bytes} bytes"
+    size = f"{counted(codebook.entries, 'entry', 'entries')}, {counted(codebook.size_bytes, 'byte')}"
+    return f"codebook {codebook.id}: {codebook.kind}{bands}, {size}"
 
 
 def _stated_errors(stated: StatedErrors) -> str:
-    source = f"{stated.source_count} splats, SH degree {stated.source_sh_degree}"
+    source = f"{counted(stated.source_count, 'splat')}, SH degree {stated.source_sh_degree}"
     lines = [f"stands for a source of {source}; {stated.pruned_count} pruned"]
     if stated.refitted:
         lines.append("attributes were fitted anew: renders are the judge of those without an error here")

@@ -11,7 +11,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
@@ -158,9 +158,9 @@ class Output(Group):
             note(line)
 
     def findings(self, findings: Sequence[Finding]) -> None:
-        """Tell what lint noticed in a PLY; what was repaired is told in any case."""
+        """Tell what lint noticed in a PLY that is not usual; what was repaired is told in any case."""
         for one in findings:
-            if one.kind == "repair" or not self.quiet:
+            if one.kind == "repair" or not (self.quiet or one.usual):
                 note(str(one))
 
     def bar(self) -> AbstractContextManager[Progress | None]:
@@ -173,6 +173,7 @@ def command(
     one_of: Sequence[tuple[str, ...]] = (),
     needs: Mapping[str, tuple[str, ...]] | None = None,
     settings: Sequence[str] = (),
+    serves: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
 
@@ -182,6 +183,7 @@ def command(
         one_of, needs: as in `Group`, for options of several groups or of none.
         settings: dataclasses of which `--set` takes what has no option, as `module:name`; they come as a parameter
             `settings` of type `Settings`.
+        serves: it goes on until it is ended: nobody waits for it.
     """
 
     def made(function: Callable[..., None]) -> Callable[..., None]:
@@ -208,7 +210,9 @@ def command(
             }
             for group in values.values():
                 group.parse()
-            function(**given, **values)
+            quiet = any(isinstance(group, Output) and group.quiet for group in values.values())
+            with nullcontext() if serves else progress_bar(quiet=quiet):
+                function(**given, **values)
 
         flat.append(_help_all(functools.partial(_more_help, function, settings, options)))
         shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 
 import typer
 
+from csplat.errors import counted
 from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_mode, parse_size
 from csplat_tools.cli.view_options import Split, Upright, Views, check_split
@@ -100,6 +101,10 @@ def render(
             prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
         )  # fmt: skip
     if rendered.ignored_count:
-        note(f"{rendered.ignored_count} splats that hold NaN or infinities are not drawn")
-    out.remark(f"{len(cameras)} pictures in {output}" if film else f"{len(rendered.files)} files in {output}")
+        note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")
+    out.remark(
+        f"{counted(len(cameras), 'picture')} in {output}"
+        if film
+        else f"{counted(len(rendered.files), 'file')} in {output}"
+    )
     out.publish({"files": [str(file) for file in rendered.files], "ignored_splats": rendered.ignored_count})

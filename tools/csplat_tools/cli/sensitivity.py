@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from csplat.errors import counted
 from csplat_tools.cli.options import Output, Scene, Seed, Threads, command
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import format_table
@@ -64,7 +65,7 @@ def sensitivity(
 
 def _lines(facts: Mapping[str, Any]) -> list[str]:
     unseen = f"no view saw {facts['unseen']} of them ({100.0 * facts['unseen_share']:.2f} %)"
-    lines = [f"{facts['splats']} splats from {facts['views']} {facts['source']} views; {unseen}"]
+    lines = [f"{counted(facts['splats'], 'splat')} from {counted(facts['views'], facts['source'] + ' view')}; {unseen}"]
     if facts["missed_share"] is not None:
         lines.append(f"views that were kept aside saw {100.0 * facts['missed_share']:.2f} % more of the splats")
     rows = [

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from csplat.errors import counted
 from csplat_tools.cli.options import Output, Scene, Seed, SourceIndex, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
@@ -98,8 +99,8 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
     size = f"{views['size'][0]}x{views['size'][1]}"
     unseen = f"{100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
     lines = [
-        f"{before} -> {after} splats ({100.0 * after / before:.1f} %); gone: {gone}",
-        f"measured in {views['used']} views of {size}, checked in {views['check']} others; {unseen}",
+        f"{before:,} -> {counted(after, 'splat')} ({100.0 * after / before:.1f} %); gone: {gone}",
+        f"measured in {counted(views['used'], 'view')} of {size}, checked in {views['check']} others; {unseen}",
     ]
     rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
     rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))

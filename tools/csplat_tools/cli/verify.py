@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from csplat.errors import CsplatError
+from csplat.errors import CsplatError, counted
 from csplat_conformance.stated import MeasureProof, Proof
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.options import Output, command
@@ -61,8 +61,7 @@ def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
     violations = verified.validation.violations
     if violations:
         clauses = sorted({one.clause for one in violations})
-        many = "1 violation" if len(violations) == 1 else f"{len(violations)} violations"
-        note(f"error: {path}: {many} of {', '.join(clauses)}")
+        note(f"error: {path}: {counted(len(violations), 'violation')} of {', '.join(clauses)}")
     if unproved:
         note("error: the stated errors were not looked at")
     for failure in verified.proof.failures if verified.proof is not None else ():
@@ -73,7 +72,7 @@ def _report(verified: Verified) -> str:
     validation, proof = verified.validation, verified.proof
     lines = [*map(str, (*validation.violations, *validation.unread)), *(f"remark: {one}" for one in validation.remarks)]
     if validation.conforms:
-        lines.append(f"intact: {validation.splat_count} splats; checked: {', '.join(validation.checks)}")
+        lines.append(f"intact: {counted(validation.splat_count, 'splat')}; checked: {', '.join(validation.checks)}")
     if proof is not None:
         lines += [_table(proof)] * bool(proof.measures) + list(proof.notes)
         if proof.holds:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import webbrowser
+from contextlib import ExitStack
 from typing import Annotated
 
 import typer
 
 from csplat.decoder import decode_scene
+from csplat.errors import counted
 from csplat_tools.cli.encoder_options import Preset, check_preset
 from csplat_tools.cli.options import Output, Scene, command
 from csplat_tools.cli.view_options import Upright
@@ -25,7 +27,7 @@ _Cameras = Annotated[
 ]
 
 
-@command()
+@command(serves=True)
 def view(
     source: Scene,
     upright: Upright,
@@ -52,7 +54,9 @@ def view(
     check_preset(preset)
     out.check(inputs=(source, cameras))
     wishes = view_wishes(cameras, upright.upright())
-    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
+    with ExitStack() as stack:
+        with out.bar() as progress:
+            scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.findings([one for one in scene.findings if one.kind == "repair"])
@@ -110,4 +114,4 @@ def _encoded(scene: ViewScene, preset: str) -> list[str]:
     if not scene.encoded_from:
         return []
     sizes = f"{format_bytes(scene.encoded_from)} -> {format_bytes(scene.size_bytes)}"
-    return [f"encoded with the preset {preset}: {sizes}, {scene.header.splat_count} splats"]
+    return [f"encoded with the preset {preset}: {sizes}, {counted(scene.header.splat_count, 'splat')}"]

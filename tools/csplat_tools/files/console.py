@@ -1,12 +1,19 @@
-"""Data on standard output, everything else on standard error: messages, progress, tables."""
+"""Data on standard output, everything else on standard error: messages, progress, tables.
+
+Progress is a bar on a terminal, elsewhere a line now and then. There is one standard error, so one display at a time.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
 if TYPE_CHECKING:
@@ -14,9 +21,11 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 __all__ = [
+    "Display",
     "Progress",
     "finite",
     "format_bytes",
+    "format_seconds",
     "format_table",
     "note",
     "progress_bar",
@@ -25,7 +34,13 @@ __all__ = [
     "step_progress",
 ]
 
-_LINES = 10  # of progress where there is no terminal
+_PATIENCE = 2.0  # seconds for which a terminal shows nothing
+_EVERY = 10.0  # seconds from one line to the next where there is no terminal
+_LOOK = 0.2  # seconds from one look at the clock to the next
+_ENOUGH = (0.03, 1.0)  # share and seconds of a stage from which the rest of it is judged
+_STAGES = 2  # that are shown at a time: those that were told last
+_WORKING = "working"  # where no stage is known
+_MINUTES_FROM = 100.0  # seconds
 
 #: What is told how far long work has come: the name of the stage, and how much of it is done, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -51,27 +66,6 @@ def note(text: str) -> None:
     _echo(text, sys.stderr)
 
 
-@contextmanager
-def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
-    """Show a bar for each stage on standard error, if that is a terminal.
-
-    Yields:
-        The callback that moves the bars; `None` where none are shown.
-    """
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    with _bars("{task.description:<24}", timed=True) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, done: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=done)
-
-        yield report
-
-
 class Step(Protocol):
     """How far a long run has come."""
 
@@ -86,47 +80,105 @@ S = TypeVar("S", bound=Step)
 
 
 @contextmanager
-def step_progress(
-    name: str, tell: Callable[[S], str], *, iterations: int, log_every: int, quiet: bool = False
-) -> Iterator[Callable[[S], None] | None]:
-    """Show the steps of a long run: a bar on a terminal, some lines elsewhere, nothing where nothing is wanted.
+def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
+    """Show how far work has come; inside of another one, that one goes on.
+
+    Yields:
+        The callback that is told; `None` where nothing is shown.
+    """
+    with _displayed(quiet=quiet) as display:
+        yield None if display is None else display.tell
+
+
+@contextmanager
+def step_progress(name: str, tell: Callable[[S], str], *, quiet: bool = False) -> Iterator[Callable[[S], None] | None]:
+    """Show the steps of a long run as `progress_bar` does, in words of its own.
 
     Args:
         name: of what is done.
-        tell: says in a line where a run stands.
-        iterations: steps in all.
-        log_every: steps from one report to the next.
+        tell: says in a line where a run stands, and what is left.
         quiet: show nothing.
     """
-    if quiet:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        every = max(1, iterations // _LINES)
-
-        def line(now: S) -> None:
-            if now.iteration // every > (now.iteration - log_every) // every or now.iteration == now.iterations:
-                note(tell(now))
-
-        yield line
-        return
-    with _bars("{task.description}", timed=False) as bar:
-        task = bar.add_task(name, total=iterations)
-
-        def show(now: S) -> None:
-            bar.update(task, completed=now.iteration, description=tell(now))
-
-        yield show
+    with _displayed(quiet=quiet) as display:
+        yield None if display is None else partial(_tell_step, display, name, tell)
 
 
-def _bars(text: str, *, timed: bool) -> Bars:
-    """Bars on standard error that vanish in the end."""
-    from rich.console import Console  # takes longer to import than most commands to run
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
+@dataclass
+class _Stage:
+    """When a stage began, and what was told of it last."""
 
-    columns = (TextColumn(text), BarColumn(), TimeElapsedColumn()) if timed else (BarColumn(), TextColumn(text))
-    return Bars(*columns, console=Console(stderr=True), transient=True)
+    begun: float
+    done: float = 0.0
+    words: str | None = None
+
+
+class Display:
+    """What people see who wait. Owns when work and its stages began, and the bars.
+
+    A terminal shows nothing for two seconds, then a bar for each stage that goes on. Elsewhere there is a line every
+    ten seconds. `tick` is called often, whether anything was told or not: work that says nothing is seen to go on.
+
+    Args:
+        terminal: whether standard error is one.
+        clock: seconds.
+    """
+
+    def __init__(self, *, terminal: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self._terminal, self._clock, self._lock = terminal, clock, threading.RLock()
+        self._begun = self._said = clock()
+        self._stages: dict[str, _Stage] = {}
+        self._bars: Bars | None = None
+        self._tasks: dict[str, TaskID] = {}
+
+    def tell(self, stage: str, done: float, words: str | None = None) -> None:
+        """Note how far a stage has come.
+
+        Args:
+            stage: its name. What falls back has begun anew.
+            done: 0 to 1.
+            words: instead of share and time left.
+        """
+        with self._lock:
+            known = self._stages.pop(stage, None)
+            if known is None or done < known.done:
+                known = _Stage(self._clock())
+            known.done, known.words = done, words
+            self._stages[stage] = known  # behind the others: told last
+
+    def tick(self) -> None:
+        """Show what is to be seen now."""
+        with self._lock:
+            now = self._clock()
+            going = [(name, stage) for name, stage in self._stages.items() if stage.done < 1.0][-_STAGES:]
+            if self._terminal:
+                if now - self._begun >= _PATIENCE:
+                    self._move(going or [(_WORKING, _Stage(now))], now)
+            elif now - self._said >= _EVERY:
+                self._said = now
+                text = "; ".join(f"{name} {_words(stage, now)}".rstrip() for name, stage in going) or _WORKING
+                minutes, seconds = divmod(int(now - self._begun), 60)
+                note(f"{text}; {minutes}:{seconds:02d} so far")
+
+    def close(self) -> None:
+        """Take the bars away; they come again with the next tick."""
+        with self._lock:
+            if self._bars is not None:
+                self._bars.stop()
+            self._bars, self._tasks = None, {}
+
+    def _move(self, going: Sequence[tuple[str, _Stage]], now: float) -> None:
+        """Bring the bars up to date; those of stages that ended go."""
+        if self._bars is None:
+            self._bars = _new_bars()
+            self._bars.start()
+        for name in self._tasks.keys() - dict(going).keys():
+            self._bars.remove_task(self._tasks.pop(name))
+        for name, stage in going:
+            if name not in self._tasks:
+                self._tasks[name] = self._bars.add_task(name, words="")
+            total = 1.0 if stage.done > 0.0 else None  # a bar that only says that something goes on
+            self._bars.update(self._tasks[name], completed=stage.done, total=total, words=_words(stage, now))
+        self._bars.refresh()
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -154,6 +206,71 @@ def format_bytes(size_bytes: int) -> str:
     return f"{size_bytes} bytes"
 
 
+def format_seconds(seconds: float) -> str:
+    """Format a duration for people, who do not count: `12 s`, `3 minutes`."""
+    return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
+
+
+_displays: list[Display] = []  # the one that is shown: there is one standard error
+
+
+@contextmanager
+def _displayed(*, quiet: bool) -> Iterator[Display | None]:
+    if quiet:
+        yield None
+        return
+    if _displays:
+        yield _displays[0]
+        return
+    display, ended = Display(terminal=sys.stderr.isatty()), threading.Event()
+
+    def look() -> None:
+        while not ended.wait(_LOOK):
+            display.tick()
+
+    thread = threading.Thread(target=look, name="csplat progress", daemon=True)
+    thread.start()
+    try:
+        _displays.append(display)
+        yield display
+    finally:
+        _displays.clear()
+        ended.set()
+        thread.join()
+        display.close()
+
+
+def _tell_step(display: Display, name: str, tell: Callable[[S], str], now: S) -> None:
+    display.tell(name, now.iteration / now.iterations, tell(now))
+
+
+def _words(stage: _Stage, now: float) -> str:
+    """How far a stage has come, and how long the rest of it takes if it goes on like that."""
+    if stage.words is not None:
+        return stage.words
+    if stage.done <= 0.0:
+        return ""
+    share, seconds = f"{100.0 * stage.done:.0f} %", now - stage.begun
+    if stage.done < _ENOUGH[0] or seconds < _ENOUGH[1]:
+        return share
+    return f"{share}, about {format_seconds(seconds * (1.0 / stage.done - 1.0))} left"
+
+
+def _new_bars() -> Bars:
+    """Bars on standard error that vanish in the end. They redirect nothing: data stays on standard output."""
+    from rich.console import Console  # takes longer to import than most commands to run
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description:<24}"), BarColumn(), TextColumn("{task.fields[words]}"))
+    console = Console(stderr=True)
+    return Bars(
+        *columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+    )  # fmt: skip
+
+
 def _echo(text: str, stream: TextIO) -> None:
+    for display in _displays:
+        display.close()  # bars and lines on one terminal do not mix
     encoding = stream.encoding or "utf-8"  # file names and metadata may hold what it cannot
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from importlib import import_module
 
 from csplat.errors import InputError
-from csplat_tools.files.console import note
+from csplat_tools.files.console import note, progress_bar
 
 __all__ = [
     "missing",
@@ -36,12 +35,15 @@ def need_renderer() -> None:
     _need("numba")
 
 
-def prepare_renderer(*, quiet: bool, simplify: bool = False, ssim: bool = False, lpips: bool = False) -> None:
-    """Compile the renderer, or load what was compiled before; say so on a terminal if it takes its time.
+def prepare_renderer(
+    *, quiet: bool, gradients: bool = False, simplify: bool = False, ssim: bool = False, lpips: bool = False
+) -> None:
+    """Compile the renderer, or load what was compiled before; say so if it takes its time.
 
     Args:
         quiet: say nothing.
-        simplify: what simplification runs too.
+        gradients: what training runs too.
+        simplify: what simplification runs too, gradients among it.
         ssim: what SSIM runs too.
         lpips: what LPIPS runs too.
 
@@ -51,9 +53,16 @@ def prepare_renderer(*, quiet: bool, simplify: bool = False, ssim: bool = False,
     need_renderer()
     from csplat_render.warmup import warm_up
 
-    announce = None if quiet or not sys.stderr.isatty() else note
     others = [_warm_up_adam] if simplify else []
-    warm_up(announce, gradients=simplify, simplify=simplify, ssim=ssim, lpips=lpips, others=others)
+    with progress_bar(quiet=quiet) as tell:
+        if tell is not None:
+            tell("preparing the renderer", 0.0)
+        warm_up(
+            None if quiet else note, gradients=gradients or simplify, simplify=simplify, ssim=ssim, lpips=lpips,
+            others=others,
+        )  # fmt: skip
+        if tell is not None:
+            tell("preparing the renderer", 1.0)
 
 
 def need_trainer(*, plots: bool = False) -> None:

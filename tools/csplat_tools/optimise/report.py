@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from csplat.encoder import EncodeResult
+from csplat.errors import counted
 from csplat_tools.files.console import format_bytes
 
 __all__ = ["Optimised", "Report"]
@@ -64,7 +65,7 @@ class Report:
         if "psnr" in goal:
             asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
         if "keep" in goal:
-            asked.append(f"{100.0 * goal['keep']:g} % of {self.splats_before} splats")
+            asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
         if "max_loss" in goal:
             asked.append(f"a loss of {goal['max_loss']:g} dB by the photographs that decide")
         lines = [f"target: {'; '.join(asked)}"]
@@ -74,9 +75,9 @@ class Report:
         lines += [f"chosen: {line}" for line in self.why]
         if self.psnr is not None:
             lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
-        cost = f"{self.encodes} file{'s' if self.encodes > 1 else ''} tried"
+        cost = f"{counted(self.encodes, 'file')} tried"
         if self.renders:
-            cost += f", {self.renders} pictures judged"
+            cost += f", {counted(self.renders, 'picture')} judged"
         if self.sensitivity_views:
             cost += f", sensitivity measured in {self.sensitivity_views}"
         if self.removal_views:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from csplat.errors import counted
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.target import Target
@@ -18,7 +19,7 @@ _FAR = 0.3  # dB above a target
 
 def reported(
     target: Target, found: Trial, trials: Trials, *, splats_before: int, views_of: str, remarks: Sequence[str],
-    **counted: Any,
+    **numbers: Any,
 ) -> Report:  # fmt: skip
     """Report a search.
 
@@ -29,11 +30,15 @@ def reported(
         splats_before: of the scene.
         views_of: where the views that judge come from: `virtual`, or a name.
         remarks: further sentences.
-        counted: what else `Report` holds.
+        numbers: what else `Report` holds.
     """
     errors, spread = found.errors, spread_of(found.errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
-    many = f"{len(errors)} virtual views" if views_of == "virtual" else f"{len(errors)} views of {views_of}"
+    many = (
+        counted(len(errors), "virtual view")
+        if views_of == "virtual"
+        else f"{counted(len(errors), 'view')} of {views_of}"
+    )
     sure = (
         f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
     )
@@ -56,7 +61,7 @@ def reported(
         tried=tuple(trial.as_json() for trial in trials.made),
         why=(*_why(target, found, trials, splats_before), *remarks),
         sure=sure,
-        **counted,
+        **numbers,
     )
 
 
@@ -78,7 +83,9 @@ def _why(target: Target, found: Trial, trials: Trials, splats_before: int) -> li
     gone = splats_before - found.splats
     if gone:
         share = 100.0 * gone / splats_before
-        lines.append(f"{gone} splats ({share:.0f} %) are left out, the others fitted to what the source looks like")
+        lines.append(
+            f"{counted(gone, 'splat')} ({share:.0f} %) left out, the others fitted to what the source looks like"
+        )
     return lines
 
 

@@ -129,7 +129,7 @@ def measure_tradeoff(setting: Setting, wanted: Wanted, *, quiet: bool = True) ->
             for number, candidate in enumerate(tried):
                 report("the sweep", sum(costs[:number]) / sum(costs))
                 points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
-                if bar is None and not quiet:
+                if not quiet:
                     note(_line(points[-1], number + 1, len(tried)))
     first = points[0]
     if isinstance(first, Failure) and all(isinstance(one, Failure) for one in points):

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from csplat.decoder import decode
 from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Frozen, Origin
 from csplat.model import SplatModel
-from csplat_render import warmup
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
-from csplat_tools.files.console import Progress, note, progress_bar, step_progress
+from csplat_tools.files.console import Progress, progress_bar, step_progress
+from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
@@ -104,14 +104,13 @@ def run_finetuning(
     """
     clock, threads = Clock(), encoding.threads
     with thread_count(threads):
-        warmup.warm_up(None if quiet else note)
+        prepare_renderer(quiet=quiet, gradients=True)
         with progress_bar(quiet=quiet) as progress:
             plan = plan_tuning(
                 source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=importance,
                 progress=progress,
             )  # fmt: skip
-        shown = step_progress("tuning", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
-        with shown as show:
+        with step_progress("tuning", _state, quiet=quiet) as show:
             tuned = tune(plan, options, clock, files, threads=threads, show=show)
         result = tuned.result
         write_bytes(output, result.data)

@@ -8,6 +8,7 @@ from typing import Any
 
 from csplat.decoder import read_header
 from csplat.encoder import EncodeResult
+from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
 from csplat_tools.files.console import format_bytes, format_table
@@ -131,7 +132,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     left_out = f" ({' and '.join(words)} are left out)" if words else ""
     size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
-    lines = [f"{report['source_splats']} splats{left_out}: {size}, {ratio}"]
+    lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
     if report["scores"]:
         rows = [
             (name, *(_number(one[score], digits) for score, digits in _SCORES))
@@ -144,7 +145,10 @@ def format_report(report: Mapping[str, Any]) -> str:
     lines += ["", format_table(("bytes", "all", "per source splat"), rows_bytes)]
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in report["seconds"].items())
     stop = ", and nothing was gained any more" if report["settled"] else ""
-    lines += ["", f"{report['steps']} steps{stop}; the best stood at {report['best_step']}; seconds: {times}"]
+    lines += [
+        "",
+        f"{counted(report['steps'], 'step')}{stop}; the best stood at {report['best_step']}; seconds: {times}",
+    ]
     return "\n".join(lines)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.training import TrainedOn
-from csplat_render import warmup
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.files.console import note, step_progress
 from csplat_tools.files.convert import SceneOverrides
+from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import write_model
 from csplat_tools.views import DataOptions
 from csplat_trainer.checkpoint import load_checkpoint
@@ -61,11 +61,10 @@ def run_training(
     for line in () if quiet else pictures.report:
         note(line)
     pictures.read()  # a damaged picture is found before kernels are compiled
-    shown = step_progress("training", _state, iterations=options.iterations, log_every=options.log_every, quiet=quiet)
     with thread_count(threads):
         if options.device == "cpu":
-            warmup.warm_up(None if quiet else note)
-        with shown as show:
+            prepare_renderer(quiet=quiet, gradients=True)
+        with step_progress("training", _state, quiet=quiet) as show:
             result = train(pictures, options, show, files)
     write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
     if plot is not None:
@@ -94,15 +93,16 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
 
 def _state(now: TrainingStep) -> str:
     return (
-        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB, {now.splat_count} splats,"
-        f" SH {now.sh_degree}, {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
+        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
+        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}, {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
     )
 
 
 def _summary(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
-    text = f"{log['splat_count']} splats after {len(log['losses'])} steps, {log['seconds']:.1f} s"
+    text = f"{counted(log['splat_count'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
     if metrics is None:
         return text + "; no test pictures"
-    text += f"; {metrics['views']} test pictures: PSNR {metrics['psnr']:.2f} dB pooled, {metrics['psnr_mean']:.2f} mean"
+    text += f"; {counted(metrics['views'], 'test picture')}: PSNR {metrics['psnr']:.2f} dB pooled,"
+    text += f" {metrics['psnr_mean']:.2f} mean"
     text += f", SSIM {metrics['ssim']:.4f}"
     return text + (f", LPIPS {metrics['lpips']:.4f}" if metrics["lpips"] is not None else "")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED
 from csplat.upright import Direction, up_of_axes
 from csplat_render.camera import MAX_IMAGE_SIZE
@@ -64,8 +64,8 @@ def load(
     name = f"{found.kind} {path}"
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
-    points = "" if found.points is None else f", {len(found.points)} points"
-    counts = f"{len(found.train)} training and {len(found.test)} test pictures"
+    points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
+    counts = f"{len(found.train)} training and {counted(len(found.test), 'test picture')}"
     report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]

@@ -1,0 +1,119 @@
+"""What people see who wait: after how long, how often, in which words. The clock is the test's own."""
+
+import io
+import sys
+
+import pytest
+
+from csplat_tools.files import console
+from csplat_tools.files.console import Display, format_seconds, note, progress_bar, say, step_progress
+
+
+class Clock:
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def lines(display, clock, capsys, seconds):
+    """What is said while so many seconds go by, with ten looks at the clock in each."""
+    for _ in range(round(seconds * 10)):
+        clock.now += 0.1
+        display.tick()
+    return capsys.readouterr().err.splitlines()
+
+
+def test_without_a_terminal_there_is_a_line_every_ten_seconds(clock, capsys):
+    display = Display(terminal=False, clock=clock)
+    display.tell("reading", 1.0)
+    display.tell("encoding", 0.0)
+    assert [] == lines(display, clock, capsys, 9)
+    display.tell("encoding", 0.4)
+    assert ["encoding 40 %, about 15 s left; 0:10 so far"] == lines(display, clock, capsys, 2)
+    assert 3 == len(lines(display, clock, capsys, 30))
+
+
+def test_work_that_tells_nothing_is_seen_to_go_on(clock, capsys):
+    display = Display(terminal=False, clock=clock)
+    assert ["working; 0:10 so far"] == lines(display, clock, capsys, 11)
+    display.tell("matching", 0.0)
+    display.tell("matching", 1.0)
+    display.tell("preparing the renderer", 0.0)
+    assert ["preparing the renderer; 1:00 so far"] == lines(display, clock, capsys, 50)[-1:]
+
+
+def test_time_left_is_that_of_a_stage_that_began_anew(clock, capsys):
+    display = Display(terminal=False, clock=clock)
+    display.tell("tiles", 0.9)
+    clock.now += 1000.0
+    display.tell("tiles", 0.1)
+    clock.now += 20.0
+    display.tell("tiles", 0.5)
+    display.tick()
+    assert "tiles 50 %, about 20 s left; 17:00 so far\n" == capsys.readouterr().err
+
+
+def test_a_stage_may_have_words_of_its_own(clock, capsys, monkeypatch):
+    display = Display(terminal=False, clock=clock)
+    monkeypatch.setattr(console, "_displays", [display])
+    with step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
+        show(type("Step", (), {"iteration": 40, "iterations": 50})())
+    assert ["training step 40, 3 s left; 0:10 so far"] == lines(display, clock, capsys, 11)
+
+
+def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("TERM", "xterm")
+    display = Display(terminal=True, clock=clock)
+    display.tell("tiles", 0.25)
+    clock.now += 1.9
+    display.tick()
+    assert "" == sys.stderr.getvalue()
+    clock.now += 1.1
+    display.tick()
+    display.close()
+    assert "tiles" in sys.stderr.getvalue()
+    assert "25 %, about 9 s left" in sys.stderr.getvalue()
+
+
+def test_what_is_said_takes_the_bars_away_first(clock, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    display = Display(terminal=True, clock=clock)
+    monkeypatch.setattr(console, "_displays", [display])
+    clock.now += 5.0
+    display.tick()
+    assert display._bars is not None
+    say("data")
+    assert display._bars is None
+    display.tick()
+    note("a remark")
+    assert sys.stderr.getvalue().endswith("a remark\n")
+    assert "data\n" == capsys.readouterr().out  # and not on standard error, where bars are
+
+
+def test_the_quiet_and_the_inner_ones_show_nothing_of_their_own():
+    with progress_bar(quiet=True) as tell:
+        assert tell is None
+        assert [] == console._displays
+    with progress_bar() as outer, progress_bar() as inner:
+        assert outer == inner
+        assert 1 == len(console._displays)
+    assert [] == console._displays
+
+
+def test_durations_are_short():
+    assert ["0 s", "99 s", "2 minutes"] == [format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
