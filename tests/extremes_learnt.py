@@ -16,7 +16,6 @@ from csplat_render.judge import Judge, Look
 from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
-from csplat_tools.optimise.target import Target
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
@@ -52,7 +51,7 @@ def small_judge(name: str) -> Judge:
 @cache
 def half(name: str) -> Simplified:
     """The scene with half its splats."""
-    return simplify(learnt_from(name), target=Target(keep=0.5), options=FEW)
+    return simplify(learnt_from(name), keep=0.5, options=FEW)
 
 
 def photographs(name: str, points: np.ndarray | None = None) -> DataSet:

@@ -1,5 +1,6 @@
 """Whole files and parts of them; the files come from the conformance suite's writer, never from our encoder."""
 
+import io
 import mmap
 from dataclasses import replace
 
@@ -135,9 +136,10 @@ def test_any_buffer_will_do(tmp_path):
     path.write_bytes(RICH)
     full = decode(RICH)
     with path.open("rb") as file:
-        for data in (bytearray(RICH), memoryview(RICH), mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)):
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        for data in (bytearray(RICH), memoryview(RICH), mapped, file, io.BytesIO(RICH), path, str(path)):
             assert_same(full, decode(data))
-    for data in ("text", 5, None, memoryview(RICH)[::2]):
+    for data in (5, None, memoryview(RICH)[::2], io.StringIO("text")):
         with pytest.raises(InputError):
             decode(data)
 

@@ -32,9 +32,8 @@ from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
 from csplat_render.virtual import virtual_cameras
-from csplat_tools.optimise.optimiser import optimise
+from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.optimise.simplify import simplify
-from csplat_tools.optimise.target import Target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
 from csplat_trainer.loop import train
@@ -75,7 +74,7 @@ def test_half_the_splats_keep_what_the_guide_says(name):
 def test_a_simplified_file_states_what_holds(name):
     source = learnt_from(name)
     views, options = find_view_set(source, count=10, size=(60, 45)), replace(FEW, adjust=False)
-    result = optimise(source, Target(keep=0.5), views, simplifying=options).result
+    result = encode_to(source, keep=0.5, views=views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     proof = prove(
@@ -90,14 +89,14 @@ def test_a_simplified_file_states_what_holds(name):
 )
 def test_a_target_psnr_is_reached(name, most):
     source = learnt_from(name)
-    found = simplify(source, views_of(virtual_cameras(source, 16, 60, 45)), target=Target(psnr=33.0), options=FEW)
+    found = simplify(source, psnr=33.0, views=views_of(virtual_cameras(source, 16, 60, 45)), options=FEW)
     assert found.report["decided_psnr"] >= 33.0
     assert len(found.model) <= most * len(source)
 
 
 def test_a_fit_that_saturated_colours_mislead_is_refused():
     """The fit counts colours beyond 1 as they are, pictures do not show them."""
-    found = simplify(learnt_from("saturated SH"), target=Target(keep=0.97), options=FEW)
+    found = simplify(learnt_from("saturated SH"), keep=0.97, options=FEW)
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
     assert found.report["refit_refused"]
 

@@ -25,7 +25,7 @@ from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
 from csplat_tools.optimise import optimiser
-from csplat_tools.optimise.optimiser import expected_seconds, optimise
+from csplat_tools.optimise.optimiser import encode_to, expected_seconds
 from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance
@@ -49,8 +49,8 @@ def around(source, count=24):
 
 def within(source, views=None, encoding=None, *, simplifying=SMALL, keep_all=False, importance=None, **goal):
     """The file on a target."""
-    return optimise(
-        source, Target(**goal), views or around(source), encoding,
+    return encode_to(
+        source, **goal, views=views or around(source), options=encoding,
         keep_all=keep_all, importance=importance, simplifying=simplifying,
     )  # fmt: skip
 
@@ -92,13 +92,13 @@ def at_30(crowded):
 @pytest.fixture(scope="module")
 def at_1500(crowded):
     """What is found of the crowded scene within 1,500 bytes."""
-    return within(crowded, size_bytes=1500)
+    return within(crowded, size=1500)
 
 
 @pytest.fixture(scope="module")
 def at_half_a_decibel(crowded, photographed):
     """What is found of the crowded scene for 0.5 dB against photographs."""
-    return within(crowded, photographed, max_loss=0.5)
+    return within(crowded, photographed, loss=0.5)
 
 
 # looking for a number
@@ -186,21 +186,21 @@ def test_a_psnr_beyond_float32_is_refused(scene):
 
 
 def test_bounds_hold_beside_a_psnr_and_all_splats_stay(scene):
-    found = within(scene, psnr=30.0, max_error={"means": 1e-3})
+    found = within(scene, psnr=30.0, errors={"means": 1e-3})
     assert found.result.report.errors["means"][0] <= 1e-3
     assert 30.0 <= found.report.psnr <= 30.6  # files of so few splats jump
     assert 300 == found.report.splats
 
 
 def test_bounds_of_sh_hold_where_pictures_need_none(scene):
-    found = within(scene, psnr=18.0, max_error={"sh1": 1e-2})
+    found = within(scene, psnr=18.0, errors={"sh1": 1e-2})
     assert 1e-2 >= found.result.report.errors["sh1"][0] == found.report.reached["sh1"]
 
 
 @pytest.mark.parametrize("measure", ["opacities", "covariance"])
 def test_bounds_that_no_number_keeps_are_refused(scene, measure):
     with pytest.raises(InputError, match=f"no lattice keeps the error of {measure}"):
-        within(scene, max_error={measure: 1e-310}, size_bytes=10**6)
+        within(scene, errors={measure: 1e-310}, size=10**6)
 
 
 def test_so_few_splats_are_fitted_as_are_asked_for(scene):
@@ -224,18 +224,18 @@ def test_extreme_scenes_meet_a_psnr(name):
 
 @pytest.mark.parametrize("goal", [4500, 7000])
 def test_a_size_is_filled_and_not_exceeded(scene, goal):
-    kept = within(scene, size_bytes=goal, keep_all=True)
+    kept = within(scene, size=goal, keep_all=True)
     assert 0.97 * goal <= len(kept.result.data) <= goal
 
 
 @pytest.mark.parametrize("goal", [4500, 7000])
 def test_a_size_is_filled_and_not_exceeded_by_fewer_splats(scene, goal):
-    fewer = within(scene, around(scene, 64), size_bytes=goal)  # of so few the largest file is not always best
+    fewer = within(scene, around(scene, 64), size=goal)  # of so few the largest file is not always best
     assert 0.9 * goal <= len(fewer.result.data) <= goal
 
 
 def test_more_bytes_are_better_pictures(scene):
-    small, large = (within(scene, size_bytes=size, keep_all=True).report.psnr for size in (3000, 6000))
+    small, large = (within(scene, size=size, keep_all=True).report.psnr for size in (3000, 6000))
     assert large > small + 3.0
 
 
@@ -243,18 +243,18 @@ def test_a_size_that_starves_all_splats_is_met_by_fewer(crowded, at_1500):
     found = at_1500
     assert len(found.result.data) <= 1500
     assert found.report.splats < 900
-    without = within(crowded, None, EncodeOptions(sh_degree=0), size_bytes=1500)
+    without = within(crowded, None, EncodeOptions(sh_degree=0), size=1500)
     assert found.report.psnr > without.report.psnr - 0.2
 
 
 def test_a_size_below_all_files_is_refused(scene):
     with pytest.raises(InputError, match="no file with all splats has 300 bytes"):
-        within(scene, size_bytes=300, keep_all=True)
+        within(scene, size=300, keep_all=True)
     with pytest.raises(InputError, match="no file has 300 bytes"):
-        within(scene, size_bytes=300)
+        within(scene, size=300)
 
 
-@pytest.mark.parametrize(("goal", "counts"), [({"size_bytes": 5000}, (1, 1, 2)), ({"psnr": 32.0}, (1, 2))])
+@pytest.mark.parametrize(("goal", "counts"), [({"size": 5000}, (1, 1, 2)), ({"psnr": 32.0}, (1, 2))])
 def test_the_same_target_gives_the_same_bytes_at_any_number_of_threads(scene, goal, counts):
     files = [
         within(scene, None, EncodeOptions(threads=n), simplifying=replace(SMALL, threads=n), **goal).result.data
@@ -317,12 +317,12 @@ def test_a_loss_against_photographs_lets_splats_go(crowded, photographed, at_hal
     decider = with_deciders(photographed).photograph_decider()
     assert decider.psnr(decode(found.result.data)) >= decider.psnr(crowded) - 0.5
     assert found.report.splats < 900
-    assert len(found.result.data) < 0.9 * len(within(crowded, photographed, max_loss=0.5, keep_all=True).result.data)
+    assert len(found.result.data) < 0.9 * len(within(crowded, photographed, loss=0.5, keep_all=True).result.data)
 
 
 def test_a_loss_wants_photographs(scene):
     with pytest.raises(InputError, match="wants photographs"):
-        within(scene, max_loss=0.5)
+        within(scene, loss=0.5)
 
 
 # views
@@ -339,7 +339,7 @@ def test_no_view_that_judges_decides_or_teaches(crowded, photographed, monkeypat
 
     monkeypatch.setattr(optimiser, "Trials", lambda *parts: made.append(Trials(*parts)) or made[-1])
     monkeypatch.setattr(optimiser, "Removal", remove)
-    within(crowded, views, **({"max_loss": 1.0} if kind == "photographs" else {"psnr": 30.0}))
+    within(crowded, views, **({"loss": 1.0} if kind == "photographs" else {"psnr": 30.0}))
     trials = made[0]
     deciders = [trials.decider] if trials.photographs is None else [trials.decider, trials.photographs]
     judges, decides = poses(trials.judge.cameras), set.union(*(poses(one.cameras) for one in deciders))
@@ -356,9 +356,7 @@ def test_whoever_judges_does_not_choose_the_file_of_a_size_or_a_loss(
 ):
     size = kind == "size"
     one, views, goal = (
-        (at_1500, around(crowded), {"size_bytes": 1500})
-        if size
-        else (at_half_a_decibel, photographed, {"max_loss": 0.5})
+        (at_1500, around(crowded), {"size": 1500}) if size else (at_half_a_decibel, photographed, {"loss": 0.5})
     )
     judges = camera_sequence(crowded, 6, (64, 48), seed=7) if size else views.judges[::2]
     other = within(crowded, replace(views, judges=judges), **goal)

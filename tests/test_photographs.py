@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from csplat import EncodeOptions, encode, write_ply
+from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
 
@@ -19,8 +19,8 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 # Importing them needs what is looked for above.
 from csplat_render import render  # noqa: E402
 from csplat_render.cameras import intrinsics, look_at, relative_to  # noqa: E402
-from csplat_tools.inspect.compare import compare_files  # noqa: E402
-from csplat_tools.views import DataOptions  # noqa: E402
+from csplat_tools.inspect.compare import compare  # noqa: E402
+from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
 from csplat_trainer.evaluate import photograph_judge  # noqa: E402
 from csplat_trainer.pictures import Picture  # noqa: E402
 
@@ -151,7 +151,7 @@ def test_a_set_without_test_pictures_is_refused(scene, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     write_ply(tmp_path / "a.ply", scene)
     with pytest.raises(InputError, match="has no test pictures"):
-        compare_files(*[str(tmp_path / "a.ply")] * 2, data=DataOptions(str(data), test_every=0))
+        compare(scene, scene, views=find_view_set(scene, data=DataOptions(str(data), test_every=0)))
 
 
 def test_cameras_and_data_exclude_each_other(files, tmp_path):
@@ -160,7 +160,7 @@ def test_cameras_and_data_exclude_each_other(files, tmp_path):
     assert 2 == invoke("compare", *files, "--size", "32x24").exit_code
     assert 2 == invoke("compare", *files, "--data", tmp_path, "--split", "val").exit_code
     with pytest.raises(InputError, match="not both"):
-        compare_files(str(files[0]), str(files[1]), cameras="x.json", data=DataOptions(str(tmp_path)))
+        find_view_set(read_ply(files[0]), cameras="x.json", data=DataOptions(str(tmp_path)))
 
 
 def test_a_photograph_is_shown_in_front_of_the_background():
@@ -235,10 +235,10 @@ def test_the_renderer_is_made_ready_once_everything_is_read(files, tmp_path):
     told = []
     data = cameras(2)
     (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in data]))
-    compare_files(
-        str(files[0]),
-        str(files[1]),
-        cameras=str(tmp_path / "cameras.json"),
+    compare(
+        files[0],
+        files[1],
+        views=find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json")),
         prepare=lambda: told.append("prepare"),
         progress=lambda stage, _: told.append(stage),
     )

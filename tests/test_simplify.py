@@ -24,7 +24,6 @@ from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.order import removal_order
-from csplat_tools.optimise.target import Target
 from csplat_tools.study import prune_share
 from csplat_tools.views import camera_sequence, find_view_set, reduced
 from csplat_tools.views.agreeing import find_views, removal_keys
@@ -114,7 +113,7 @@ def test_exact_errors_choose_better_than_opacity(source):
     scores = {}
     for rounds in (1, SMALL.rounds):
         options = replace(SMALL, rounds=rounds, refit=False, bands=False, views=40)
-        scores[rounds] = judge.psnr(simplify(source, target=Target(keep=0.8), options=options).model)
+        scores[rounds] = judge.psnr(simplify(source, keep=0.8, options=options).model)
     by_opacity = [judge.psnr(prune_share(source, 0.8, by_area=by_area)[0]) for by_area in (False, True)]
     assert min(scores.values()) > max(by_opacity) + 3.0
 
@@ -123,7 +122,7 @@ def test_exact_errors_choose_better_than_opacity(source):
 
 
 def test_keeping_a_share_keeps_that_many_and_says_which(source):
-    result = simplify(source, target=Target(keep=0.5), options=SMALL)
+    result = simplify(source, keep=0.5, options=SMALL)
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
     np.testing.assert_array_equal(source.quats[result.source_index], result.model.quats)
@@ -138,7 +137,7 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     options = replace(SMALL, views=40, steps=8)
-    report = simplify(shell, target=Target(keep=0.5), options=options).report
+    report = simplify(shell, keep=0.5, options=options).report
     assert report["check_psnr"] > report["check_psnr_pruned"] + 0.5
     errors = report["fit_errors"][0]
     assert errors == sorted(errors, reverse=True)
@@ -146,7 +145,7 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
 
 def test_a_refit_that_serves_its_own_views_alone_is_refused(source):
     options = replace(SMALL, views=4, bands=False, adjust=False)
-    report = simplify(source, target=Target(keep=0.4), options=options).report
+    report = simplify(source, keep=0.4, options=options).report
     assert report["refit_refused"]
     assert report["check_psnr"] == report["check_psnr_pruned"]
 
@@ -157,7 +156,7 @@ def test_adjusted_opacities_and_scales_gain_on_views_that_were_not_used(source):
     scores = {}
     for adjusted in (False, True):
         options = replace(SMALL, views=40, steps=8, adjust=adjusted)
-        scores[adjusted] = simplify(shell, target=Target(keep=0.5), options=options).report["check_psnr"]
+        scores[adjusted] = simplify(shell, keep=0.5, options=options).report["check_psnr"]
     assert scores[True] > scores[False] + 0.3
 
 
@@ -186,7 +185,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
 @pytest.mark.parametrize("goal", [35.0, 28.0])
 def test_a_target_psnr_is_reached(source, goal):
     views = views_of(camera_sequence(source, 16, (48, 36), seed=3))
-    result = simplify(source, views, target=Target(psnr=goal), options=replace(SMALL, bands=False))
+    result = simplify(source, psnr=goal, views=views, options=replace(SMALL, bands=False))
     assert result.report["decided_psnr"] >= goal
     assert views.decider(source).psnr(result.model) == pytest.approx(result.report["decided_psnr"])
     assert len(result.model) < len(source)
@@ -201,7 +200,7 @@ def test_more_loss_lets_more_splats_go(source):
     judge = photograph_judge(views.pictures(views.decides), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = simplify(source, views, target=Target(max_loss=loss), options=replace(SMALL, bands=False))
+        result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False))
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -209,11 +208,11 @@ def test_more_loss_lets_more_splats_go(source):
 
 def test_a_loss_wants_photographs(source):
     with pytest.raises(InputError, match="name a data set"):
-        simplify(source, target=Target(max_loss=0.3), options=SMALL)
+        simplify(source, loss=0.3, options=SMALL)
 
 
 def test_nothing_changes_where_everything_stays(source):
-    result = simplify(source, target=Target(keep=1.0), options=replace(SMALL, refit=False))
+    result = simplify(source, keep=1.0, options=replace(SMALL, refit=False))
     assert len(result.model) == len(source)
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
@@ -228,13 +227,11 @@ def test_nothing_changes_where_everything_stays(source):
 )
 def test_as_many_stay_as_were_asked_for_and_one_at_least(source, keep, options, left):
     chosen = replace(SMALL, refit=False, bands=False, **options)
-    assert left == len(simplify(source, target=Target(keep=keep), options=chosen).model)
+    assert left == len(simplify(source, keep=keep, options=chosen).model)
 
 
 def test_the_result_does_not_depend_on_threads(source):
-    one, two = (
-        simplify(source, target=Target(keep=0.5), options=replace(SMALL, threads=threads)) for threads in (1, 2)
-    )
+    one, two = (simplify(source, keep=0.5, options=replace(SMALL, threads=threads)) for threads in (1, 2))
     np.testing.assert_array_equal(one.source_index, two.source_index)
     for name in ("opacities", "scales", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(one.model, name), getattr(two.model, name))
@@ -254,7 +251,7 @@ def test_bands_that_are_worth_less_than_their_bits_go():
 
 
 def test_bands_without_worth_are_zero_and_others_are_not(source):
-    result = simplify(source, target=Target(keep=0.4), options=SMALL)
+    result = simplify(source, keep=0.4, options=SMALL)
     stays = result.stays
     assert stays is not None
     assert 0 < np.count_nonzero(~stays) < stays.size
@@ -267,10 +264,10 @@ def test_bands_without_worth_are_zero_and_others_are_not(source):
 # errors
 
 
-def test_targets_of_files_and_options_out_of_range_are_refused(source):
-    for wrong in (Target(size_bytes=1000), Target(psnr=40.0, max_error={"means": 0.1})):
-        with pytest.raises(InputError, match="of files"):
-            simplify(source, target=wrong, options=SMALL)
+def test_several_targets_and_options_out_of_range_are_refused(source):
+    for given, says in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
+        with pytest.raises(InputError, match=says):
+            simplify(source, options=SMALL, **given)
     for wrong in ({"rounds": 0}, {"steps": 0}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):
             SimplifyOptions(**wrong)
@@ -278,7 +275,7 @@ def test_targets_of_files_and_options_out_of_range_are_refused(source):
 
 def test_an_empty_scene_is_refused(source):
     with pytest.raises(InputError, match="without splats"):
-        simplify(source.select(slice(0, 0)), target=Target(keep=0.5))
+        simplify(source.select(slice(0, 0)), keep=0.5)
 
 
 def test_decibels_are_read_with_and_without_their_unit():

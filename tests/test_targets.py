@@ -12,7 +12,8 @@ from csplat.encoder import encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
-from csplat_tools.optimise.bounds import encode_within, meet_bounds
+from csplat_tools.optimise.bounds import meet_bounds
+from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
@@ -103,7 +104,7 @@ def test_a_target_is_one_thing_within_its_range(asked, message):
     [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}],
 )
 def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
-    found = encode_within(scene, Target(max_error=bounds), EncodeOptions())
+    found = encode_to(scene, errors=bounds)
     proof = measure_errors(scene, decode(found.result.data), found.result.source_index)
     for name, bound in bounds.items():
         assert 0.3 * bound < proof[name][0] <= bound

@@ -32,9 +32,8 @@ _SIMPLIFY = """
 from csplat_tools.files.extras import prepare_renderer
 prepare_renderer(quiet=True, simplify=True)
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
-from csplat_tools.optimise.target import Target
 before = compiled()
-simplify(model, None, target=Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24)))
+simplify(model, keep=0.5, options=SimplifyOptions(views=2, view_size=(32, 24)))
 """
 _COMPARE = """
 warm_up(gradients=False, ssim=True, lpips=True)

@@ -1,9 +1,14 @@
 """csplat: a compressed format for 3D Gaussian splats.
 
     >>> import csplat
-    >>> model = csplat.read_ply("scene.ply")            # doctest: +SKIP
-    >>> data = csplat.encode(model)                     # doctest: +SKIP
-    >>> model = csplat.decode(data)                     # doctest: +SKIP
+    >>> model = csplat.read_ply("scene.ply")
+    >>> data = csplat.encode(model, csplat.EncodeOptions(preset="small"))
+    >>> model = csplat.decode(data)
+
+One rule for what goes in: where a *file* is read (`read_ply`, `decode`, `read_header`), a path, an open binary file and
+bytes are taken alike; where a *scene* is wanted (`encode`, `write_ply`, `to_gsplat`), it is a `SplatModel`.
+Errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` are the file's, `InputError` is the
+caller's; what the system says of a path stays an `OSError`.
 
 The names below load their modules when first used (PEP 562): `import csplat.decoder` brings in
 neither the encoder nor the PLY reader, so that a decoder can be embedded alone.
@@ -11,12 +16,14 @@ neither the encoder nor the PLY reader, so that a decoder can be embedded alone.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from csplat.decoder import decode, decode_integers, read_header
-    from csplat.encoder import EncodeOptions, encode
+    from csplat.decoder import decode, decode_integers, decode_scene, read_header
+    from csplat.encoder import EncodeOptions, EncodeResult, encode, encode_with_report
     from csplat.errors import (
         CsplatError,
         FormatError,
@@ -25,13 +32,14 @@ if TYPE_CHECKING:
         UnsupportedError,
     )
     from csplat.model import SplatModel
-    from csplat.ply import read_ply, write_ply
+    from csplat.ply import lint_ply, read_ply, write_ply
 
 __version__ = "0.1.0"
 
 __all__ = [
     "CsplatError",
     "EncodeOptions",
+    "EncodeResult",
     "FormatError",
     "InputError",
     "LimitError",
@@ -40,15 +48,39 @@ __all__ = [
     "__version__",
     "decode",
     "decode_integers",
+    "decode_scene",
     "encode",
+    "encode_with_report",
+    "lint_ply",
     "read_header",
     "read_ply",
     "write_ply",
 ]
 
+
+def lazy_exports(package: str, module_of: Mapping[str, str]) -> Callable[[str], object]:
+    """Make the `__getattr__` of a package whose names load their modules when first used (PEP 562).
+
+    Args:
+        package: its name.
+        module_of: by name, the module that has it.
+    """
+
+    def get(name: str) -> object:
+        module = module_of.get(name)
+        if module is None:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value: object = getattr(import_module(module), name)
+        setattr(sys.modules[package], name, value)  # the next access does not come here again
+        return value
+
+    return get
+
+
 _MODULE_OF = {
     "CsplatError": "csplat.errors",
     "EncodeOptions": "csplat.encoder",
+    "EncodeResult": "csplat.encoder",
     "FormatError": "csplat.errors",
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
@@ -56,20 +88,15 @@ _MODULE_OF = {
     "UnsupportedError": "csplat.errors",
     "decode": "csplat.decoder",
     "decode_integers": "csplat.decoder",
+    "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
+    "encode_with_report": "csplat.encoder",
+    "lint_ply": "csplat.ply",
     "read_header": "csplat.decoder",
     "read_ply": "csplat.ply",
     "write_ply": "csplat.ply",
 }
-
-
-def __getattr__(name: str) -> object:
-    module = _MODULE_OF.get(name)
-    if module is None:
-        raise AttributeError(f"module 'csplat' has no attribute {name!r}")
-    value: object = getattr(import_module(module), name)
-    globals()[name] = value  # the next access does not come here again
-    return value
+__getattr__ = lazy_exports(__name__, _MODULE_OF)
 
 
 def __dir__() -> list[str]:

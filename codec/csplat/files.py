@@ -1,20 +1,93 @@
-"""Writing files so that a reader never sees half of one, and reading arrays."""
+"""Files as callers name them: written so that a reader never sees half of one, read from wherever they are."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from mmap import mmap
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from tokenize import TokenError
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.inputs import File
 
-__all__ = ["atomic_writer", "read_array"]
+__all__ = ["BinaryWriter", "atomic_writer", "local_file", "opened_for_writing", "read_array"]
+
+_PART_SIZE = 1 << 20
+
+
+class BinaryWriter(Protocol):
+    """What `open(path, "wb")` and `io.BytesIO` give."""
+
+    def write(self, data: bytes | memoryview, /) -> object:
+        """Take some bytes."""
+        ...
+
+
+@contextmanager
+def local_file(file: File, name: str = "") -> Iterator[Path]:
+    """Give the path of a file that can be read twice. What is none is copied into a temporary one first.
+
+    Args:
+        file: a path; a binary file, read from where it stands; or bytes. Named pipes are copied, too.
+        name: of the copy, for messages; else that of the binary file, or "data".
+
+    Raises:
+        InputError: it is none of these, or a file of text.
+        OSError: it cannot be read.
+    """
+    if isinstance(file, (str, os.PathLike)):
+        path = Path(file)
+        if not path.is_fifo():
+            yield path
+            return
+        with path.open("rb") as pipe, local_file(pipe) as copied:
+            yield copied
+            return
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        said = getattr(file, "name", None)
+        spool = Path(folder) / (name or (Path(said).name if isinstance(said, str) else "") or "data")
+        with spool.open("wb") as stream:
+            for part in _parts(file):
+                stream.write(part)
+        yield spool
+
+
+def _parts(file: Any) -> Iterator[memoryview]:
+    """The bytes of what is no path, some at a time."""
+    try:
+        if isinstance(file, mmap) or not hasattr(file, "read"):
+            yield memoryview(file).cast("B")
+            return
+        while data := file.read(_PART_SIZE):
+            yield memoryview(data)
+    except TypeError as error:
+        raise InputError(
+            f"a {type(file).__name__} is no file, wanted a path, a binary file or bytes: {error}"
+        ) from None
+
+
+@contextmanager
+def opened_for_writing(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryWriter]:
+    """Give what to write a file to: `atomic_writer` of a path; an open binary file as it is, and it stays open.
+
+    Raises:
+        InputError: it is neither.
+        OSError: as of `atomic_writer`.
+    """
+    if isinstance(file, (str, os.PathLike)):
+        with atomic_writer(file) as stream:
+            yield stream
+    elif hasattr(file, "write"):
+        yield file
+    else:
+        raise InputError(f"a {type(file).__name__} is no file to write, wanted a path or a binary file")
 
 
 @contextmanager

@@ -23,6 +23,7 @@ __all__ = [
     "UNSPECIFIED",
     "SplatModel",
     "check_axes",
+    "check_model",
     "normalise_quats",
     "sh_degree_of",
 ]
@@ -148,6 +149,19 @@ class SplatModel:
             shN=self.shN[index],
             extra={name: column[index] for name, column in self.extra.items()},
             means_double=None if self.means_double is None else self.means_double[index],
+        )
+
+
+def check_model(caller: str, model: object) -> None:
+    """Refuse what is no model, naming what makes one.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not isinstance(model, SplatModel):
+        raise InputError(
+            f"{caller} takes a SplatModel, not a {type(model).__name__}: csplat.read_ply(file) makes one of a PLY,"
+            " csplat.decode(file) of a .csplat file"
         )
 
 

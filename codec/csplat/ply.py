@@ -13,7 +13,6 @@ was trained on, as `csplat.training` has it in the metadata).
 from __future__ import annotations
 
 import io
-import os
 import re
 import warnings
 from collections.abc import Iterator
@@ -24,7 +23,9 @@ import numpy as np
 import plyfile
 
 from csplat.errors import InputError, counted
+from csplat.files import local_file
 from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_packed_header
+from csplat.inputs import File
 from csplat.lint import Finding, find_columns, refuse
 from csplat.model import SplatModel
 from csplat.ply_columns import Rows, gather
@@ -41,7 +42,7 @@ _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay i
 
 
 def read_ply(
-    path: str | os.PathLike[str],
+    file: File,
     *,
     strict: bool = False,
     keep_extra: bool = False,
@@ -55,10 +56,18 @@ def read_ply(
     Header comments are kept in `metadata["comments"]`.
 
     Args:
-        path: the file.
+        file: its path; an open binary file, or the bytes, of which a temporary copy is made.
         strict: refuse what would be repaired (`csplat.lint` lists it).
         keep_extra: keep columns that splats do not have in `SplatModel.extra`.
         report: findings are appended to this list, repairs among them.
+
+    Example:
+        >>> import csplat
+        >>> model = csplat.read_ply("scene.ply")
+        >>> model
+        SplatModel(1983 splats, sh_degree=3)
+        >>> model.scales.shape, model.scales.dtype  # natural logarithms
+        ((1983, 3), dtype('float32'))
 
     Raises:
         InputError: not a PLY of splats (other splat formats are named, with a converter), or one
@@ -67,7 +76,8 @@ def read_ply(
     """
     findings: list[Finding] = []
     try:
-        model = _load(Path(path), findings, keep_extra=keep_extra, strict=strict)
+        with local_file(file) as path:
+            model = _load(path, findings, keep_extra=keep_extra, strict=strict)
     finally:
         if report is not None:
             report.extend(findings)
@@ -76,8 +86,11 @@ def read_ply(
     return model
 
 
-def lint_ply(path: str | os.PathLike[str]) -> list[Finding]:
+def lint_ply(file: File) -> list[Finding]:
     """Find out what is wrong with a PLY of splats, without refusing it.
+
+    Args:
+        file: as of `read_ply`.
 
     Returns:
         Findings in the order of reading; the last one is an error where `read_ply` would refuse.
@@ -87,7 +100,8 @@ def lint_ply(path: str | os.PathLike[str]) -> list[Finding]:
         OSError: the file cannot be read.
     """
     findings: list[Finding] = []
-    _load(Path(path), findings, keep_extra=False, strict=False)
+    with local_file(file) as path:
+        _load(path, findings, keep_extra=False, strict=False)
     return findings
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.files import atomic_writer
-from csplat.model import SplatModel
+from csplat.files import BinaryWriter, opened_for_writing
+from csplat.model import SplatModel, check_model
 from csplat.ply_columns import logits_of_alpha
 from csplat.ply_comments import format_comments
 
@@ -30,24 +30,30 @@ _PLY_TYPES = {
 }
 
 
-def write_ply(path: str | os.PathLike[str], model: SplatModel, *, absolute: bool = False) -> None:
+def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *, absolute: bool = False) -> None:
     """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
 
     Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow
     the others; cameras and metadata but comments, licence and training are not written.
 
     Args:
-        path: the file; it takes its name when it is complete, replacing an older one.
+        file: its path, which it takes when it is complete, replacing an older one; or an open binary file.
         model: the scene.
         absolute: write x, y and z as doubles with the origin added, for programs that take
             doubles. By default they are floats relative to the origin, which a comment names.
 
+    Example:
+        >>> import csplat
+        >>> model = csplat.read_ply("scene.ply")
+        >>> csplat.write_ply("half.ply", model.select(slice(0, None, 2)))
+
     Raises:
-        InputError: an extra column has a name or type that a PLY cannot hold.
+        InputError: an extra column has a name or type that a PLY cannot hold; or the model is none.
         OSError: the file cannot be written.
     """
+    check_model("write_ply", model)
     dtype = _row_dtype(model, absolute=absolute)
-    with atomic_writer(path) as stream:
+    with opened_for_writing(file) as stream:
         stream.write(_header(model, absolute=absolute))
         step = max(1, _BLOCK_SIZE // dtype.itemsize)
         rows = np.zeros(min(step, len(model)), dtype)

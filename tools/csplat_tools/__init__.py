@@ -1,11 +1,66 @@
-"""Command line, conversion, comparison and reports around the csplat codec."""
+"""Command line, conversion, comparison and reports around the csplat codec.
+
+    >>> import csplat_tools
+    >>> found = csplat_tools.encode_to("scene.ply", psnr=40.0)  # doctest: +SKIP
+    >>> compared = csplat_tools.compare("scene.ply", found.data)  # doctest: +SKIP
+
+The commands call these functions. A *scene* is a `SplatModel`, or a file of either kind: a path, an open binary file,
+or bytes. What renders wants the packages of the extra `render`, and says so. The names load their modules when first
+used.
+"""
 
 from __future__ import annotations
 
-from csplat import __version__
+from typing import TYPE_CHECKING
+
+from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
-__all__ = ["VERSIONS"]
+if TYPE_CHECKING:
+    from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
+    from csplat_tools.inspect.compare import Comparison, compare
+    from csplat_tools.optimise.optimiser import encode_to
+    from csplat_tools.optimise.report import Optimised
+    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+    from csplat_tools.views import DataOptions, ViewSet, find_view_set
+
+__all__ = [
+    "VERSIONS",
+    "Comparison",
+    "DataOptions",
+    "LoadedModel",
+    "Optimised",
+    "SceneLike",
+    "Simplified",
+    "SimplifyOptions",
+    "ViewSet",
+    "compare",
+    "encode_to",
+    "find_view_set",
+    "load_model",
+    "simplify",
+]
 
 #: Of the program and of the format.
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
+
+_MODULE_OF = {
+    "Comparison": "csplat_tools.inspect.compare",
+    "DataOptions": "csplat_tools.views",
+    "LoadedModel": "csplat_tools.files.scenes",
+    "Optimised": "csplat_tools.optimise.report",
+    "SceneLike": "csplat_tools.files.scenes",
+    "Simplified": "csplat_tools.optimise.simplify",
+    "SimplifyOptions": "csplat_tools.optimise.simplify",
+    "ViewSet": "csplat_tools.views",
+    "compare": "csplat_tools.inspect.compare",
+    "encode_to": "csplat_tools.optimise.optimiser",
+    "find_view_set": "csplat_tools.views",
+    "load_model": "csplat_tools.files.scenes",
+    "simplify": "csplat_tools.optimise.simplify",
+}
+__getattr__ = lazy_exports(__name__, _MODULE_OF)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from csplat_render.camera import Camera
+from csplat_render.conventions import Mode
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from csplat_render.arrays import HasSplats, RenderResult
 
-__all__ = ["Camera", "render"]
+__all__ = ["Camera", "Mode", "render"]
 
 
 def render(
@@ -21,7 +22,7 @@ def render(
     camera: Camera,
     *,
     background: ArrayLike = (0.0, 0.0, 0.0),
-    mode: str = "standard",
+    mode: Mode = "standard",
     antialiased: bool | None = None,
     sh_degree: int | None = None,
     threads: int | None = None,
@@ -38,6 +39,17 @@ def render(
         antialiased: apply the mip-splatting filter; None for what the model says.
         sh_degree: highest degree of the spherical harmonics; None for all there are.
         threads: how many; None for all.
+
+    Returns:
+        `rgb` [H, W, 3] float32, not clipped; `alpha` [H, W]; `depth` [H, W], scene units; and more.
+
+    Example:
+        >>> import csplat, csplat_render
+        >>> from csplat_render.virtual import orbit_cameras
+        >>> model = csplat.read_ply("scene.ply")
+        >>> camera = orbit_cameras(model, 1, 64, 48)[0]
+        >>> csplat_render.render(model, camera, mode="exact").rgb.shape
+        (48, 64, 3)
 
     Raises:
         InputError: shapes do not fit together, or an option is not one of these.

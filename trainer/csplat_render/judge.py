@@ -18,6 +18,7 @@ from csplat_render import metrics
 from csplat_render.arrays import RenderResult
 from csplat_render.camera import Camera
 from csplat_render.cameras import relative_to
+from csplat_render.conventions import Mode
 
 __all__ = ["Judge", "Look", "OnView", "renderer"]
 
@@ -63,7 +64,7 @@ class Judge:
     cameras: Sequence[Camera]
     looks: Sequence[Look | Callable[[], Look]]
     background: ArrayLike = (0.0, 0.0, 0.0)
-    mode: str = "standard"
+    mode: Mode = "standard"
     threads: int | None = None
     origin: Sequence[float] | None = None
 
@@ -80,7 +81,7 @@ class Judge:
         cameras: Sequence[Camera],
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
-        mode: str = "standard",
+        mode: Mode = "standard",
         threads: int | None = None,
     ) -> Judge:
         """Judge by what the source looks like.
@@ -173,7 +174,7 @@ class Judge:
 
 
 def renderer(
-    model: SplatModel, background: ArrayLike, *, mode: str = "standard", threads: int | None = None
+    model: SplatModel, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
     """What draws a scene from camera after camera, and keeps its memory in between.
 

@@ -26,7 +26,7 @@ from csplat_render.binning import (
 from csplat_render.blending import blend
 from csplat_render.blending_backward import RECORD, blend_backward
 from csplat_render.camera import Camera
-from csplat_render.conventions import ALPHA_CAP, Settings, settings_of, view_vector
+from csplat_render.conventions import ALPHA_CAP, Mode, Settings, settings_of, view_vector
 from csplat_render.jit import thread_count
 from csplat_render.projecting import BLOCK, project
 from csplat_render.projecting_backward import project_backward
@@ -74,7 +74,7 @@ class Rasteriser:
 
     def __init__(
         self,
-        mode: str = "standard",
+        mode: Mode = "standard",
         dtype: Any = np.float32,
         *,
         gradients: bool = True,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat_render.camera import Camera
+from csplat_render.conventions import Mode
 from csplat_render.judge import Judge, Look
 from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
 from csplat_trainer.pictures import Picture, compose
@@ -23,7 +24,7 @@ def photograph_judge(
     pictures: Sequence[Picture],
     background: ArrayLike,
     *,
-    mode: str = "standard",
+    mode: Mode = "standard",
     threads: int | None = None,
     origin: Sequence[float] | None = None,
 ) -> Judge:

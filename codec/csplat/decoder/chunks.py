@@ -12,30 +12,30 @@ from csplat.decoder.limits import Limits
 from csplat.decoder.stated import StatedErrors, read_serr
 
 if TYPE_CHECKING:
-    from csplat.decoder.container import Buffer
+    from csplat.inputs import File
 
 __all__ = ["read_cameras", "read_metadata", "read_options", "read_stated_errors"]
 
 
-def read_metadata(data: Buffer, *, limits: Limits | None = None) -> dict[str, Any] | None:
+def read_metadata(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
     """Return what the META chunk holds, `None` where there is none."""
     value: dict[str, Any] | None = _read_text(data, _spec.CHUNK_METADATA, limits)
     return value
 
 
-def read_cameras(data: Buffer, *, limits: Limits | None = None) -> list[dict[str, Any]] | None:
+def read_cameras(data: File, *, limits: Limits | None = None) -> list[dict[str, Any]] | None:
     """Return what the CAMS chunk holds, `None` where there is none."""
     value: list[dict[str, Any]] | None = _read_text(data, _spec.CHUNK_CAMERAS, limits)
     return value
 
 
-def read_options(data: Buffer, *, limits: Limits | None = None) -> dict[str, Any] | None:
+def read_options(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
     """Return what the OPTS chunk holds, `None` where there is none."""
     value: dict[str, Any] | None = _read_text(data, _spec.CHUNK_OPTIONS, limits)
     return value
 
 
-def read_stated_errors(data: Buffer) -> StatedErrors | None:
+def read_stated_errors(data: File) -> StatedErrors | None:
     """Return what the SERR chunk states, `None` where there is none."""
     view = view_of(data)
     check_length(view, read_file_header(view).file_size)
@@ -43,7 +43,7 @@ def read_stated_errors(data: Buffer) -> StatedErrors | None:
     return read_serr(view, header)
 
 
-def _read_text(data: Buffer, kind: bytes, limits: Limits | None) -> Any:
+def _read_text(data: File, kind: bytes, limits: Limits | None) -> Any:
     view = view_of(data)
     check_length(view, read_file_header(view).file_size)
     header = read_header(view)

@@ -6,18 +6,18 @@ is an offset in the file.
 
 from __future__ import annotations
 
+import mmap
+import os
 import zlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
 
 if TYPE_CHECKING:
-    from mmap import mmap
-
-    #: What a file may be handed in as (collections.abc.Buffer needs Python 3.12).
-    Buffer = bytes | bytearray | memoryview | mmap
+    from csplat.inputs import File
 
 __all__ = [
     "Cursor",
@@ -75,16 +75,35 @@ class Cursor:
             )
 
 
-def view_of(data: Buffer) -> memoryview:
-    """Return the bytes of a buffer (bytes, bytearray, memoryview, mmap) without copying them.
+def view_of(data: File) -> memoryview:
+    """Return the bytes of a file; those in memory are not copied, a path's are mapped.
+
+    Args:
+        data: a path; a binary file, which is read to its end; or a buffer (bytes, bytearray, memoryview, mmap).
 
     Raises:
-        InputError: not a buffer, or not a contiguous one.
+        InputError: it is none of these, or a buffer that is not contiguous, or a file of text.
+        OSError: it cannot be read.
     """
+    if isinstance(data, (str, os.PathLike)):
+        return memoryview(_mapped(data))
     try:
-        return memoryview(data).cast("B")
+        # An mmap is a buffer and a file; of others that are read, what comes has to be bytes.
+        read = None if isinstance(data, mmap.mmap) else getattr(data, "read", None)
+        return memoryview(data if read is None else read()).cast("B")  # type: ignore[arg-type]  # the except says so
     except (TypeError, ValueError) as error:
-        raise InputError(f"data is a {type(data).__name__}, wanted contiguous bytes: {error}") from None
+        raise InputError(
+            f"data is a {type(data).__name__}, wanted a path, a binary file or contiguous bytes: {error}"
+        ) from None
+
+
+def _mapped(path: str | os.PathLike[str]) -> bytes | mmap.mmap:
+    """A file in memory, without reading it where that is possible; it is closed when nobody looks at it any more."""
+    with Path(path).open("rb") as stream:
+        try:
+            return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        except (ValueError, OSError):  # empty, or a pipe
+            return stream.read()
 
 
 def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:

@@ -14,7 +14,7 @@ from csplat.decoder.index_tiles import SINGLE_MAX, SINGLE_MIN, STEP_MIN, check_c
 from csplat.errors import FormatError, UnsupportedError
 
 if TYPE_CHECKING:
-    from csplat.decoder.container import Buffer
+    from csplat.inputs import File
 
 __all__ = ["read_header"]
 
@@ -30,13 +30,13 @@ _RECORD_SIZES: Final = {
 }
 
 
-def read_header(data: Buffer) -> SceneHeader:
+def read_header(data: File) -> SceneHeader:
     """Read what a file's header and index say; the first HEADER_SIZE + index_size bytes suffice.
 
     The header's and the index's CRC are checked, chunks are not looked at.
 
     Args:
-        data: a file, or its beginning.
+        data: a file, as of `decode`, or its beginning.
 
     Raises:
         FormatError: a clause on header or index is broken; E_TRUNCATED where the data ends

@@ -27,7 +27,7 @@ from csplat.errors import InputError, LimitError
 from csplat.model import SplatModel
 
 if TYPE_CHECKING:
-    from csplat.decoder.container import Buffer
+    from csplat.inputs import File
 
 __all__ = [
     "DecodedTile",
@@ -100,7 +100,7 @@ class _Job:
 
 
 def decode(
-    data: Buffer,
+    data: File,
     *,
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
@@ -110,7 +110,7 @@ def decode(
     """Decode a file, or chosen tiles and SH bands of it.
 
     Args:
-        data: the whole file.
+        data: the whole file: its path, which is mapped into memory; an open binary file; or its bytes.
         limits: what it may take; the registry's defaults if left out.
         tiles: places of the tiles wanted, in the order wanted; all if left out.
         sh_degree: highest SH band wanted; all if left out, or if the file has fewer.
@@ -119,18 +119,27 @@ def decode(
     Returns:
         The splats. What is returned of a part equals the same part of a whole decode.
 
+    Example:
+        >>> import csplat
+        >>> model = csplat.decode("scene.csplat")
+        >>> model
+        SplatModel(1983 splats, sh_degree=3)
+        >>> csplat.decode("scene.csplat", sh_degree=1).shN.shape
+        (1983, 3, 3)
+
     Raises:
         FormatError: the file breaks a clause. A whole decode checks all of them, every chunk's
             CRC included; a part checks what it reads.
         UnsupportedError: the file asks for what this version does not have.
         LimitError: the file asks for more than `limits`.
         InputError: an argument is at fault.
+        OSError: the file cannot be read.
     """
     return decode_scene(data, limits=limits, tiles=tiles, sh_degree=sh_degree, threads=threads).model
 
 
 def decode_scene(
-    data: Buffer,
+    data: File,
     *,
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
@@ -159,7 +168,7 @@ def decode_scene(
 
 
 def decode_integers(
-    data: Buffer,
+    data: File,
     *,
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
@@ -186,7 +195,7 @@ def decode_integers(
 
 
 def iter_tiles(
-    data: Buffer,
+    data: File,
     *,
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
@@ -198,7 +207,7 @@ def iter_tiles(
     shows when it is its turn. `limits.splats` does not apply, `limits.bytes` to one tile at a time.
 
     Args:
-        data: the whole file; an `mmap` need not fit the memory.
+        data: as of `decode`; a path or an `mmap` need not fit the memory.
         limits: as of `decode`.
         tiles: as of `decode`.
         sh_degree: as of `decode`.
@@ -211,7 +220,7 @@ def iter_tiles(
     return _iterate(job)
 
 
-def _prepare(data: Buffer, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None) -> _Job:
+def _prepare(data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None) -> _Job:
     view = view_of(data)
     check_length(view, read_file_header(view).file_size)
     header = read_header(view)

@@ -15,7 +15,7 @@ from csplat.encoder.gauge import fix_gauge
 from csplat.encoder.grades import most_grades
 from csplat.encoder.importance import Importance, trusted
 from csplat.encoder.kmeans import cluster
-from csplat.encoder.options import PRESETS, EncodeOptions
+from csplat.encoder.options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
 from csplat.encoder.pipeline import encode, encode_with_report
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "Coded",
     "Curvatures",
     "DecodedValues",
+    "Deflate",
     "Draft",
     "EncodeOptions",
     "EncodeReport",
@@ -30,7 +31,10 @@ __all__ = [
     "FreeValues",
     "Frozen",
     "Importance",
+    "MeansCoding",
     "Origin",
+    "PresetName",
+    "ShCoding",
     "cluster",
     "encode",
     "encode_with_report",

@@ -45,7 +45,7 @@ from csplat.encoder.shape_tables import ShapeTables
 from csplat.encoder.tile import tile_order
 from csplat.encoder.tiling import Tile
 from csplat.errors import InputError
-from csplat.model import SplatModel
+from csplat.model import SplatModel, check_model
 
 __all__ = ["Draft", "Origin", "sample_rows"]
 
@@ -121,7 +121,11 @@ class Draft:
             InputError: values that no lattice can hold, an option that the model does not allow, an importance of
                 other splats, or an origin of others.
         """
-        options, origin = options or EncodeOptions(), origin or Origin(len(model), np.arange(len(model)))
+        check_model("the encoder", model)
+        options = EncodeOptions() if options is None else options
+        if not isinstance(options, EncodeOptions):
+            raise InputError(f"options is {options!r}, wanted csplat.EncodeOptions(preset=...)")
+        origin = origin or Origin(len(model), np.arange(len(model)))
         if len(origin.source_index) != len(model):
             raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
         model = _within_binary32(model)

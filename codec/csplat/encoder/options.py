@@ -6,12 +6,17 @@ import math
 import os
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Literal, get_args
 
 from csplat import _spec
 from csplat.errors import InputError
 
-__all__ = ["PRESETS", "EncodeOptions", "Preset"]
+__all__ = ["PRESETS", "Deflate", "EncodeOptions", "MeansCoding", "Preset", "PresetName", "ShCoding"]
+
+PresetName = Literal["fast", "balanced", "small"]
+MeansCoding = Literal["auto", "morton", "axis"]
+ShCoding = Literal["auto", "codebook", "scalar", "none"]
+Deflate = Literal["auto", "libdeflate", "zlib"]
 
 
 @dataclass(frozen=True)
@@ -54,14 +59,25 @@ class EncodeOptions:
         keep_extra: carry the model's extra columns.
         seed: of the k-means.
         threads: how many to use; `None` takes all cores. The bytes do not depend on it.
+
+    Example:
+        >>> import csplat
+        >>> csplat.EncodeOptions(preset="small", sh_degree=2).preset
+        'small'
+        >>> csplat.EncodeOptions(preset="tiny")
+        Traceback (most recent call last):
+        csplat.errors.InputError: preset is 'tiny', wanted one of fast, balanced, small
+
+    Raises:
+        InputError: a word is none of those listed, or a number is out of its range.
     """
 
-    preset: str = "balanced"
+    preset: PresetName = "balanced"
     attribute_psnr: float | None = None
     position_bits: int | None = None
     position_step: float | None = None
     position_error: float | None = None
-    means_coding: str = "auto"
+    means_coding: MeansCoding = "auto"
     scale_step: float | None = None
     opacity_levels: int | None = None
     quat_levels: int | None = None
@@ -69,7 +85,7 @@ class EncodeOptions:
     sh_step: float | None = None
     chroma_shift: int | None = None
     sh_degree: int | None = None
-    sh_coding: str = "auto"
+    sh_coding: ShCoding = "auto"
     codebook_size: int | None = None
     escape_fraction: float | None = None
     shape_codebook_size: int | None = None
@@ -78,7 +94,7 @@ class EncodeOptions:
     grades: int | None = None
     tile_splats: int = _spec.TILE_SPLATS_MAX
     deflate_level: int | None = None
-    deflate: str = "auto"
+    deflate: Deflate = "auto"
     keep_extra: bool = False
     seed: int = 0
     threads: int | None = None
@@ -130,7 +146,7 @@ class Preset:
 
     quality: tuple[float, float]
     sh_quality: float
-    sh_coding: str
+    sh_coding: ShCoding
     adaptive: float
     deflate_level: int
     codebook_share: float = 1 / 16
@@ -139,7 +155,7 @@ class Preset:
     escape_fraction: float = 0.02
 
 
-PRESETS = {
+PRESETS: dict[PresetName, Preset] = {
     # 255 entries and the escape are a byte, and found in no time; the escapes make up for how few they are.
     "fast": Preset((55.0, 63.5), 44.0, "auto", 0.5, 1, codebook_most=255, escape_fraction=0.2),
     "balanced": Preset((53.5, 53.2), 43.0, "auto", 0.5, 12),
@@ -147,10 +163,10 @@ PRESETS = {
 }
 
 _WORDS = {
-    "preset": tuple(PRESETS),
-    "means_coding": ("auto", "morton", "axis"),
-    "sh_coding": ("auto", "codebook", "scalar", "none"),
-    "deflate": ("auto", "libdeflate", "zlib"),
+    "preset": get_args(PresetName),
+    "means_coding": get_args(MeansCoding),
+    "sh_coding": get_args(ShCoding),
+    "deflate": get_args(Deflate),
 }
 _TINY, _HUGE = 1e-250, 1e250  # a float32 over the one, and the other over a float32, stay within float64
 _RANGES: dict[str, tuple[type[int | float], float, float]] = {

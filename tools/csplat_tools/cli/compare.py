@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from csplat.errors import counted
+from csplat.files import read_array
 from csplat_tools.cli.options import Lpips, Mode, Output, command
 from csplat_tools.cli.parsing import parse_mode
-from csplat_tools.cli.view_options import Split, Views, check_split
+from csplat_tools.cli.view_options import SplitWord, Views, check_split
 from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
+from csplat_tools.files.scenes import load_model
+from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.inspect.attributes import AttributeErrors
-from csplat_tools.inspect.compare import FileComparison, compare_files
+
+if TYPE_CHECKING:
+    from csplat_tools.inspect.compare import Comparison
 
 __all__ = ["compare"]
 
@@ -32,7 +37,7 @@ def compare(
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
     views: Views,
     out: Output,
-    split: Split = "test",
+    split: SplitWord = "test",
     source_index: Annotated[
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
     ] = None,
@@ -58,21 +63,28 @@ def compare(
       csplat compare scene.ply scene.csplat --pictures differences
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
+    import csplat_tools
+
     out.check(inputs=(a, b, views.cameras, source_index))
+    chosen, part = parse_mode(mode), check_split(split)
+    if a == b == STANDARD_STREAM:
+        raise typer.BadParameter("A and B cannot both be standard input")
+    need_renderer()
+    rows = None if source_index is None else read_array(source_index)
+    source = load_model(a)
+    around = views.find(source.model, out, count=0, split=part)
     with out.bar() as progress:
-        compared = compare_files(
-            a, b, cameras=views.cameras, data=views.photographs(), split=check_split(split), source_index=source_index,
-            lpips=lpips, pictures=pictures, amplification=amplify, background=views.colour, mode=parse_mode(mode),
-            force=out.force, prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None),
-            progress=progress,
+        compared = csplat_tools.compare(
+            source, b, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
+            background=views.colour, mode=chosen, force=out.force,
+            prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
-    out.remark(*compared.notes)
     out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
     if pictures is not None:
         out.remark(f"{counted(len(compared.quality.each), 'file')} in {pictures}")
 
 
-def _format(compared: FileComparison, a: str, b: str) -> str:
+def _format(compared: Comparison, a: str, b: str) -> str:
     parts = [_sizes(compared, a, b)]
     if compared.attributes is None:
         parts.append("errors of the splats are not known: which is which, `encode --source-index` writes down")
@@ -85,7 +97,7 @@ def _format(compared: FileComparison, a: str, b: str) -> str:
     return "\n\n".join(parts)
 
 
-def _sizes(compared: FileComparison, a: str, b: str) -> str:
+def _sizes(compared: Comparison, a: str, b: str) -> str:
     rows = []
     for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
         count = len(one.model)
@@ -104,7 +116,7 @@ def _attributes(attributes: AttributeErrors) -> str:
     return format_table(("error", "max", "rms"), rows) + f"\n{remark}"
 
 
-def _quality(compared: FileComparison) -> str:
+def _quality(compared: Comparison) -> str:
     quality = compared.quality
     rows = [
         ("psnr", f"{quality.psnr:.2f} dB"),
@@ -136,14 +148,14 @@ def _photographs(scores: dict[str, Any]) -> str:
     return format_table(header, rows)
 
 
-def _cameras(compared: FileComparison) -> str:
+def _cameras(compared: Comparison) -> str:
     views = len(compared.quality.each)
     if compared.cameras == "virtual":
         return counted(views, "virtual view")
     return f"{counted(views, 'view')} of {compared.cameras}"
 
 
-def _ignored(compared: FileComparison) -> list[str]:
+def _ignored(compared: Comparison) -> list[str]:
     return [
         f"{counted(count, 'splat')} of {name} with NaN or infinities, not drawn"
         for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)

@@ -195,25 +195,24 @@ def _reach(
     progress: Progress | None,
 ) -> EncodedScene:
     """The file that keeps to the target."""
+    import csplat_tools
     from csplat_tools.files.importance import read_weights
 
-    target = goal.read(model.unit_metres)
+    target, around = goal.read(model.unit_metres), None
     assert target is not None
     weights = None if importance is None else read_weights(importance, model)
-    if not target.is_rendered:
-        from csplat_tools.optimise.bounds import encode_within
-
-        made = encode_within(model, target, encoding, importance=weights, progress=progress)
-    else:
-        from csplat_tools.optimise.optimiser import expected_seconds, optimise
+    if target.is_rendered:
+        from csplat_tools.optimise.optimiser import expected_seconds
 
         around = views.find(model, out, **virtual.given())
         seconds = expected_seconds(model, encoding, target, keep_all=goal.keep_all)
         if seconds > _SECONDS_WORTH_SAYING:
             out.remark(_forecast(seconds, may_keep_all=not goal.keep_all and goal.keep is None))
-        made = optimise(
-            model, target, around, encoding, keep_all=goal.keep_all, importance=weights, progress=progress
-        )  # fmt: skip
+    made = csplat_tools.encode_to(
+        model, psnr=target.psnr, size=target.size_bytes, loss=target.max_loss, keep=target.keep,
+        errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
+        progress=progress,
+    )  # fmt: skip
     return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from csplat.encoder import PRESETS, EncodeOptions
+from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat_tools.cli.options import Group, chosen
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
@@ -94,10 +94,10 @@ class Encoding(Group):
         return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=facts.keep_extra)
 
 
-def check_preset(preset: str) -> None:
+def check_preset(preset: str) -> PresetName:
     """Refuse what is no preset.
 
     Raises:
         typer.BadParameter: it is none.
     """
-    chosen(EncodeOptions, preset=preset)
+    return chosen(EncodeOptions, preset=preset).preset

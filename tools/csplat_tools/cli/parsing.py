@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
 
 import typer
 
 from csplat.errors import InputError
 from csplat.model import check_axes
 from csplat.upright import Direction, unit_up
+
+if TYPE_CHECKING:
+    from csplat_render import Mode
 
 __all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_mode", "parse_size", "parse_up"]
 
@@ -75,7 +79,7 @@ def parse_axes(text: str) -> str:
     return text
 
 
-def parse_mode(text: str) -> str:
+def parse_mode(text: str) -> Mode:
     """A mode of the renderer.
 
     Raises:
@@ -83,9 +87,10 @@ def parse_mode(text: str) -> str:
     """
     from csplat_render.conventions import MODES  # not wanted by commands that render nothing
 
-    if text not in MODES:
-        raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
-    return text
+    for mode in MODES:
+        if mode == text:
+            return mode
+    raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
 
 
 def parse_decibels(text: str) -> float:

@@ -12,7 +12,7 @@ import typer
 from csplat.errors import counted
 from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_mode, parse_size
-from csplat_tools.cli.view_options import Split, Upright, Views, check_split
+from csplat_tools.cli.view_options import SplitWord, Upright, Views, check_split
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
@@ -56,7 +56,7 @@ def render(
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras on a circle around the scene.")
     ] = None,
-    split: Split = "test",
+    split: SplitWord = "test",
     fps: Annotated[
         float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Pictures per second of a film.")
     ] = DEFAULT_FPS,

@@ -68,12 +68,12 @@ def simplify(
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
     prepare_renderer(quiet=out.quiet, simplify=True)
+    import csplat_tools
     from csplat_tools.optimise.simplify import SimplifyOptions
-    from csplat_tools.optimise.simplify import simplify as simplified
     from csplat_tools.optimise.target import Target
 
     loss = None if max_loss is None else parse_decibels(max_loss)
-    target = chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)
+    chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
     out.check(output, inputs=(source, views.cameras), named={"--source-index": source_index})
     model = upright.upright().applied(load_model(source).model)
@@ -81,7 +81,9 @@ def simplify(
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])
     with out.bar() as progress:
-        result = simplified(model, around, target=target, options=options, progress=progress)
+        result = csplat_tools.simplify(
+            model, keep=keep, psnr=target_psnr, loss=loss, views=around, options=options, progress=progress
+        )
     write_model(output, result.model, absolute=False)
     if source_index is not None:
         write_array(source_index, result.source_index)

@@ -51,12 +51,12 @@ def view(
       csplat view scene.ply --preset small --up z
       csplat view scene.csplat --no-browser --port 8000
     """
-    check_preset(preset)
+    name = check_preset(preset)
     out.check(inputs=(source, cameras))
     wishes = view_wishes(cameras, upright.upright())
     with ExitStack() as stack:
         with out.bar() as progress:
-            scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
+            scene = stack.enter_context(open_scene(source, preset=name, progress=progress))
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.findings([one for one in scene.findings if one.kind == "repair"])
@@ -92,10 +92,10 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    check_preset(preset)
+    name = check_preset(preset)
     wishes = view_wishes(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
-    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
+    with out.bar() as progress, open_scene(source, preset=name, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
         exported = export_page(data, scene.name, wishes)

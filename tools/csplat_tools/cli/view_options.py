@@ -14,14 +14,14 @@ from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse
 from csplat_tools.files.convert import SceneOverrides
 
 if TYPE_CHECKING:
-    from csplat_tools.views import DataOptions, ViewSet
+    from csplat_tools.views import DataOptions, Split, ViewSet
 
-__all__ = ["Near", "Split", "Upright", "Views", "Virtual", "check_split"]
+__all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual", "check_split"]
 
 _DATA = "Photographs of --data (by default as the scene was trained)"
 _VIEWS = "Views (virtual ones by default)"
 
-Split = Annotated[str, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
+SplitWord = Annotated[str, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
 Near = Annotated[
     float | None, typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Their near plane.")
 ]
@@ -151,7 +151,7 @@ class Virtual(Group):
         return {name: value for name, value in (("count", self.views), ("size", size)) if value is not None}
 
 
-def check_split(split: str) -> str:
+def check_split(word: str) -> Split:
     """Refuse what is no part of a data set.
 
     Raises:
@@ -159,6 +159,7 @@ def check_split(split: str) -> str:
     """
     from csplat_tools.views import SPLITS
 
-    if split not in SPLITS:
-        raise typer.BadParameter(f"the split is {split!r}, wanted one of {', '.join(SPLITS)}")
-    return split
+    for split in SPLITS:
+        if split == word:
+            return split
+    raise typer.BadParameter(f"the split is {word!r}, wanted one of {', '.join(SPLITS)}")

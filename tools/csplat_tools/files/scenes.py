@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from csplat.decoder import SceneHeader, StatedErrors, decode_scene
+from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
 
-__all__ = ["LoadedModel", "load_model", "without_bands"]
+__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "without_bands"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +22,7 @@ class LoadedModel:
 
     Attributes:
         model: the splats.
-        size_bytes: of the file.
+        size_bytes: of the file; of a model that was in no file, that of its plain PLY.
         header: of a .csplat file; `None` for a PLY.
         stated_errors: of a .csplat file that states them.
     """
@@ -42,23 +43,46 @@ class LoadedModel:
         }
 
 
-def load_model(path: str) -> LoadedModel:
-    """Read a scene of either kind; which one its first bytes tell.
+#: A scene, as functions of this package take it: a model, or a file of either kind.
+SceneLike = SplatModel | LoadedModel | File
+
+
+def load_model(scene: SceneLike) -> LoadedModel:
+    """Read a scene of either kind, a PLY or a .csplat file; which one its first bytes tell.
 
     Args:
-        path: the file, or `-`.
+        scene: the file: a path, an open binary file, or bytes; as a path `-` is standard input. What is a model, or
+            loaded already, stays as it is.
+
+    Example:
+        >>> import csplat_tools
+        >>> scene = csplat_tools.load_model("scene.csplat")
+        >>> scene.model, scene.size_bytes, scene.header.tile_count
+        (SplatModel(8929 splats, sh_degree=3), 1, 1)
 
     Raises:
-        CsplatError: it is not valid.
+        CsplatError: it is not valid, or no file.
         OSError: it cannot be read.
     """
-    with local_path(path) as local:
+    if isinstance(scene, LoadedModel):
+        return scene
+    if isinstance(scene, SplatModel):
+        return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
+    with local_path(scene) as local:
         size_bytes = local.stat().st_size
         if not is_csplat(local):
             return LoadedModel(read_ply(local), size_bytes)
         with mapped_csplat(str(local)) as data:
-            scene = decode_scene(data)
-    return LoadedModel(scene.model, size_bytes, scene.header, scene.stated_errors)
+            decoded = decode_scene(data)
+    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors)
+
+
+def ply_splat_bytes(sh_degree: int) -> int:
+    """What a splat takes in a PLY of the INRIA trainer, whose columns are floats: 248 bytes at SH degree 3.
+
+    Position and normal, opacity, scale and rotation are 14; the rest are colours.
+    """
+    return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
 def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import io
 import json
 import mmap
-import shutil
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +20,8 @@ from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
 from csplat.errors import InputError
-from csplat.files import atomic_writer
+from csplat.files import atomic_writer, local_file
+from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat.ply import write_ply
 
@@ -97,35 +96,30 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
 
 
 @contextmanager
-def local_path(path: str) -> Iterator[Path]:
-    """Give the path of a file that can be read twice; standard input and named pipes are copied first.
+def local_path(file: File) -> Iterator[Path]:
+    """Give the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied first.
 
     Raises:
+        InputError: it is no file.
         OSError: it cannot be read.
     """
-    if path != STANDARD_STREAM and not Path(path).is_fifo():
-        yield Path(path)
-        return
-    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        spool = Path(folder) / "standard input"
-        with spool.open("wb") as stream:
-            if path == STANDARD_STREAM:
-                shutil.copyfileobj(sys.stdin.buffer, stream, 1 << 20)
-            else:
-                with Path(path).open("rb") as pipe:
-                    shutil.copyfileobj(pipe, stream, 1 << 20)
-        yield spool
+    if isinstance(file, str) and file == STANDARD_STREAM:
+        with local_file(sys.stdin.buffer, "standard input") as path:
+            yield path
+    else:
+        with local_file(file) as path:
+            yield path
 
 
 @contextmanager
-def ply_path(path: str) -> Iterator[Path]:
-    """Give the path of a PLY; standard input and named pipes go into a temporary file first.
+def ply_path(file: File) -> Iterator[Path]:
+    """Give the path of a PLY; what is no path of a file goes into a temporary one first.
 
     Raises:
         InputError: it is a .csplat file.
         OSError: it cannot be read.
     """
-    with local_path(path) as local:
+    with local_path(file) as local:
         if is_csplat(local):
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
@@ -206,12 +200,8 @@ def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:
     if path != STANDARD_STREAM:
         write_ply(path, model, absolute=absolute)
         return
-    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        spool = Path(folder) / "scene.ply"
-        write_ply(spool, model, absolute=absolute)
-        with spool.open("rb") as stream:
-            shutil.copyfileobj(stream, sys.stdout.buffer, 1 << 20)
-            sys.stdout.buffer.flush()
+    write_ply(sys.stdout.buffer, model, absolute=absolute)
+    sys.stdout.buffer.flush()
 
 
 def _refuse_ply(name: str, data: bytes) -> None:

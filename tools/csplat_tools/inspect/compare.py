@@ -1,7 +1,8 @@
-"""Two files compared in everything: what `csplat compare` does, apart from the command line."""
+"""Two scenes compared in everything: what `csplat compare` does, apart from the command line."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,18 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.files import read_array
+from csplat_render import Mode
 from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
-from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
-from csplat_tools.files.scenes import LoadedModel, load_model
+from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
 from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors
-from csplat_tools.views import Colour, DataOptions, find_view_set
+from csplat_tools.views import Colour, ViewSet, find_view_set
 
-__all__ = ["USUAL_WEIGHTS", "FileComparison", "compare_files"]
+__all__ = ["USUAL_WEIGHTS", "Comparison", "compare"]
 
 F32 = NDArray[np.float32]
 
@@ -31,8 +31,8 @@ USUAL_WEIGHTS = "auto"
 
 
 @dataclass(frozen=True, eq=False)
-class FileComparison:
-    """What was found out about two files.
+class Comparison:
+    """What was found out about two scenes.
 
     Attributes:
         a: the source.
@@ -45,7 +45,7 @@ class FileComparison:
             keys `split`, `a` and `b`; `None` where there is no data set.
         background, mode: of the pictures.
         notes: what the user should know of the views.
-        seconds: reading, matching, rendering and writing.
+        seconds: reading what was not in memory, matching, rendering and writing.
     """
 
     a: LoadedModel
@@ -56,7 +56,7 @@ class FileComparison:
     cameras: str
     photographs: dict[str, Any] | None
     background: Colour
-    mode: str
+    mode: Mode
     notes: tuple[str, ...]
     seconds: float
 
@@ -86,74 +86,72 @@ class FileComparison:
         }
 
 
-def compare_files(
-    a: str,
-    b: str,
+def compare(
+    a: SceneLike,
+    b: SceneLike,
     *,
-    cameras: str | None = None,
-    data: DataOptions | None = None,
-    split: str = "test",
-    source_index: str | None = None,
+    views: ViewSet | None = None,
+    source_index: NDArray[np.integer[Any]] | None = None,
     lpips: str | None = None,
-    pictures: str | None = None,
+    pictures: str | os.PathLike[str] | None = None,
     amplification: float = 10.0,
     background: Colour | None = None,
-    mode: str = "standard",
+    mode: Mode = "standard",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Progress | None = None,
-) -> FileComparison:
-    """Compare a file with its source.
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """Compare a scene with its source, as `csplat compare` does. Wants the packages of the render extra.
 
     Args:
-        a: the source, PLY or .csplat.
-        b: what became of it, PLY or .csplat.
-        cameras: a camera file, of which those cameras are taken that judge; the virtual cameras of A if left out.
-        data: instead: views of a data set, whose photographs judge A and B, too.
-        split: which of its photographs.
-        source_index: a .npy file, which splat of A each splat of B is.
+        a: the source: a model, or a file of either kind.
+        b: what became of it, likewise.
+        views: those that judge are looked from; where they are photographs, these judge A and B, too. `None`: the
+            eight virtual ones of `psnr`, 640×480, in front of black (`find_view_set`).
+        source_index: [N] which splat of A each splat of B is.
         lpips: a file of LPIPS weights, or `auto` for the usual places; it is not computed if left out.
         pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
         amplification: of the difference.
-        background: red, green, blue, 0..1; if left out black for virtual cameras, else as `find_view_set` says.
+        background: red, green, blue, 0..1; if left out that of the views.
         mode: of the renderer.
         force: existing pictures may be replaced.
         prepare: is called when all that is named has been read and checked, before the first picture.
-        progress: is told the stages.
+        progress: is told the stage and the share of it that is done, 0 to 1.
+
+    Example:
+        >>> import csplat_tools
+        >>> found = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
+        >>> found.ratio, found.quality.psnr, found.attributes.errors["means"]  # doctest: +SKIP
+        (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
-        CsplatError: a file is not valid, or exists; or no photograph judges; or the renderer is not installed.
+        CsplatError: a file is not valid, or exists; or no view judges; or the renderer is not installed.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
     need_renderer()
     if pictures is not None:
         need_pictures()
-    if a == b == "-":
-        raise InputError("A and B cannot both be standard input")
-    if cameras is not None and data is not None:
-        raise InputError("wanted cameras of a file or of a data set, not both")
     distance = None if lpips is None else load_lpips(None if lpips == USUAL_WEIGHTS else lpips)
-    rows = None if source_index is None else read_array(source_index)
     source, other = load_model(a), load_model(b)
-    views = find_view_set(source.model, cameras=cameras, data=data, background=background, count=0, split=split)
+    views = views or find_view_set(source.model, background=background, count=0)
     if not views.judges:
-        raise InputError(f"{views.name} has no {split} pictures")
+        raise InputError(f"{views.name} has no {views.split} pictures")
     by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
     viewers: list[OnView] = []
     if pictures is not None:
         names = picture_names([camera.image for camera in views.judges])
-        viewers.append(_Sheets(pictures, names, by_photographs, amplification, force=force))
-    errors = attribute_errors(source, other, rows, progress=progress)
+        viewers.append(_Sheets(os.fspath(pictures), names, by_photographs, amplification, force=force))
+    errors = attribute_errors(source, other, source_index, progress=progress)
     if prepare is not None:
         prepare()
     judges = None if by_photographs is None else _Both(by_photographs, distance)
     viewers += [] if judges is None else [judges]
     judge = views.judge(source.model, mode=mode, background=background)
     quality = judge.scores(other.model, lpips=distance, on_view=_all_of(viewers), progress=progress)
-    return FileComparison(
+    return Comparison(
         source, other, errors, quality, judge.look(0).ignored, views.name,
-        None if judges is None else {"split": split, **judges.as_json()},
+        None if judges is None else {"split": views.split, **judges.as_json()},
         views.background, mode, views.notes, time.perf_counter() - start,
     )  # fmt: skip
 

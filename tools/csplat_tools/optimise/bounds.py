@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,10 +13,8 @@ from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress
-from csplat_tools.optimise.report import Optimised, Report
-from csplat_tools.optimise.target import Target
 
-__all__ = ["Bounded", "encode_within", "meet_bounds"]
+__all__ = ["Bounded", "meet_bounds"]
 
 _TRIES = 12
 _NEAR = 0.9  # of a bound that is good enough; below it a coarser step is tried
@@ -44,39 +41,6 @@ class Bounded:
     encoding: EncodeOptions
     result: EncodeResult
     encodes: int
-
-
-def encode_within(
-    source: SplatModel,
-    target: Target,
-    encoding: EncodeOptions,
-    *,
-    importance: NDArray[Any] | Importance | None = None,
-    progress: Progress | None = None,
-) -> Optimised:
-    """The file that keeps to largest errors and to nothing else; nothing is rendered.
-
-    Args:
-        source: the scene.
-        target: largest errors.
-        encoding, importance, progress: as for `meet_bounds`.
-
-    Raises:
-        InputError: as `meet_bounds`.
-    """
-    start = time.perf_counter()
-    bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
-    result = bounded.result
-    report = Report(
-        goal=target.as_json(),
-        size_bytes=len(result.data),
-        splats=result.report.splat_count,
-        splats_before=len(source),
-        encodes=bounded.encodes,
-        seconds=round(time.perf_counter() - start, 3),
-        reached={name: result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
-    )
-    return Optimised(result, report)
 
 
 def meet_bounds(

@@ -96,3 +96,8 @@ class Optimised:
 
     result: EncodeResult
     report: Report
+
+    @property
+    def data(self) -> bytes:
+        """The file."""
+        return self.result.data

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance
+from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance, ShCoding
 from csplat.model import SplatModel
 from csplat_render.judge import Judge
 from csplat_render.metrics import psnr_of_mse
@@ -38,7 +38,7 @@ class Coding:
         graded: splats are sorted into grades by what was measured, if anything was; else nothing measured is heeded.
     """
 
-    sh: str | None
+    sh: ShCoding | None
     share: float | None = None
     degree: int | None = None
     adaptive: float | None = None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render import Camera, render
+from csplat_render import Camera, Mode, render
 from csplat_render.arrays import RenderResult
 from csplat_render.cameras import load_cameras, resized
 from csplat_render.virtual import orbit_cameras
@@ -21,7 +21,7 @@ from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
 from csplat_tools.files.streams import check_output, write_array
 from csplat_tools.present.film import check_film, write_film
-from csplat_tools.views import DataOptions, find_view_set
+from csplat_tools.views import DataOptions, Split, find_view_set
 
 __all__ = ["Rendered", "find_cameras", "render_film", "render_folder"]
 
@@ -50,7 +50,7 @@ def find_cameras(
     data: DataOptions | None = None,
     size: tuple[int, int] | None = None,
     *,
-    split: str = "test",
+    split: Split = "test",
 ) -> list[Camera]:
     """Get the cameras that a command line names: a file's, those of an orbit, or a data set's.
 
@@ -86,7 +86,7 @@ def render_folder(
     folder: str,
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    mode: str = "standard",
+    mode: Mode = "standard",
     depth: bool = False,
     alpha: bool = False,
     force: bool = False,
@@ -141,7 +141,7 @@ def render_film(
     *,
     fps: float,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    mode: str = "standard",
+    mode: Mode = "standard",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
     progress: Progress | None = None,
@@ -176,7 +176,7 @@ def _pictures(
     model: SplatModel,
     cameras: Sequence[Camera],
     background: tuple[float, float, float],
-    mode: str,
+    mode: Mode,
     prepare: Callable[[], object] | None,
     progress: Progress | None,
 ) -> Iterator[RenderResult]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, read_header
-from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import FormatError
 from csplat.lint import Finding
 from csplat_render.cameras import load_cameras
@@ -47,7 +47,7 @@ class ViewScene:
 
 
 @contextmanager
-def open_scene(path: str, *, preset: str, progress: Progress | None = None) -> Iterator[ViewScene]:
+def open_scene(path: str, *, preset: PresetName, progress: Progress | None = None) -> Iterator[ViewScene]:
     """Get a scene ready: check the header of a .csplat file, encode a PLY.
 
     Args:
@@ -105,7 +105,7 @@ def _checked(path: Path, stem: str) -> ViewScene:
     return ViewScene(f"{stem}.csplat", path, size, header)
 
 
-def _encoded(path: Path, stem: str, preset: str, progress: Progress | None) -> ViewScene:
+def _encoded(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewScene:
     source = read_source(str(path), progress=progress)
     data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
     return ViewScene(f"{stem}.csplat", data, len(data), read_header(data), source.findings, source.size_bytes)

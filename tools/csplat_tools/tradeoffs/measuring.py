@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
+from csplat_render import Mode
 from csplat_render.cameras import relative_to
 from csplat_render.judge import renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
@@ -73,14 +74,14 @@ class Measurer:
         source_photographs: the source's scores against photographs, where there are some.
     """
 
-    def __init__(self, setting: Setting, modes: Sequence[str], threads: int | None) -> None:
+    def __init__(self, setting: Setting, modes: Sequence[Mode], threads: int | None) -> None:
         self._setting, self._modes, self._threads = setting, modes, threads
         views = setting.views
         self._judge = views.judge(setting.source, threads=threads)
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
         places = evenly(range(len(views.judges)), TIMED_VIEWS)
         self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
-        self.source_modes = {mode: self._mode_time(setting.source, mode) for mode in modes}
+        self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
 
     def measure(self, candidate: Candidate, progress: Progress) -> Point:
@@ -96,7 +97,7 @@ class Measurer:
         decoded, decode_seconds = self._decoded(made.data, None)
         worst = WorstView()
         quality, photographs = self._compared(decoded, worst)
-        modes = {mode: self._mode_time(decoded, mode) for mode in self._modes}
+        modes: dict[str, ModeTime] = {mode: self._mode_time(decoded, mode) for mode in self._modes}
         return Point(
             name=candidate.name,
             family=candidate.family,
@@ -166,7 +167,7 @@ class Measurer:
         ]
         return Scores.of(each)
 
-    def _mode_time(self, model: SplatModel, mode: str) -> ModeTime:
+    def _mode_time(self, model: SplatModel, mode: Mode) -> ModeTime:
         """Render the timed views, after one that is not timed: it allocates."""
         shift = np.subtract(model.origin, self._setting.source.origin)
         views = [(relative_to(shift, camera), wanted) for camera, wanted in self._timed]

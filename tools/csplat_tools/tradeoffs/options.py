@@ -7,8 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from csplat.encoder import PRESETS
+from csplat.encoder import PRESETS, PresetName
 from csplat.errors import InputError
+from csplat_render import Mode
 from csplat_tools.optimise.target import parse_size_bytes
 
 __all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
@@ -44,14 +45,14 @@ class Wanted:
     """
 
     what: tuple[str, ...] = USUAL
-    preset: str = "balanced"
+    preset: PresetName = "balanced"
     attribute_psnr: tuple[float, ...] = (32.0, 36.0, 40.0, 44.0, 48.0, 56.0)
     psnr: tuple[float, ...] = (36.0, 40.0, 44.0)
     sizes: tuple[int, ...] = ()
     keep: tuple[float, ...] = (0.7, 0.5, 0.3)
     opacities: tuple[float, ...] = (0.005, 0.02, 0.1)
     kmeans: tuple[float, ...] = (256, 4096)
-    modes: tuple[str, ...] = ("standard", "fast")
+    modes: tuple[Mode, ...] = ("standard", "fast")
     iterations: int = 1_000
     threads: int | None = None
 

@@ -10,8 +10,7 @@ from typing import Any
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress, format_bytes
-from csplat_tools.optimise.optimiser import optimise
-from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoffs.options import Wanted
 from csplat_tools.tradeoffs.points import TriedFile
@@ -105,7 +104,7 @@ def _targets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for psnr in wanted.psnr:
         yield Candidate(f"target {psnr:g} dB", "targets", partial(_reach, setting, wanted, psnr=psnr))
     for size in wanted.sizes:
-        yield Candidate(f"target {format_bytes(size)}", "targets", partial(_reach, setting, wanted, size_bytes=size))
+        yield Candidate(f"target {format_bytes(size)}", "targets", partial(_reach, setting, wanted, size=size))
 
 
 def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
@@ -134,7 +133,7 @@ def _reduce(setting: Setting, wanted: Wanted, reduction: Reduction, progress: Pr
 
 def _reach(setting: Setting, wanted: Wanted, progress: Progress, **asked: Any) -> TriedFile:
     options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
-    found = optimise(setting.source, Target(**asked), setting.views, options, progress=progress)
+    found = encode_to(setting.source, views=setting.views, options=options, progress=progress, **asked)
     return _made(found.result, target=found.report.as_json())
 
 

@@ -18,7 +18,6 @@ from csplat_tools.files.console import Progress
 from csplat_tools.files.importance import read_importance
 from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
-from csplat_tools.optimise.target import Target
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -134,5 +133,5 @@ def _simplified(
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(threads=threads)
-    result = simplify(model, views, target=Target(keep=keep), options=options, progress=progress)
+    result = simplify(model, keep=keep, views=views, options=options, progress=progress)
     return result.model, result.source_index

@@ -12,10 +12,11 @@ from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
 from csplat_tools.files.console import format_bytes, format_table
+from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.views import ViewSet
 
-__all__ = ["Judged", "as_report", "format_report", "judge_models", "ply_splat_bytes"]
+__all__ = ["Judged", "as_report", "format_report", "judge_models"]
 
 _SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
 
@@ -61,14 +62,6 @@ def judge_models(
             found = judge.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score, _ in _SCORES}
     return Judged("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
-
-
-def ply_splat_bytes(sh_degree: int) -> int:
-    """What a splat takes in a PLY of the INRIA trainer, whose columns are floats: 248 bytes at SH degree 3.
-
-    Position and normal, opacity, scale and rotation are 14; the rest are colours.
-    """
-    return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
 def as_report(

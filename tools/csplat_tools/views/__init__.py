@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from csplat_tools.views.finding import SPLITS, DataOptions, comparison_cameras, find_view_set, with_deciders
+from csplat_tools.views.finding import DataOptions, comparison_cameras, find_view_set, with_deciders
 from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced
-from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet
+from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet
 
 __all__ = [
     "BLACK",
@@ -16,6 +16,7 @@ __all__ = [
     "WHITE",
     "Colour",
     "DataOptions",
+    "Split",
     "ViewSet",
     "camera_sequence",
     "comparison_cameras",

@@ -23,15 +23,12 @@ from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.files.extras import need_photographs
 from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly
-from csplat_tools.views.viewset import BLACK, VIRTUAL, WHITE, Colour, ViewSet, pose
+from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, pose
 
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
 
-__all__ = ["SPLITS", "DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
-
-#: Parts of a data set: the photographs that were held out of training, and the others.
-SPLITS = ("test", "train")
+__all__ = ["DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
 
 _JUDGING = (8, 640, 480)  # the views of `psnr`
 _ENOUGH = 40  # cameras of a file that they may teach and judge
@@ -75,7 +72,7 @@ def find_view_set(
     size: tuple[int, int] = VIEW_SIZE,
     seed: int = 0,
     aside: int | None = None,
-    split: str = "test",
+    split: Split = "test",
 ) -> ViewSet:
     """Read or place views, and give each its role; see the table above.
 
@@ -141,7 +138,7 @@ def _of_file(
 
 
 def _of_data(
-    source: SplatModel, data: DataOptions, background: Colour | None, aside: int | None, split: str
+    source: SplatModel, data: DataOptions, background: Colour | None, aside: int | None, split: Split
 ) -> ViewSet:
     need_photographs()
     from csplat_trainer.data import load
@@ -161,7 +158,7 @@ def _of_data(
     decides, teaches = _apart(apart, aside)
     return ViewSet(
         _named_file(data.path), colour, teaches, decides, [one.camera for one in test], [*train, *test],
-        origin=source.origin, notes=(*found.report, *notes, *more),
+        origin=source.origin, notes=(*found.report, *notes, *more), split=split,
     )  # fmt: skip
 
 

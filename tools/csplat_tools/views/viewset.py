@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render import Camera
+from csplat_render import Camera, Mode
 from csplat_render.judge import Judge
 
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
 
-__all__ = ["BLACK", "VIRTUAL", "WHITE", "Colour", "ViewSet", "pose"]
+__all__ = ["BLACK", "SPLITS", "VIRTUAL", "WHITE", "Colour", "Split", "ViewSet", "pose"]
 
 Colour = tuple[float, float, float]
 
@@ -25,6 +25,10 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 #: The name of a set whose judging views are virtual: those of `psnr`.
 VIRTUAL = "virtual"
+
+#: Parts of a data set: the photographs that were held out of training, and the others.
+Split = Literal["test", "train"]
+SPLITS: tuple[Split, ...] = get_args(Split)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,7 @@ class ViewSet:
         virtual: whether the views that teach and decide were placed around the scene by us.
         origin: what all cameras are relative to: the scene's.
         notes: what the user should know of how the set came about, a line each.
+        split: which photographs of a data set judge: those that were held out, or those of the training.
 
     Raises:
         InputError: a view has two roles.
@@ -56,6 +61,7 @@ class ViewSet:
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
+    split: Split = "test"
 
     def __post_init__(self) -> None:
         seen: dict[bytes, str] = {}
@@ -75,7 +81,7 @@ class ViewSet:
         source: SplatModel,
         *,
         background: Colour | None = None,
-        mode: str = "standard",
+        mode: Mode = "standard",
         threads: int | None = None,
     ) -> Judge:
         """What judges by renders of the source.
@@ -99,7 +105,7 @@ class ViewSet:
         """
         return Judge.of_source(source, self.decides, self.background, threads=threads)
 
-    def photograph_judge(self, *, mode: str = "standard", threads: int | None = None) -> Judge:
+    def photograph_judge(self, *, mode: Mode = "standard", threads: int | None = None) -> Judge:
         """What judges by photographs.
 
         Raises:
@@ -129,7 +135,7 @@ class ViewSet:
         for photograph in self.photographs:
             _ = photograph.pixels
 
-    def _by_photographs(self, cameras: Sequence[Camera], mode: str, threads: int | None) -> Judge:
+    def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Judge:
         from csplat_trainer.evaluate import photograph_judge
 
         if not self.photographs:

@@ -25,7 +25,7 @@ import typer
 
 from csplat import EncodeOptions, decoder, encode, read_ply
 from csplat.errors import CsplatError
-from csplat_bench.common.command import JSON, PRESETS, listed, run, tell
+from csplat_bench.common.command import JSON, PRESETS, listed, preset_of, run, tell
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.common.report import describe, table, write_json
 from csplat_bench.common.scenes import ROOT
@@ -156,7 +156,7 @@ def _files(path: Path, presets: list[str]) -> Iterator[tuple[str, bytes]]:
         return
     model = read_ply(path)
     for preset in presets:
-        yield f"{path.stem} {preset}", encode(model, EncodeOptions(preset=preset))
+        yield f"{path.stem} {preset}", encode(model, EncodeOptions(preset=preset_of(preset)))
 
 
 def _splats(data: bytes) -> int | str:

@@ -25,7 +25,7 @@ from csplat.encoder import EncodeOptions, encode
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply import read_ply, write_ply
-from csplat_bench.common.command import MARKDOWN, PEERS, run, tell
+from csplat_bench.common.command import MARKDOWN, PEERS, preset_of, run, tell
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import NPM, ROOT, Scene
@@ -103,7 +103,7 @@ def _measure(one: Input, command: list[str] | None) -> Measured:
 
 
 def _ours(one: Input, source: Source, path: Path, preset: str) -> Figures:
-    data = encode(read_ply(path), EncodeOptions(preset=preset))
+    data = encode(read_ply(path), EncodeOptions(preset=preset_of(preset)))
     decoded = decode(data)
     return {"bytes": len(data), "psnr": _judge(source.model(decoded.origin)).psnr(decoded) if one.renders else None}
 

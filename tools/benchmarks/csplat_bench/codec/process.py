@@ -12,6 +12,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat_bench.common.command import preset_of
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.common.measuring import medians, peak_bytes, reset_peak, timed
 
@@ -35,7 +36,7 @@ class Run:
 
 def encoded(ply: Path, output: Path, preset: str, threads: int | None, runs: int) -> Run:
     """Encode a PLY, from arrays to bytes, and write the file."""
-    model, options = read_ply(ply), EncodeOptions(preset=preset, threads=threads)
+    model, options = read_ply(ply), EncodeOptions(preset=preset_of(preset), threads=threads)
     data, seconds, growth = _run(lambda: encode(model, options), runs)
     output.write_bytes(data)
     return Run(seconds, growth, _array_bytes(model))

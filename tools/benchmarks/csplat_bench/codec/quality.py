@@ -25,7 +25,20 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, PRESETS, SCENES, listed, numbers, run, tell
+from csplat_bench.common.command import (
+    CACHE,
+    EXTRA,
+    JSON,
+    MARKDOWN,
+    PEERS,
+    PRESETS,
+    SCENES,
+    listed,
+    numbers,
+    preset_of,
+    run,
+    tell,
+)
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine, write_json
@@ -104,7 +117,7 @@ def _files(scene: Scene, source: SplatModel, presets: Sequence[str], seeds: Sequ
     others = [Judge.of_source(source, virtual_cameras(source, seed=seed)) for seed in compared]
     found = []
     for preset in presets:
-        data = encode(source, EncodeOptions(preset=preset))
+        data = encode(source, EncodeOptions(preset=preset_of(preset)))
         model = decode(data)
         psnr = judge.psnr(model)
         found.append(Quality(preset, len(data) / len(source), psnr, tuple(one.psnr(model) - psnr for one in others)))

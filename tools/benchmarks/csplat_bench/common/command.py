@@ -12,12 +12,14 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
+from csplat.encoder import PRESETS as KNOWN_PRESETS
+from csplat.encoder import PresetName
 from csplat.errors import CsplatError
 from csplat_tools.files.console import note as tell
 
 __all__ = [
     "AGAIN", "CACHE", "EXTRA", "JSON", "LPIPS", "MARKDOWN", "OUT", "PEERS", "PRESETS", "SCENES", "TABLES", "THREADS",
-    "VIEWS", "WrongWords", "listed", "numbers", "run", "tell",
+    "VIEWS", "WrongWords", "listed", "numbers", "preset_of", "run", "tell",
 ]  # fmt: skip
 
 T = TypeVar("T")
@@ -76,6 +78,18 @@ def run(main: Callable[..., Any], words: Sequence[str] | None = None) -> int:
 def listed(text: str) -> list[str]:
     """Words between commas."""
     return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def preset_of(word: str) -> PresetName:
+    """A preset by its name.
+
+    Raises:
+        WrongWords: there is none of that name.
+    """
+    for name in KNOWN_PRESETS:
+        if name == word:
+            return name
+    raise WrongWords(f"the preset is {word!r}, wanted one of {', '.join(KNOWN_PRESETS)}")
 
 
 def numbers(text: str, kind: Callable[[str], T]) -> list[T]:

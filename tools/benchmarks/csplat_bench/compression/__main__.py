@@ -27,7 +27,19 @@ import typer
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError
 from csplat_bench.common.captures import CAPTURES, Capture, choose_captures, trained
-from csplat_bench.common.command import LPIPS, MARKDOWN, OUT, SCENES, THREADS, WrongWords, listed, numbers, run, tell
+from csplat_bench.common.command import (
+    LPIPS,
+    MARKDOWN,
+    OUT,
+    SCENES,
+    THREADS,
+    WrongWords,
+    listed,
+    numbers,
+    preset_of,
+    run,
+    tell,
+)
 from csplat_bench.common.kept import Kept, file_digest, read_kept
 from csplat_bench.common.report import machines, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
@@ -77,7 +89,9 @@ def main(
     parts = [part for part in _PARTS if part in what or not what]
     lists = Lists(numbers(sizes, int), numbers(escapes, float), numbers(bits, int), numbers(keep, float))
     try:
-        encoding = EncodeOptions(preset=preset, threads=threads, **{"shape_codebook_size": 4096, **_knobs(knob)})
+        encoding = EncodeOptions(
+            preset=preset_of(preset), threads=threads, **{"shape_codebook_size": 4096, **_knobs(knob)}
+        )
         tuning = FinetuneOptions(iterations=iterations, byte_cost=byte_cost)
         variants(encoding, lists)
     except InputError as error:

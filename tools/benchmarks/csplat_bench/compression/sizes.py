@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import FreeValues, Frozen
-from csplat_tools.training.report import ply_splat_bytes
+from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_trainer.tuning.rate import colour_integers_of
 
 __all__ = ["Book", "books_of", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]

@@ -13,7 +13,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_bench.common.captures import read_training, train_to
-from csplat_bench.common.command import tell
+from csplat_bench.common.command import preset_of, tell
 from csplat_bench.common.kept import file_digest
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import write_json
@@ -127,7 +127,7 @@ def _scored(folder: SceneFolder, data: DataSet, settings: Settings, ply: Path, l
     source = read_ply(ply)
     files = [_file(PLY, source, ply.stat().st_size, None, data, lpips)]
     for preset in settings.presets:
-        encoded, timing = timed(encode, source, EncodeOptions(preset=preset))
+        encoded, timing = timed(encode, source, EncodeOptions(preset=preset_of(preset)))
         files.append(_file(preset, decode(encoded), len(encoded), timing.wall, data, lpips))
     for one in files:
         tell(f"{folder.title}: {one['file']} {one['size_bytes'] / 1e6:.2f} MB, {one['psnr_mean']:.2f} dB")

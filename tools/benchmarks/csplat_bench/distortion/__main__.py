@@ -24,11 +24,24 @@ from typing import Annotated
 import typer
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.encoder import EncodeOptions, Importance, ShCoding, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import AGAIN, CACHE, MARKDOWN, OUT, PEERS, SCENES, VIEWS, listed, numbers, run, tell
+from csplat_bench.common.command import (
+    AGAIN,
+    CACHE,
+    MARKDOWN,
+    OUT,
+    PEERS,
+    SCENES,
+    VIEWS,
+    listed,
+    numbers,
+    preset_of,
+    run,
+    tell,
+)
 from csplat_bench.common.curves import Point, bracket, rate_at
 from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.measuring import timed
@@ -41,13 +54,13 @@ from csplat_bench.distortion.plot import plot as draw
 from csplat_bench.distortion.tables import tables
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.optimise.optimiser import optimise
+from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
-from csplat_tools.optimise.target import Target
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
+_SH_CODINGS: dict[str, ShCoding] = {"scalar": "scalar", "codebook": "codebook"}
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
 _GRID_TRIES = 4  # files at most for one point of a curve
@@ -181,9 +194,9 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
 
     def measure(quality: float) -> Point:
         quality = round(quality, 2)
-        options = EncodeOptions(attribute_psnr=quality, sh_coding="auto" if coding == "none" else coding)
+        options = EncodeOptions(attribute_psnr=quality, sh_coding=_SH_CODINGS.get(coding, "auto"))
         graded = preset == GRADED
-        options = replace(options, adaptive=1.0) if graded else replace(options, preset=preset)
+        options = replace(options, adaptive=1.0) if graded else replace(options, preset=preset_of(preset))
         importance = bench.importance if graded else None
         result, timing = timed(encode_with_report, bench.source, options, importance=importance)
         point = Point(bench.judge.psnr(decode(result.data)), len(result.data), quality, timing.wall)
@@ -213,7 +226,7 @@ def _reached(bench: _Bench, goal: float, views: int) -> Simplified:
     """The file of a PSNR by the cameras that judge all files here; virtual views teach and decide."""
     around = replace(find_view_set(bench.source, count=views), judges=bench.judge.cameras)
     try:
-        found, timing = timed(optimise, bench.source, Target(psnr=goal), around)
+        found, timing = timed(encode_to, bench.source, psnr=goal, views=around)
     except InputError as error:
         return {"goal": goal, "remark": str(error), "seconds": 0.0}
     chosen = found.report.chosen

@@ -29,18 +29,17 @@ from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes
 from csplat_render.judge import Judge
 from csplat_tools.files.scenes import without_bands
-from csplat_tools.optimise.optimiser import optimise
-from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.tradeoffs.measuring import fetched_bytes
-from csplat_tools.views import BLACK, comparison_cameras, find_view_set
+from csplat_tools.views import BLACK, comparison_cameras
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k,statue"
 #: By name, options of `csplat encode`; the target, and whether all splats stay.
 _POINTS = {
-    "thumbnail": ("--target-psnr 30", Target(psnr=30.0), False),
-    "web page": ("--target-psnr 38", Target(psnr=38.0), False),
+    "thumbnail": ("--target-psnr 30", 30.0, False),
+    "web page": ("--target-psnr 38", 38.0, False),
     "balanced": ("--preset balanced", None, True),
-    "archive": ("--target-psnr 50 --keep-all", Target(psnr=50.0), True),
+    "archive": ("--target-psnr 50 --keep-all", 50.0, True),
 }
 _HEAD = ("scene", "for", "kB", "× smaller", "dB", "whole, s", "first picture, kB", "dB", "s", "encoding, s")
 
@@ -80,9 +79,9 @@ def main(
 
 
 def _reached(source: SplatModel, ply_bytes: int, name: str) -> Reached:
-    _, target, whole = _POINTS[name]
+    _, psnr, whole = _POINTS[name]
     try:
-        data, timing = timed(_encoded, source, target, whole=whole)
+        data, timing = timed(_encoded, source, psnr, whole=whole)
     except InputError as error:
         return {"error": str(error)}
     judge = Judge.of_source(source, comparison_cameras(source), BLACK)
@@ -97,10 +96,8 @@ def _reached(source: SplatModel, ply_bytes: int, name: str) -> Reached:
     }
 
 
-def _encoded(source: SplatModel, target: Target | None, *, whole: bool) -> bytes:
-    if target is None:
-        return encode(source)
-    return optimise(source, target, find_view_set(source), keep_all=whole).result.data
+def _encoded(source: SplatModel, psnr: float | None, *, whole: bool) -> bytes:
+    return encode(source) if psnr is None else encode_to(source, psnr=psnr, keep_all=whole).data
 
 
 def _cells(one: Reached, rate: float) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
+from csplat_bench.common.command import preset_of
 from csplat_bench.common.measuring import timed
 from csplat_bench.study.judge import Views
 from csplat_bench.study.records import How, Measured, Survivors
@@ -134,7 +135,7 @@ def measure_row(subject: Subject, row: Row) -> Measured:
     if subject.teachers is not None:
         views = with_deciders(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
     reduced, strategy = timed(reduce_model, subject.source, row.reduction, views)
-    options = EncodeOptions(preset=row.preset)
+    options = EncodeOptions(preset=preset_of(row.preset))
     encoded, encoding = timed(encode_reduced, subject.source, row.reduction, options, views=views)
     decoded = decode(encoded.data)
     scores = subject.views.score(decoded if row.decoded else reduced.model)
@@ -172,7 +173,7 @@ def attribute_bytes(subject: Subject) -> dict[str, dict[str, int]]:
     files = {"float32": {**floats, "frame": 0}}
     wanted = {"balanced": Reduction(), "small": Reduction(), "small, SH 0, τ 0.02": Reduction(0.02, sh_degree=0)}
     for name, reduction in wanted.items():
-        data = encode_reduced(source, reduction, EncodeOptions(preset=name.partition(",")[0])).data
+        data = encode_reduced(source, reduction, EncodeOptions(preset=preset_of(name.partition(",")[0]))).data
         used = byte_shares(data, read_header(data))
         del used["overhead"]
         files[name] = {**_gathered(used), "frame": len(data) - sum(used.values())}

@@ -23,7 +23,7 @@ import typer
 
 from csplat.encoder import EncodeOptions, encode
 from csplat.ply import read_ply
-from csplat_bench.common.command import CACHE, EXTRA, JSON, PRESETS, listed, numbers, run, tell
+from csplat_bench.common.command import CACHE, EXTRA, JSON, PRESETS, listed, numbers, preset_of, run, tell
 from csplat_bench.common.making import blow_up
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, Scene, find_scenes
@@ -94,7 +94,7 @@ def _encoded(scene: Scene, preset: str, cache: Path, size: int | None = None) ->
     if not path.exists():
         source = read_ply(scene.path)
         model = source if size is None else blow_up(source, size)
-        path.write_bytes(encode(model, EncodeOptions(preset=preset)))
+        path.write_bytes(encode(model, EncodeOptions(preset=preset_of(preset))))
     return File(name, preset, path)
 
 

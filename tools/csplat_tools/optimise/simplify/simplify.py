@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,8 @@ from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
 from csplat_tools.files.console import Progress
+from csplat_tools.files.extras import need_renderer
+from csplat_tools.files.scenes import SceneLike, load_model
 from csplat_tools.optimise.simplify.colours import ColourFit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import Order, removal_order
@@ -126,34 +129,49 @@ def prepare(
 
 
 def simplify(
-    source: SplatModel,
-    views: ViewSet | None = None,
+    scene: SceneLike,
     *,
-    target: Target,
+    keep: float | None = None,
+    psnr: float | None = None,
+    loss: float | None = None,
+    views: ViewSet | None = None,
     options: SimplifyOptions | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Simplified:
-    """Remove splats until a target is met, fit the colours of the others, drop SH bands.
+    """Remove splats until a target is met, fit the others, drop SH bands: what `csplat simplify` calls.
+
+    One of `keep`, `psnr` and `loss` is wanted. Wants the packages of the render extra.
 
     Args:
-        source: the scene.
-        views: what stays is fitted in those that teach; those that decide say how much may go. None for virtual ones,
+        scene: a model, or a file of either kind.
+        keep: share of the splats that stay, above 0, at most 1.
+        psnr: dB against the source's renders by the views that decide, at least; as few splats as that allows stay.
+        loss: dB that the PSNR against the photographs of `views` may fall.
+        views: what stays is fitted in those that teach; those that decide say how much may go. `None`: virtual ones,
             as many as it takes.
-        target: a share of the splats, a PSNR or a loss against photographs.
         options: how to go about it.
-        progress: is told the stages.
+        progress: is told the stage and the share of it that is done, 0 to 1.
 
     Returns:
         The smaller scene; its splats are in the source's order.
 
+    Example:
+        >>> import csplat_tools
+        >>> half = csplat_tools.simplify("scene.ply", keep=0.5)  # doctest: +SKIP
+        >>> len(half.model), half.report["psnr"]  # doctest: +SKIP
+        (4464, 39.6)
+
     Raises:
         InputError: a scene without splats, views that do not teach or decide, or a target that even the source misses.
+        CsplatError: the file is none.
+        OSError: it cannot be read.
     """
+    need_renderer()
+    target = Target(psnr, None, loss, keep)
+    source = load_model(scene).model
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
-    if target.size_bytes is not None or target.max_error:
-        raise InputError("sizes and largest errors are of files: wanted a share of the splats, a PSNR or a loss")
     if target.max_loss is not None and (views is None or not views.photographs):
         raise InputError("a loss against photographs wants photographs: name a data set")
     left = None if target.keep is None else target.count(len(source))

@@ -1,0 +1,204 @@
+"""The Python interface: its names, what they take, what they refuse and how, and that the commands call them."""
+
+import gzip
+import io
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_tools
+from csplat.errors import CsplatError, InputError
+from csplat_tools.cli.app import app
+
+
+@pytest.fixture
+def files(make_model, tmp_path):
+    """One scene as a model, a PLY and a .csplat file."""
+    model = make_model(60, 1)
+    csplat.write_ply(tmp_path / "scene.ply", model)
+    (tmp_path / "scene.csplat").write_bytes(csplat.encode(model))
+    return model, tmp_path / "scene.ply", tmp_path / "scene.csplat"
+
+
+FORMS = {
+    "str": str,
+    "path": lambda path: path,
+    "bytes": lambda path: path.read_bytes(),
+    "bytearray": lambda path: bytearray(path.read_bytes()),
+    "memoryview": lambda path: memoryview(path.read_bytes()),
+    "BytesIO": lambda path: io.BytesIO(path.read_bytes()),
+    "gzip": lambda path: gzip.GzipFile(fileobj=io.BytesIO(gzip.compress(path.read_bytes()))),
+}
+
+
+def assert_same(a, b):
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+
+
+# names
+
+
+@pytest.mark.parametrize("package", [csplat, csplat_tools])
+def test_every_name_is_there_and_listed(package):
+    assert sorted(package.__all__) == dir(package)
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+
+
+def test_the_packages_load_neither_renderer_nor_command_line():
+    code = "import csplat, csplat_tools, sys; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & set(loaded)
+
+
+# files, in every form
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_a_file_may_be_a_path_or_open_or_bytes(files, form):
+    model, ply, coded = files
+    assert_same(csplat.read_ply(ply), csplat.read_ply(form(ply)))
+    assert_same(csplat.decode(coded.read_bytes()), csplat.decode(form(coded)))
+    assert len(model) == csplat.read_header(form(coded)).splat_count
+    assert csplat.lint_ply(ply) == csplat.lint_ply(form(ply))
+    for path in (ply, coded):
+        loaded = csplat_tools.load_model(form(path))
+        assert (len(model), path.stat().st_size) == (len(loaded.model), loaded.size_bytes)
+
+
+def test_a_ply_may_be_written_into_an_open_file_which_stays_open(files):
+    model, ply, _ = files
+    stream = io.BytesIO()
+    csplat.write_ply(stream, model)
+    assert ply.read_bytes() == stream.getvalue()
+
+
+def test_what_is_read_from_an_open_file_begins_where_that_stands(files):
+    _, ply, _ = files
+    stream = io.BytesIO(b"before" + ply.read_bytes())
+    stream.seek(6)
+    assert_same(csplat.read_ply(ply), csplat.read_ply(stream))
+
+
+def test_messages_name_an_open_file(tmp_path):
+    (tmp_path / "wrong.ply").write_bytes(b"nothing of the kind")
+    with (tmp_path / "wrong.ply").open("rb") as stream, pytest.raises(InputError, match=r"wrong\.ply is not a PLY"):
+        csplat.read_ply(stream)
+
+
+# what cannot be used
+
+
+@pytest.mark.parametrize("wrong", [5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")])
+@pytest.mark.parametrize("function", ["read_ply", "decode", "read_header", "lint_ply"])
+def test_what_is_no_file_is_a_typed_error(function, wrong):
+    with pytest.raises(InputError, match="wanted"):
+        getattr(csplat, function)(wrong)
+
+
+@pytest.mark.parametrize("function", ["read_ply", "decode", "read_header"])
+def test_a_file_that_is_not_there_is_named(function, tmp_path):
+    with pytest.raises(FileNotFoundError, match="absent"):
+        getattr(csplat, function)(tmp_path / "absent")
+
+
+@pytest.mark.parametrize("wrong", ["scene.ply", b"ply", None, 5])
+def test_what_is_no_model_is_refused_with_the_name_of_what_makes_one(wrong, tmp_path):
+    calls = [csplat.encode, csplat.encode_with_report, lambda model: csplat.write_ply(tmp_path / "out.ply", model)]
+    for call in calls:
+        with pytest.raises(InputError, match=r"takes a SplatModel.*csplat\.read_ply"):
+            call(wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_preset_in_place_of_options_is_refused_with_what_was_meant(files):
+    with pytest.raises(InputError, match=r"EncodeOptions\(preset="):
+        csplat.encode(files[0], "small")
+
+
+def test_files_of_the_other_kind_are_typed_errors(files):
+    _, ply, coded = files
+    for call, wrong in ((csplat.read_ply, coded), (csplat.decode, ply)):
+        for form in FORMS.values():
+            with pytest.raises(CsplatError):
+                call(form(wrong))
+
+
+# targets
+
+
+def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
+    _, ply, _ = files
+    stages = []
+
+    def progress(stage, done):
+        stages.append((stage, done))
+
+    first = csplat_tools.encode_to(csplat.read_ply(ply), errors={"means": 0.01}, progress=progress)
+    assert first.data == csplat_tools.encode_to(ply.read_bytes(), errors={"means": 0.01}).data
+    assert first.report.reached["means"] <= 0.01
+    assert stages
+    assert all(isinstance(stage, str) and 0.0 <= done <= 1.0 for stage, done in stages)
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({}, "no target"),
+        ({"psnr": 40.0, "size": 1000}, "one of them"),
+        ({"size": "5 parsecs"}, "wanted bytes"),
+        ({"errors": {"colour": 1.0}}, "no measure"),
+    ],
+)
+def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, says):
+    with pytest.raises(InputError, match=says):
+        csplat_tools.encode_to("absent.ply", **asked)
+
+
+# the commands call these
+
+
+class Called(Exception):  # noqa: N818  # no error: it ends a command where the interface begins
+    """What a command handed over."""
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "given"),
+    [
+        (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
+        (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "keep_all": False}),
+        (["encode", "scene.ply", "o", "--target-size", "5kB", "--keep-all"], "encode_to", {"size": 5000}),
+        (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {"keep": 0.5, "psnr": None, "loss": None}),
+        (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
+    ],
+)
+def test_commands_call_the_functions_that_programs_call(files, monkeypatch, words, name, given):
+    pytest.importorskip("numba", reason="these commands want the extra [render]")
+    monkeypatch.chdir(files[1].parent)
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
+
+    def called(*args, **named):
+        raise Called(args, named)
+
+    monkeypatch.setattr(csplat_tools, name, called)
+    raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
+    assert isinstance(raised, Called), raised
+    scene, named = raised.args[0][0], raised.args[1]
+    assert_same(csplat.read_ply(files[1]), getattr(scene, "model", scene))
+    assert given.items() <= named.items()
+
+
+def test_a_comparison_of_models_counts_them_as_plain_plies(files):
+    pytest.importorskip("numba", reason="comparing wants the extra [render]")
+    model, ply, coded = files
+    size = ply.stat().st_size - len(ply.read_bytes().partition(b"end_header\n")[0]) - len(b"end_header\n")
+    assert size == csplat_tools.load_model(model).size_bytes
+    loaded = csplat_tools.load_model(coded)
+    assert loaded is csplat_tools.load_model(loaded)
+    assert replace(loaded, size_bytes=1).header == csplat.read_header(coded)
