@@ -5,10 +5,13 @@ import inspect
 import json
 import os
 import pty
+import resource
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +22,11 @@ from typer.testing import CliRunner
 
 from csplat import _spec, decode, read_ply, write_ply
 from csplat.encoder import EncodeOptions
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.cli.app import app
 from csplat_tools.cli.encode import encode as encode_command
+from csplat_tools.files.streams import check_output, write_bytes
 
 PROGRAM = [sys.executable, "-m", "csplat_tools"]
 
@@ -150,7 +155,7 @@ def test_settings_that_want_an_extra_say_so_in_one_line(ply, tmp_path):
     code = "import sys; sys.modules['numba'] = None; from csplat_tools.__main__ import main; main()"
     words = ("simplify", ply, tmp_path / "o.ply", "--keep", "0.5", "--set", "rounds=1")
     done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, check=False)
-    assert (1, "error: this needs numba: pip install 'csplat[render]'\n") == (done.returncode, done.stderr)
+    assert (1, "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n") == (done.returncode, done.stderr)
 
 
 def test_the_output_is_an_argument_or_an_option(tmp_path, ply):
@@ -352,7 +357,9 @@ def test_a_damaged_file_gives_no_ply(tmp_path, csplat_file):
     data[-10] ^= 1
     csplat_file.write_bytes(data)
     target = tmp_path / "out.ply"
-    assert refused("decode", csplat_file, target).startswith("error: E_CRC at byte ")
+    line = refused("decode", csplat_file, target)
+    assert line.startswith(f"error: {csplat_file}: the file is damaged: E_CRC at byte ")
+    assert line.endswith("; copy or download it again\n")
     assert not target.exists()
     refused("decode", csplat_file, target, "--sh-degree", 0)  # the damage is in band 2
     assert not target.exists()
@@ -383,6 +390,80 @@ def test_what_is_not_there_is_one_line(tmp_path, ply, monkeypatch, words, part):
     assert part in refused(*words)
 
 
+def test_of_two_writers_of_a_new_name_one_loses(tmp_path, monkeypatch):
+    target, written, both = str(tmp_path / "new"), os.fsync, threading.Barrier(2, timeout=20)
+
+    def meet(number):
+        written(number)
+        both.wait()  # both files are complete, and neither has its name
+
+    monkeypatch.setattr(os, "fsync", meet)
+    check_output(target, force=False)
+    lost = []
+
+    def write(data):
+        try:
+            write_bytes(target, data)
+        except InputError as error:
+            lost.append((data, str(error)))
+
+    writers = [threading.Thread(target=write, args=(data,)) for data in (b"one", b"two")]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert 1 == len(lost)
+    data, message = lost[0]
+    assert "its file stays; --force replaces it" in message
+    assert {b"one": b"two", b"two": b"one"}[data] == (tmp_path / "new").read_bytes()
+    assert ["new"] == [path.name for path in tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_name_that_was_taken_meanwhile_is_left_unless_replacing_is_asked_for(tmp_path, monkeypatch, links):
+    if not links:  # as FAT has it
+
+        def refuse(*_):
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr(os, "link", refuse)
+    target = tmp_path / "new"
+    check_output(str(target), force=False)
+    target.write_bytes(b"theirs")
+    with pytest.raises(InputError, match="another program wrote it meanwhile"):
+        write_bytes(str(target), b"ours")
+    assert b"theirs" == target.read_bytes()
+    check_output(str(target), force=True)
+    write_bytes(str(target), b"ours")
+    assert b"ours" == target.read_bytes()
+    target.unlink()
+    check_output(str(target), force=False)
+    write_bytes(str(target), b"first")
+    write_bytes(str(target), b"second")  # the name is ours now
+    assert b"second" == target.read_bytes()
+    assert ["new"] == [path.name for path in tmp_path.iterdir()]
+
+
+def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_file):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        line = refused("decode", csplat_file, folder / "back.ply")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert line.startswith(f"error: {folder / 'back.ply'}: File too large; no half of a file was left")
+    assert line.endswith("(EFBIG)\n")
+    assert [] == list(folder.iterdir())
+
+
+def test_a_full_standard_output_is_one_line(csplat_file):
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run([*PROGRAM, "info", csplat_file], stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (1, b"error: standard output: No space left on device (ENOSPC)\n") == (done.returncode, done.stderr)
+
+
 # Wrong kinds of files -----------------------------------------------------------------------------
 
 
@@ -408,7 +489,48 @@ def test_a_csplat_is_not_encoded_and_a_ply_not_decoded(tmp_path, ply, csplat_fil
 def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
     path = tmp_path / name
     path.write_bytes(head)
-    assert "splat-transform" in refused("encode", path, tmp_path / "out.csplat", "--quiet")
+    commands = [("encode", path, tmp_path / "out.csplat"), ("lint", path), ("info", path)]
+    for words in commands[: 2 if path.suffix == ".ply" else 3]:
+        line = refused(*words)
+        assert line.startswith(f"error: {name} is ")
+        assert "which csplat does not read yet: convert it to PLY first, with splat-transform" in line
+        assert line.endswith("(E_INPUT)\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("encode", "scene.ply", "out.ply"), "csplat simplify scene.ply out.ply"),
+        (("encode", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
+        (("encode", "scene.ply", "page.html"), "csplat export-html scene.ply page.html"),
+        (("encode", "scene.ply", "out.spz"), "csplat encode scene.ply out.csplat"),
+        (("decode", "scene.csplat", "out.csplat"), "csplat decode scene.csplat out.ply"),
+        (("decode", "scene.ply", "out.csplat"), "csplat encode scene.ply out.csplat"),
+        (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
+        (("lint", "scene.ply", "--fix", "out.csplat"), "csplat encode scene.ply out.csplat"),
+    ],
+)
+def test_a_name_that_contradicts_the_command_is_refused_with_the_one_meant(
+    tmp_path, ply, csplat_file, monkeypatch, words, meant
+):
+    assert {ply.name, csplat_file.name} == {"scene.ply", "scene.csplat"}
+    monkeypatch.chdir(tmp_path)
+    assert f"did you mean `{meant}`? (E_INPUT)" in refused(*words)
+    assert {"scene.ply", "scene.csplat", "index.npy"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
+    path = damaged_ply(tmp_path / "bad.ply", make_model)
+    path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))
+    line = refused("encode", path, tmp_path / "out.csplat")
+    assert line.startswith(f"error: {path}: missing-columns: no column opacity")
+    (tmp_path / "cut.csplat").write_bytes(csplat_file.read_bytes()[:200])
+    line = refused("compare", csplat_file, tmp_path / "cut.csplat")
+    assert line.startswith(f"error: {tmp_path / 'cut.csplat'}: the file ends too early: E_TRUNCATED")
+    (tmp_path / "none.csplat").write_bytes(b"nothing of ours" * 20)
+    line = refused("decode", tmp_path / "none.csplat", tmp_path / "out.ply")
+    assert line.startswith(f"error: {tmp_path / 'none.csplat'}: not a .csplat file: E_MAGIC at byte 0")
+    assert "`csplat encode` makes one of a PLY" in line
 
 
 # Info ---------------------------------------------------------------------------------------------

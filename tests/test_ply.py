@@ -563,4 +563,4 @@ def test_real_scenes_read_and_read_back(data_dir, tmp_path, name):
 def test_real_files_of_other_formats_are_named(data_dir, path, what):
     with pytest.raises(InputError, match="splat-transform") as caught:
         read_ply(data_dir / path)
-    assert f"is {what}, not a plain PLY" in str(caught.value)
+    assert f"is {what}, which csplat does not read yet: convert it" in str(caught.value)

@@ -178,7 +178,7 @@ def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, 
     words = ["render", str(ply), "--cameras", str(cameras), "-o", str(tmp_path / "out")]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
     assert 1 == done.returncode
-    assert f"error: this needs {package}: pip install 'csplat[render]'\n" == done.stderr
+    assert f"error: this needs {package}: pip install 'csplat[render]' (E_INPUT)\n" == done.stderr
 
 
 def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):

@@ -359,7 +359,7 @@ def test_nothing_is_overwritten_unless_forced(capture, tmp_path, option):
     words = [capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--quiet", option, target]
     refused = invoke(*words)
     assert 1 == refused.exit_code
-    assert re.fullmatch(r"error: \S+ exists: --force replaces it\n", refused.stderr)
+    assert re.fullmatch(r"error: \S+ exists: --force replaces it \(E_INPUT\)\n", refused.stderr)
     assert "mine" == mine.read_text()
     assert 0 == invoke(*words, "--force").exit_code
     assert "mine" != mine.read_text()
@@ -381,14 +381,16 @@ def test_what_it_does_is_said_on_standard_error(capture):
 def test_an_absent_file_is_one_line(tmp_path):
     result = invoke(tmp_path / "absent.ply")
     assert 1 == result.exit_code
-    assert f"error: {tmp_path / 'absent.ply'}: No such file or directory\n" == result.stderr
+    assert (
+        f"error: {tmp_path / 'absent.ply'}: No such file or directory; is the name right? (ENOENT)\n" == result.stderr
+    )
 
 
 def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
     write_ply(tmp_path / "empty.ply", make_model(0))
     result = invoke(tmp_path / "empty.ply", "-o", tmp_path / "report.html")
     assert 1 == result.exit_code
-    assert "error: a scene without splats has nothing to trade\n" == result.stderr
+    assert "error: a scene without splats has nothing to trade (E_INPUT)\n" == result.stderr
     assert not (tmp_path / "report.html").exists()
 
 
@@ -438,7 +440,7 @@ def test_without_the_extra_packages_one_line_says_what_to_install(tmp_path, samp
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert 1 == done.returncode
-    assert f"error: this needs {module}: pip install 'csplat[render]'\n" == done.stderr
+    assert f"error: this needs {module}: pip install 'csplat[render]' (E_INPUT)\n" == done.stderr
 
 
 def test_the_help_has_examples():

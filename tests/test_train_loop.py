@@ -228,4 +228,4 @@ def test_the_command_says_which_extra_is_missing(tmp_path):
         [sys.executable, "-c", code, str(tmp_path / "o.ply")], capture_output=True, text=True, check=False
     )
     assert 1 == done.returncode
-    assert "error: this needs numba: pip install 'csplat[render]'" == done.stderr.strip()
+    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == done.stderr.strip()

@@ -20,9 +20,11 @@ class CsplatError(Exception):
 
     Attributes:
         code: what went wrong, constant across versions and languages (`E_CRC`).
+        path: the file that was read when it went wrong, as the caller named it; `None` where that is not known.
     """
 
     code: str = "E_CSPLAT"
+    path: str | None = None
 
 
 class FormatError(CsplatError):

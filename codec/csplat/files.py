@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from mmap import mmap
@@ -91,19 +92,21 @@ def opened_for_writing(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[
 
 
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[BinaryIO]:
     """Open a file for writing that takes its name only when all of it is written.
 
     The bytes go to a temporary neighbour, renamed over `path` on success and removed on any
     error; a symbolic link keeps pointing where it points. Devices and pipes are written directly.
 
     Args:
-        path: where the file shall be; an existing file is replaced.
+        path: where the file shall be.
+        replace: whether an existing file is replaced; if not, one that came meanwhile stays, too.
 
     Yields:
         A binary file object, positioned at 0.
 
     Raises:
+        FileExistsError: the file is there and is not to be replaced.
         OSError: the folder does not exist, is full or is not writable.
     """
     if Path(path).exists() and not Path(path).is_file():
@@ -111,17 +114,39 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield stream
         return
     target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.{threading.get_ident()}.tmp")
     try:
         with temporary.open("xb") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())  # the name must not reach the disk before the bytes
-        temporary.replace(target)
-    except BaseException:
+        if replace:
+            temporary.replace(target)
+        else:
+            _take_name(temporary, target)
+    except BaseException as error:
         with suppress(FileNotFoundError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
+            error.filename = os.fspath(path)  # what failed is the file, in the words of whoever asked for it
         raise
+
+
+def _take_name(temporary: Path, target: Path) -> None:
+    """Give a complete file its name, which of several writers one gets.
+
+    Raises:
+        FileExistsError: another one was quicker.
+    """
+    try:
+        os.link(temporary, target)
+    except FileExistsError:
+        raise
+    except OSError:  # no hard links here: the name is taken by an empty file, which the complete one replaces
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        temporary.replace(target)
+    else:
+        temporary.unlink()
 
 
 def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:

@@ -13,13 +13,14 @@ from pathlib import Path
 
 from csplat.errors import InputError
 
-__all__ = ["HEAD_SIZE", "refuse_folder", "refuse_foreign", "refuse_packed_header"]
+__all__ = ["HEAD_SIZE", "foreign_name", "refuse_folder", "refuse_foreign", "refuse_known", "refuse_packed_header"]
 
 #: Bytes of the beginning of a file that `refuse_foreign` wants to see.
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _SPLAT_ROW_SIZE = 32
+_PACKED = ("gzip", "zip", "csplat")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
@@ -48,11 +49,7 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
     """
     if head[:3] == b"ply" and head[3:4] in (b"\n", b"\r"):
         return
-    found = _by_magic(path, head)
-    if found is None:
-        found = _BY_SUFFIX.get(path.suffix.lower())
-    if found is not None:
-        raise InputError(_refusal(path, *found))
+    refuse_known(path, head)
     if size == 0:
         raise InputError(f"{path.name} is empty, wanted a PLY")
     if size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
@@ -61,6 +58,23 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
             f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
         )
     raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}")
+
+
+def refuse_known(path: Path, head: bytes) -> None:
+    """Refuse what is known to be another format, by its first bytes or its name.
+
+    Raises:
+        InputError: it is one.
+    """
+    found = _by_magic(path, head) or _BY_SUFFIX.get(path.suffix.lower())
+    if found is not None:
+        raise InputError(_refusal(path, *found))
+
+
+def foreign_name(path: Path) -> str | None:
+    """What a file of that name would be for other programs; `None`: nothing that is known."""
+    suffix = path.suffix.lower()
+    return _BY_SUFFIX[suffix][0] if suffix in _BY_SUFFIX and suffix != ".csplat" else None
 
 
 def refuse_folder(path: Path) -> None:
@@ -120,4 +134,5 @@ def _zip_holds_meta(path: Path) -> bool:
 
 
 def _refusal(path: Path, what: str, converter: str) -> str:
-    return f"{path.name} is {what}, not a plain PLY: convert it to PLY first, with {converter}"
+    why = "not a plain PLY" if what in _PACKED else "which csplat does not read yet"
+    return f"{path.name} is {what}, {why}: convert it to PLY first, with {converter}"

@@ -2,21 +2,47 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec
 
 import typer
 
-from csplat.errors import CsplatError
+from csplat.errors import CsplatError, InputError
 from csplat_tools.files.console import note
 
 __all__ = ["FAILED", "INTERRUPTED", "guarded"]
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+_AGAIN = "copy or download it again"
+_NEWER = "a newer csplat may know it"
+_BROKEN = ("the file contradicts itself", f"{_AGAIN}; `csplat verify` lists all that is wrong")
+_DAMAGED = ("the file is damaged", _AGAIN)
+#: By code of the format: what is wrong, and what helps. `tools/viewer/messages.mjs` says the same in the viewer.
+_WORDS = {
+    "E_MAGIC": ("not a .csplat file", "`csplat encode` makes one of a PLY"),
+    "E_VERSION": ("written in another version of the format", _NEWER),
+    "E_TRUNCATED": ("the file ends too early", _AGAIN),
+    "E_TRAILING": ("something follows the end of the file", _AGAIN),
+    "E_CRC": _DAMAGED,
+    "E_CODER": _DAMAGED,
+    "E_UNSUPPORTED": ("", _NEWER),
+    "E_LIMIT": ("the scene is larger than is allowed here", "`csplat decode --max-splats` allows more"),
+}
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
+_OS_ADVICE = {
+    errno.ENOENT: "is the name right?",
+    errno.EACCES: "you are not allowed to",
+    errno.ENOSPC: "no half of a file was left; make room, or name another place",
+    errno.EFBIG: "no half of a file was left; name another place",
+    errno.EDQUOT: "no half of a file was left; make room, or name another place",
+}
 
 P = ParamSpec("P")
 
@@ -33,11 +59,13 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             command(*args, **kwargs)
             sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
         except CsplatError as error:
-            _fail(str(error))
+            _fail(_csplat_error(error))
         except BrokenPipeError:
             _drop_stdout()
             raise typer.Exit(FAILED) from None
         except OSError as error:
+            if error.filename is None and error.errno in _FULL:
+                _drop_stdout()  # all other writers name their file
             _fail(_os_error(error))
         except MemoryError:
             _fail("out of memory")
@@ -53,9 +81,23 @@ def _fail(message: str) -> None:
     raise typer.Exit(FAILED) from None
 
 
+def _csplat_error(error: CsplatError) -> str:
+    """Which file, what is wrong in plain words, what exactly, what to do, and the code."""
+    what, advice = _WORDS.get(error.code, ("", "") if isinstance(error, InputError) else _BROKEN)
+    message = str(error)
+    parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
+    parts += [part for part in (what, message) if part]
+    code = "" if error.code in message else f" ({error.code})"
+    return ": ".join(parts) + (f"; {advice}" if advice else "") + code
+
+
 def _os_error(error: OSError) -> str:
     reason = error.strerror or str(error) or type(error).__name__
-    return f"{error.filename}: {reason}" if error.filename is not None else reason
+    number = error.errno or 0
+    code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
+    if error.filename is None:
+        return ("standard output: " if number in _FULL else "") + reason + code
+    return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
 
 
 def _drop_stdout() -> None:

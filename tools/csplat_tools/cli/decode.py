@@ -9,6 +9,7 @@ import typer
 from csplat_tools.cli.options import Output, ShDegree, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import decode_file
+from csplat_tools.files.streams import check_name
 
 __all__ = ["decode"]
 
@@ -37,6 +38,7 @@ def decode(
       csplat decode scene.csplat - | gzip > scene.ply.gz
     """
     out.check(output, inputs=(source,))
+    check_name(output, ".ply", "decode", source)
     with out.bar() as progress:
         model = decode_file(
             source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, facts=upright.upright(),

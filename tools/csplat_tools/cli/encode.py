@@ -21,6 +21,7 @@ from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import Progress, format_bytes, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.streams import check_name
 
 if TYPE_CHECKING:
     from csplat_tools.optimise.target import Target
@@ -168,6 +169,7 @@ def encode(
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
     out.check(output, inputs=(source, importance, views.cameras), named={"--source-index": source_index})
+    check_name(output, ".csplat", "encode", source)
     if goal.is_rendered:
         prepare_renderer(quiet=out.quiet, simplify=True)
     reaching: Encoder = partial(_reach, goal, views, virtual, importance, out)

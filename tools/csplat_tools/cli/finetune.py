@@ -24,6 +24,7 @@ from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Near, Views, Virtual
 from csplat_tools.files.convert import read_source
 from csplat_tools.files.extras import need_trainer
+from csplat_tools.files.streams import check_name
 
 __all__ = ["finetune"]
 
@@ -127,6 +128,7 @@ def finetune(
         out.check(inputs=inputs, named={"--checkpoint": checkpoint}, force=True)
         del named["--checkpoint"]
     out.check(output, inputs=(*inputs, resume), named=named)
+    check_name(output, ".csplat", "finetune", source)
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
     read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra)
     out.findings(read.findings)

@@ -12,7 +12,7 @@ from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.options import Output, command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
-from csplat_tools.files.streams import STANDARD_STREAM, ply_path, write_model
+from csplat_tools.files.streams import STANDARD_STREAM, check_name, ply_path, write_model
 
 __all__ = ["lint"]
 
@@ -41,6 +41,8 @@ def lint(
       csplat lint scene.ply --json | jq '.findings[].id'
     """
     out.check(fix, inputs=(source,))
+    if fix is not None:
+        check_name(fix, ".ply", "lint --fix", source)
     with ply_path(source) as path:
         findings = lint_ply(path)
         if keep_extra:

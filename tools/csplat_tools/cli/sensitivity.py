@@ -13,6 +13,7 @@ from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.scenes import load_model
+from csplat_tools.files.streams import check_name
 
 __all__ = ["sensitivity"]
 
@@ -48,6 +49,7 @@ def sensitivity(
       csplat encode scene.ply scene.csplat --importance scene.npz
     """
     out.check(inputs=(source, views.cameras), named={"OUT.npz": output})
+    check_name(output, ".npz", "sensitivity", source)
     looked_for = views.data is None and views.cameras is None  # virtual ones
     prepare_renderer(quiet=out.quiet, simplify=looked_for)
     from csplat_tools.optimise.sensitivity import measure_scene

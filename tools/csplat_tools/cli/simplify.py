@@ -16,7 +16,7 @@ from csplat_tools.cli.view_options import Upright, Views, Virtual
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.scenes import load_model
-from csplat_tools.files.streams import write_array, write_model
+from csplat_tools.files.streams import check_name, write_array, write_model
 
 __all__ = ["simplify"]
 
@@ -76,6 +76,7 @@ def simplify(
     chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
     out.check(output, inputs=(source, views.cameras), named={"--source-index": source_index})
+    check_name(output, ".ply", "simplify", source)
     model = upright.upright().applied(load_model(source).model)
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)

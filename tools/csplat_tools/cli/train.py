@@ -12,6 +12,7 @@ from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.extras import need_trainer
+from csplat_tools.files.streams import check_name
 from csplat_tools.views import DataOptions
 from csplat_trainer.options import BACKGROUNDS, DEVICES, TrainOptions
 from csplat_trainer.outputs import Outputs
@@ -99,6 +100,7 @@ def train(
         output, inputs=(resume, lpips_weights),
         named={"--plot": plot, "--checkpoint": None if again else checkpoint},
     )  # fmt: skip
+    check_name(output, ".ply", "train", source)
     data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
     files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
     out.publish(

@@ -15,7 +15,7 @@ from csplat_tools.cli.encoder_options import Preset, check_preset
 from csplat_tools.cli.options import Output, Scene, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, note
-from csplat_tools.files.streams import write_bytes
+from csplat_tools.files.streams import check_name, write_bytes
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import ViewScene, open_scene, view_wishes
@@ -95,6 +95,7 @@ def export_html(
     name = check_preset(preset)
     wishes = view_wishes(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
+    check_name(output, ".html", "export-html", source)
     with out.bar() as progress, open_scene(source, preset=name, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)

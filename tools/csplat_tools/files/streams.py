@@ -9,29 +9,33 @@ from __future__ import annotations
 import io
 import json
 import mmap
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
-from csplat.errors import InputError
+from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
+from csplat.foreign import HEAD_SIZE, foreign_name, refuse_known
 from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat.ply import write_ply
 
 __all__ = [
     "STANDARD_STREAM",
+    "check_name",
     "check_output",
     "check_outputs",
     "is_csplat",
     "local_path",
     "mapped_csplat",
+    "open_output",
     "ply_path",
     "write_array",
     "write_bytes",
@@ -42,6 +46,17 @@ __all__ = [
 STANDARD_STREAM = "-"
 
 _PLY_MAGICS = (b"ply\n", b"ply\r")
+
+#: By the endings of input and output, `*` for any, the command that makes one of the other.
+_MAKERS = {
+    (".ply", ".ply"): "simplify",
+    (".csplat", ".ply"): "decode",
+    (".ply", ".csplat"): "encode",
+    ("*", ".html"): "export-html",
+    ("*", ".npz"): "sensitivity",
+}
+
+_free: set[Path] = set()  # names that nobody had when they were checked: whoever takes one meanwhile keeps it
 
 
 def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> None:
@@ -63,8 +78,11 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
     target = Path(path)
     if target.is_dir():
         raise InputError(f"{path} is a folder, wanted the name of a file")
+    _free.discard(target.resolve())
     if not target.exists():
         target.parent.stat()  # an OSError that names the folder
+        if not force:
+            _free.add(target.resolve())
         return
     for other in inputs:
         if other != STANDARD_STREAM and Path(other).exists() and target.samefile(other):
@@ -95,6 +113,30 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
         check_output(path, force=force, inputs=read)
 
 
+def check_name(path: str, wanted: str, command: str, source: str) -> None:
+    """Refuse an output whose name says that it is something else than the command writes.
+
+    Args:
+        path: the output, or `-`.
+        wanted: the ending that it might have.
+        command: the name of the command.
+        source: its input.
+
+    Raises:
+        InputError: the name ends otherwise, as files of another kind do. The message has the command that was meant.
+    """
+    target, suffix = Path(path), Path(path).suffix.lower()
+    if suffix == wanted:
+        return
+    known = foreign_name(target)
+    maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix))
+    if known is None and maker is None and suffix not in {kind for pair in _MAKERS for kind in pair}:
+        return
+    meant = f"csplat {maker} {source} {path}" if maker else f"csplat {command} {source} {target.with_suffix(wanted)}"
+    what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
+    raise InputError(f"{path}: {what} `csplat {command}` writes a {wanted} file: did you mean `{meant}`?")
+
+
 @contextmanager
 def local_path(file: File) -> Iterator[Path]:
     """Give the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied first.
@@ -104,10 +146,10 @@ def local_path(file: File) -> Iterator[Path]:
         OSError: it cannot be read.
     """
     if isinstance(file, str) and file == STANDARD_STREAM:
-        with local_file(sys.stdin.buffer, "standard input") as path:
+        with _naming(file), local_file(sys.stdin.buffer, "standard input") as path:
             yield path
     else:
-        with local_file(file) as path:
+        with _naming(file), local_file(file) as path:
             yield path
 
 
@@ -155,19 +197,20 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap.mmap]:
     """
     if path == STANDARD_STREAM:
         data = sys.stdin.buffer.read()
-        _refuse_ply("standard input", data)
-        yield data
+        with _naming(path):
+            _refuse_others("standard input", data)
+            yield data
         return
-    with Path(path).open("rb") as stream:
+    with Path(path).open("rb") as stream, _naming(path):
         try:
             mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         except (ValueError, OSError, io.UnsupportedOperation):  # empty, or a pipe
             data = stream.read()
-            _refuse_ply(path, data)
+            _refuse_others(path, data)
             yield data
             return
         try:
-            _refuse_ply(path, mapped[:4])
+            _refuse_others(path, mapped[:HEAD_SIZE])
             yield mapped
         finally:
             _close(mapped)
@@ -186,8 +229,27 @@ def write_bytes(path: str, data: bytes) -> None:
         sys.stdout.buffer.write(data)
         sys.stdout.buffer.flush()
     else:
-        with atomic_writer(path) as stream:
+        with open_output(path) as stream:
             stream.write(data)
+
+
+@contextmanager
+def open_output(path: str) -> Iterator[BinaryIO]:
+    """Open a file that takes its name when it is complete. One that was free when it was checked has to be free still.
+
+    Raises:
+        InputError: somebody else has taken the name.
+        OSError: it cannot be written.
+    """
+    target = Path(path).resolve()
+    try:
+        with atomic_writer(path, replace=target not in _free) as stream:
+            yield stream
+    except FileExistsError:
+        raise InputError(
+            f"{path} exists: another program wrote it meanwhile, and its file stays; --force replaces it"
+        ) from None
+    _free.discard(target)
 
 
 def write_json(path: str, value: Any) -> None:
@@ -198,15 +260,29 @@ def write_json(path: str, value: Any) -> None:
 def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:
     """Write a PLY, or one to standard output."""
     if path != STANDARD_STREAM:
-        write_ply(path, model, absolute=absolute)
+        with open_output(path) as stream:
+            write_ply(stream, model, absolute=absolute)
         return
     write_ply(sys.stdout.buffer, model, absolute=absolute)
     sys.stdout.buffer.flush()
 
 
-def _refuse_ply(name: str, data: bytes) -> None:
+@contextmanager
+def _naming(file: File) -> Iterator[None]:
+    """Note in errors which file they are about, if it has a name."""
+    try:
+        yield
+    except CsplatError as error:
+        if isinstance(file, (str, os.PathLike)):
+            error.path = "standard input" if file == STANDARD_STREAM else os.fspath(file)
+        raise
+
+
+def _refuse_others(name: str, data: bytes) -> None:
     if data[:4] in _PLY_MAGICS:
         raise InputError(f"{name} is a PLY, wanted a .csplat file: `csplat encode` makes one")
+    if not data.startswith(MAGIC) and Path(name).suffix.lower() != ".csplat":
+        refuse_known(Path(name), data[:HEAD_SIZE])
 
 
 def _close(mapped: mmap.mmap) -> None:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from csplat.encoder import EncodeOptions, Importance, most_grades, trusted
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.removal import measure_removal
 from csplat_tools.files.console import Progress
+from csplat_tools.files.streams import open_output
 from csplat_tools.views import Colour, ViewSet, evenly
 from csplat_tools.views.agreeing import find_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
@@ -56,7 +56,7 @@ class MeasuredSensitivity:
 
     def write(self, path: str) -> None:
         """Write the file, all of it or nothing."""
-        with atomic_writer(path) as stream:
+        with open_output(path) as stream:
             write_sensitivity(stream, self.model, self.found, self.source, self.missed_share)
 
     def as_json(self) -> dict[str, Any]:
