@@ -1,5 +1,6 @@
 """The Python interface: its names, what they take, what they refuse and how, and that the commands call them."""
 
+import doctest
 import gzip
 import io
 import subprocess
@@ -55,6 +56,31 @@ def test_the_packages_load_neither_renderer_nor_command_line():
     code = "import csplat, csplat_tools, sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & set(loaded)
+
+
+# what the documentation shows
+
+
+@pytest.fixture(scope="module")
+def documented(tmp_path_factory, sample_path):
+    """A folder with the files that examples name."""
+    folder = tmp_path_factory.mktemp("documented")
+    model = csplat.read_ply(sample_path).select(slice(0, 1000))
+    csplat.write_ply(folder / "scene.ply", model)
+    (folder / "scene.csplat").write_bytes(csplat.encode(model, csplat.EncodeOptions(preset="fast")))
+    return folder
+
+
+@pytest.mark.parametrize("package", [csplat, csplat_tools])
+def test_what_the_documentation_shows_is_so(package, documented, monkeypatch):
+    monkeypatch.chdir(documented)
+    shown = {id(one): one for one in (package, *(getattr(package, name) for name in package.__all__))}
+    examples = 0
+    for one in shown.values():
+        for test in doctest.DocTestFinder(recurse=False).find(one, getattr(one, "__name__", "?"), globs={}):
+            assert 0 == doctest.DocTestRunner().run(test).failed, test.name
+            examples += len(test.examples)
+    assert examples > 3
 
 
 # files, in every form

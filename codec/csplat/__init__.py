@@ -22,6 +22,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from csplat.bridges import from_gsplat, to_gsplat
     from csplat.decoder import decode, decode_integers, decode_scene, read_header
     from csplat.encoder import EncodeOptions, EncodeResult, encode, encode_with_report
     from csplat.errors import (
@@ -51,9 +52,11 @@ __all__ = [
     "decode_scene",
     "encode",
     "encode_with_report",
+    "from_gsplat",
     "lint_ply",
     "read_header",
     "read_ply",
+    "to_gsplat",
     "write_ply",
 ]
 
@@ -91,9 +94,11 @@ _MODULE_OF = {
     "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
     "encode_with_report": "csplat.encoder",
+    "from_gsplat": "csplat.bridges",
     "lint_ply": "csplat.ply",
     "read_header": "csplat.decoder",
     "read_ply": "csplat.ply",
+    "to_gsplat": "csplat.bridges",
     "write_ply": "csplat.ply",
 }
 __getattr__ = lazy_exports(__name__, _MODULE_OF)

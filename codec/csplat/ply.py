@@ -65,9 +65,9 @@ def read_ply(
         >>> import csplat
         >>> model = csplat.read_ply("scene.ply")
         >>> model
-        SplatModel(1983 splats, sh_degree=3)
+        SplatModel(1000 splats, sh_degree=3)
         >>> model.scales.shape, model.scales.dtype  # natural logarithms
-        ((1983, 3), dtype('float32'))
+        ((1000, 3), dtype('float32'))
 
     Raises:
         InputError: not a PLY of splats (other splat formats are named, with a converter), or one

@@ -123,9 +123,9 @@ def decode(
         >>> import csplat
         >>> model = csplat.decode("scene.csplat")
         >>> model
-        SplatModel(1983 splats, sh_degree=3)
+        SplatModel(1000 splats, sh_degree=3)
         >>> csplat.decode("scene.csplat", sh_degree=1).shN.shape
-        (1983, 3, 3)
+        (1000, 3, 3)
 
     Raises:
         FormatError: the file breaks a clause. A whole decode checks all of them, every chunk's

@@ -61,7 +61,7 @@ def encode_with_report(
         >>> import csplat
         >>> result = csplat.encode_with_report(csplat.read_ply("scene.ply"))
         >>> most, rms = result.report.errors["opacities"]  # of any splat, and over all, as the file states them
-        >>> 0.0 < rms < most < 0.02
+        >>> 0.0 < rms < most < 0.1
         True
 
     Raises:

@@ -89,11 +89,13 @@ def encode_to(
 
     Example:
         >>> import csplat, csplat_tools
-        >>> found = csplat_tools.encode_to("scene.ply", errors={"means": 0.001})
+        >>> found = csplat_tools.encode_to(
+        ...     "scene.ply", errors={"means": 0.001}, options=csplat.EncodeOptions(preset="fast")
+        ... )
         >>> found.report.reached["means"] <= 0.001
         True
         >>> csplat.decode(found.data)
-        SplatModel(8929 splats, sh_degree=3)
+        SplatModel(1000 splats, sh_degree=3)
 
     Raises:
         InputError: there are no splats, a knob is set that the target has to choose, or it is out of reach.

@@ -1,0 +1,159 @@
+"""To and from what trainers hold: a dict of arrays or tensors under gsplat's names.
+
+| name | `form="parameters"`, as in training and checkpoints | `form="activated"`, as `gsplat.rasterization` wants it |
+|---|---|---|
+| `means` | [N, 3] scene units | the same |
+| `quats` | [N, 4] w x y z, of any length | the same |
+| `scales` | [N, 3] natural logarithms | [N, 3] standard deviations, scene units |
+| `opacities` | [N] logits | [N] alpha, 0 to 1 |
+| `sh0` | [N, 1, 3] coefficient of degree 0 | the same |
+| `shN` | [N, K, 3] the higher ones, K = 0, 3, 8 or 15 | the same |
+
+A `SplatModel` holds logarithms of scales and alpha, which is neither of the two: say which form is meant.
+torch is imported where tensors are asked for, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+
+import numpy as np
+
+from csplat.errors import InputError
+from csplat.model import F32, SplatModel, check_model, normalise_quats
+from csplat.ply_columns import alpha_of_logits, logits_of_alpha
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Form", "from_gsplat", "to_gsplat"]
+
+Form = Literal["parameters", "activated"]
+
+_NEEDED = ("means", "quats", "scales", "opacities", "sh0")
+_SPLATS = "splats"  # where a checkpoint of gsplat's trainer has them
+
+
+def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> SplatModel:
+    """Make a model of a dict under gsplat's names.
+
+    Args:
+        splats: arrays, or tensors of torch on any device, with or without gradients; see the table above. A
+            checkpoint of gsplat's trainer will do: its member `splats` is taken. `shN` may be left out.
+        form: "parameters", as they are trained; or "activated", as `gsplat.rasterization` takes them.
+
+    Returns:
+        The scene: float32, rotations at unit length. The arrays are copies. What no array says is as by default: of a
+        scene that was trained so, `dataclasses.replace(model, antialiased=True)` says it.
+
+    Example:
+        >>> import csplat, numpy as np
+        >>> splats = {
+        ...     "means": np.zeros((2, 3)), "quats": np.ones((2, 4)), "scales": np.log(np.full((2, 3), 0.01)),
+        ...     "opacities": np.zeros(2), "sh0": np.zeros((2, 1, 3)),
+        ... }
+        >>> csplat.from_gsplat(splats).opacities  # of logits
+        array([0.5, 0.5], dtype=float32)
+
+    Raises:
+        InputError: a name is missing, or an array is of another shape, not finite, or out of its range.
+    """
+    _check_form(form)
+    if not any(name in splats for name in _NEEDED) and _SPLATS in splats:
+        splats = splats[_SPLATS]
+    missing = [name for name in _NEEDED if name not in splats]
+    if missing:
+        hint = "; it was trained with features of appearance, which are no SH" if "features" in splats else ""
+        raise InputError(f"the splats have no {', '.join(missing)}, wanted gsplat's names{hint}")
+    means, quats, scales, opacities, sh0 = (_array(name, splats[name]) for name in _NEEDED)
+    count = len(means) if means.ndim else 0
+    shN = _array("shN", splats["shN"]) if "shN" in splats else np.zeros((count, 0, 3), np.float32)
+    if quats.shape != (count, 4):
+        raise InputError(f"quats has shape {list(quats.shape)}, wanted [{count}, 4]")
+    if not np.isfinite(quats).all():
+        raise InputError("quats holds values that are NaN or infinite")
+    opacities = _reshaped("opacities", opacities, (count,), (count, 1))
+    if form == "parameters":
+        opacities = alpha_of_logits(opacities)
+    elif (scales > 0.0).all():
+        scales = np.log(scales.astype(np.float64)).astype(np.float32)
+    else:
+        raise InputError('scales are not all above 0: those of form="parameters" are logarithms')
+    sh0 = _reshaped("sh0", sh0, (count, 3), (count, 1, 3))
+    return SplatModel(means, normalise_quats(quats), scales, opacities, sh0, shN)
+
+
+@overload
+def to_gsplat(model: SplatModel, *, form: Form = ..., device: None = None) -> dict[str, F32]: ...
+@overload
+def to_gsplat(model: SplatModel, *, form: Form = ..., device: str) -> dict[str, Tensor]: ...
+def to_gsplat(
+    model: SplatModel, *, form: Form = "parameters", device: str | None = None
+) -> dict[str, F32] | dict[str, Tensor]:
+    """Give a model as a dict under gsplat's names; see the table above.
+
+    To render with gsplat: `s = to_gsplat(model, form="activated", device="cuda")`, and then
+    `rasterization(s["means"], s["quats"], s["scales"], s["opacities"], torch.cat([s["sh0"], s["shN"]], 1), viewmats,
+    Ks, width, height, sh_degree=model.sh_degree)`. Cameras are relative to `model.origin`, as the means are.
+
+    Args:
+        model: the scene.
+        form: "parameters", as they are trained: logarithms and logits; or "activated", as `gsplat.rasterization`
+            takes them.
+        device: "cpu", "cuda", ...: tensors of torch there. `None`: NumPy arrays.
+
+    Returns:
+        `means`, `quats`, `scales`, `opacities`, `sh0`, `shN`: float32, copies. Alpha of 0 and 1 have finite logits.
+
+    Example:
+        >>> import csplat
+        >>> splats = csplat.to_gsplat(csplat.decode("scene.csplat"), form="activated")
+        >>> splats["sh0"].shape, splats["shN"].shape, bool(splats["scales"].min() > 0.0)
+        ((1000, 1, 3), (1000, 15, 3), True)
+
+    Raises:
+        InputError: it is no model, the form is none, or torch is not installed.
+    """
+    check_model("to_gsplat", model)
+    _check_form(form)
+    activated = form == "activated"
+    with np.errstate(over="ignore", under="ignore"):
+        scales = np.exp(model.scales.astype(np.float64)).astype(np.float32) if activated else model.scales.copy()
+    arrays = {
+        "means": model.means.copy(),
+        "quats": model.quats.copy(),
+        "scales": scales,
+        "opacities": model.opacities.copy() if activated else logits_of_alpha(model.opacities),
+        "sh0": model.sh0[:, None, :].copy(),
+        "shN": model.shN.copy(),
+    }
+    if device is None:
+        return arrays
+    try:
+        import torch
+    except ModuleNotFoundError:
+        raise InputError("tensors want torch, which is not installed: device=None gives NumPy arrays") from None
+    return {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
+
+
+def _array(name: str, value: Any) -> F32:
+    """A float32 copy of an array, or of a tensor wherever it is."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().float().numpy()  # float: NumPy knows no bfloat16
+    try:
+        with np.errstate(over="ignore"):
+            return np.array(value, np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is a {type(value).__name__}, wanted an array or a tensor: {error}") from None
+
+
+def _reshaped(name: str, array: F32, wanted: tuple[int, ...], also: tuple[int, ...]) -> F32:
+    if array.shape not in (wanted, also):
+        raise InputError(f"{name} has shape {list(array.shape)}, wanted {list(also)}")
+    return array.reshape(wanted)
+
+
+def _check_form(form: str) -> None:
+    if form not in get_args(Form):
+        raise InputError(f"form is {form!r}, wanted one of {', '.join(get_args(Form))}")
