@@ -4,12 +4,13 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from csplat import encode, read_ply
+from csplat import decode, encode, read_ply
 from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
 from csplat_tools.present.export import export_page, link_modules
@@ -59,7 +60,7 @@ def test_the_page_opens_from_a_file_without_a_network(tab, site, sample, tmp_pat
     assert ["blob", "file"] == sorted(schemes)  # the page, and its worker
 
 
-def test_the_page_from_a_file_opens_other_files(tab, make_model, tmp_path):
+def test_the_page_from_a_file_opens_other_files_and_keeps_what_is_up(tab, make_model, tmp_path):
     (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), "scene.csplat").page)
     (tmp_path / "other.csplat").write_bytes(encode(make_model(70, 0)))
     page = tab.page
@@ -69,6 +70,10 @@ def test_the_page_from_a_file_opens_other_files(tab, make_model, tmp_path):
     page.set_input_files("#file", tmp_path / "other.csplat")
     tab.until("document.getElementById('summary').textContent.startsWith('70 splats')")
     assert "other.csplat" == page.inner_text("#title")
+    page.click("#upright")
+    with page.expect_download() as download:
+        page.click("#keep-download")
+    assert [0, 0, 1] == decode(Path(download.value.path()).read_bytes()).metadata["up"]
 
 
 def test_the_page_is_forbidden_the_network(tab, site, make_model):

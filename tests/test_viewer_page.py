@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from csplat import EncodeOptions, encode, read_ply
+from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.decoder import read_header
+from csplat_conformance.validator import validate
 
 PAGE = "/tools/viewer/index.html"
 POSE = "JSON.parse(JSON.stringify(csplatViewer.rig.pose))"
@@ -378,6 +379,37 @@ def test_nonsense_in_the_address_is_reported(small, site, make_model):
     said = small.page.inner_text("#toast")
     assert "size is “big”" in said
     assert "axes is “RRR”" in said
+
+
+def test_turning_upright_can_be_kept(small, site, make_model, tmp_path):
+    load(small, site, encode(make_model(60, 1, metadata={"title": "Lying down"})))
+    page = small.page
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.click("#upright")
+    assert [0, 0, 1] == page.evaluate("csplatViewer.rig.home.up")
+    assert "z is up." == page.inner_text("#keep-title")
+    command = "csplat encode scene.ply scene.csplat --up z"
+    assert command == page.inner_text("#keep-command")
+    page.click("#keep-copy")
+    small.until("document.getElementById('toast').textContent === 'Copied'")
+    assert command == page.evaluate("navigator.clipboard.readText()")
+    with page.expect_download() as download:
+        page.click("#keep-download")
+    assert "scene.csplat" == download.value.suggested_filename
+    kept = tmp_path / "kept.csplat"
+    download.value.save_as(kept)
+    assert {"title": "Lying down", "up": [0, 0, 1]} == decode(kept.read_bytes()).metadata
+    assert validate(kept.read_bytes()).conforms
+    page.keyboard.press("Escape")
+    assert page.locator("#keep").is_hidden()
+
+    load(small, site, kept.read_bytes())
+    assert [0, 0, 1] == page.evaluate("csplatViewer.rig.home.up")
+    assert page.locator("#upright").is_hidden()
+    for _ in range(6):
+        page.keyboard.press("u")
+    assert "z is up, as the scene says" == page.inner_text("#toast")
+    assert page.locator("#keep").is_hidden()
 
 
 def test_an_empty_scene_is_a_scene(small, site, make_model):

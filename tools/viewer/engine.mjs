@@ -192,6 +192,19 @@ class SplatEngine {
     return this.renderer.readPixels();
   }
 
+  /** @param {[number, number, number]} up */
+  fileWithUp(up) {
+    const { port1, port2 } = new MessageChannel();
+    this.worker.postMessage({ type: 'rewrite', up, port: port2 }, [port2]);
+    return new Promise((/** @type {(bytes: Uint8Array<ArrayBuffer>) => void} */ resolve, reject) => {
+      port1.onmessage = (/** @type {{data: import('./worker.mjs').Rewritten}} */ { data: { bytes, error } }) => {
+        port1.close();
+        if (bytes) resolve(bytes);
+        else reject(new EngineError(error ?? { code: E_WORKER, message: 'no file came' }));
+      };
+    });
+  }
+
   /** @param {number} count */
   async timeFrames(count) {
     await this.settled();

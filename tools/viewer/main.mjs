@@ -1,10 +1,11 @@
 // The page: an engine, a camera that a person moves, and what stands over the scene.
 //
-// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&axes=RDF&size=WxH&background=rrggbb&ui=0
+// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // `window.csplatViewer` lets programs drive the page; its `ready` resolves when the scene is drawn for good.
 
 import { Controls } from './controls.mjs';
 import { createEngine } from './engine.mjs';
+import { KeepOffer, upWord } from './keep.mjs';
 import { Overlay, element } from './overlay.mjs';
 import { embedded, fetchCameras, nameOf, readWishes } from './page.mjs';
 import { Rig } from './rig.mjs';
@@ -27,6 +28,13 @@ const address = Object.fromEntries(new URLSearchParams(location.search));
 const { wishes, complaints } = readWishes(new URLSearchParams({ ...page?.wishes, ...address }));
 const canvas = element('canvas', HTMLCanvasElement);
 const overlay = new Overlay({ open: (file) => void show(file, file.name) });
+const keep = new KeepOffer({
+  file: async (up) => {
+    if (!engine) throw new Error('there is no scene');
+    return engine.fileWithUp(up);
+  },
+  say: (text) => overlay.toast(text),
+});
 const rig = new Rig(emptyPose(), 1);
 const stage = new Stage(canvas, wishes.size, draw);
 const calm = matchMedia('(prefers-reduced-motion: reduce)');
@@ -40,7 +48,7 @@ const controls = new Controls(canvas, rig, {
   calm: () => calm.matches || wishes.size !== null || !wishes.ui,
 });
 /** @type {SceneView} */
-const view = new SceneView(rig, controls, wishes.axes);
+const view = new SceneView(rig, controls, wishes);
 document.documentElement.classList.toggle('bare', !wishes.ui);
 
 /** @type {Engine | null} */
@@ -65,6 +73,7 @@ async function show(source, name) {
   const mine = ++turn;
   view.begin();
   overlay.begin(name);
+  keep.hide();
   tools(false);
   try {
     await engine.open(source);
@@ -123,7 +132,12 @@ function shDegree(degree) {
 }
 
 function turnUpright() {
-  if (engine?.bounds) overlay.toast(`${view.turnUpright(engine.bounds, engine.stats.splatCount)} is up`);
+  if (!engine?.bounds) return;
+  const { up, isSaid } = view.turnUpright(engine.bounds, engine.stats.splatCount);
+  if (isSaid) {
+    keep.hide();
+    overlay.toast(`${upWord(up).replace('-', '−')} is up, as the scene says`);
+  } else keep.show(overlay.name, up);
 }
 
 async function fullScreen() {
@@ -145,7 +159,10 @@ const ACTIONS = {
   KeyB: nextBackground,
   BracketLeft: () => otherCamera(-1),
   BracketRight: () => otherCamera(1),
-  Escape: () => overlay.hideError(),
+  Escape: () => {
+    overlay.hideError();
+    keep.hide();
+  },
   Digit0: () => shDegree(0),
   Digit1: () => shDegree(1),
   Digit2: () => shDegree(2),

@@ -136,8 +136,9 @@ export class Overlay {
 
   toggleHelp() {
     const dialog = element('help-dialog', HTMLDialogElement);
-    if (dialog.open) dialog.close();
-    else dialog.showModal();
+    if (dialog.open) return dialog.close();
+    dialog.showModal();
+    dialog.scrollTop = 0; // on a small screen the button that has the focus is at the end
   }
 
   /**

@@ -1,10 +1,13 @@
 // What the address of the page asks for, and what a page that carries its scene has inside.
 
+import { unitDirection } from './vectors.mjs';
+
 /**
  * @typedef {object} Wishes
  * @property {string | null} scene address of a .csplat file
  * @property {string | null} camera a camera, a list of them, or the address of a file of one or the other
  * @property {number} view which camera of a list, from 0
+ * @property {import('./vectors.mjs').Vec3 | null} up direction that is up, of length 1, instead of what the file says
  * @property {string | null} axes directions of +x, +y, +z instead of the file's
  * @property {{width: number, height: number} | null} size of the drawing buffer, pixels
  * @property {[number, number, number]} background 0 to 1
@@ -18,7 +21,9 @@
  * @property {Record<string, string>} wishes parameters, as an address would have them
  */
 
+const UP = /^[-+.\de]+(?:,[-+.\de]+){2}$/i;
 const AXES = /^(?=.*[RL])(?=.*[UD])(?=.*[FB])[RLUDFB]{3}$/;
+const THREE = 'three numbers as 0,-1,0';
 
 /** @returns {Embedded | null} */
 export function embedded() {
@@ -43,6 +48,9 @@ export function readWishes(query) {
   };
   const size = match('size', /^([1-9]\d{0,3})x([1-9]\d{0,3})$/, 'width and height as 800x600');
   const colour = match('background', /^([\da-f]{2})([\da-f]{2})([\da-f]{2})$/i, 'a colour as ff8800');
+  const numbers = match('up', UP, THREE);
+  const up = numbers && unitDirection(numbers[0].split(',').map(Number));
+  if (numbers && !up) complaints.push(`up is “${numbers[0]}”, wanted ${THREE}`);
   const axes = match('axes', AXES, 'three letters as RDF');
   const view = match('view', /^\d{1,6}$/, 'a number from 0');
   return {
@@ -50,6 +58,7 @@ export function readWishes(query) {
       scene: query.get('scene'),
       camera: query.get('camera'),
       view: Number(view?.[0] ?? 0),
+      up,
       axes: axes?.[0] ?? null,
       size: size && { width: Number(size[1]), height: Number(size[2]) },
       background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : [0, 0, 0],

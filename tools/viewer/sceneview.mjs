@@ -13,7 +13,7 @@ import {
 import { findFrame } from './frame.mjs';
 import { defaultLens } from './rig.mjs';
 import { pick } from './survey.mjs';
-import { dot } from './vectors.mjs';
+import { dot, unitDirection } from './vectors.mjs';
 
 /**
  * @typedef {import('./controls.mjs').Controls} Controls
@@ -26,7 +26,7 @@ import { dot } from './vectors.mjs';
  * @typedef {ReturnType<typeof readCamera> & {image: string}} Camera
  */
 
-const AXIS_NAMES = ['x', 'y', 'z'];
+const SAME = 0.999; // cosine of the angle between directions that are taken for one
 
 /** @returns {Pose} of a camera before anything is known */
 export function emptyPose() {
@@ -47,6 +47,8 @@ export function emptyPose() {
 /** What a file says of its scene. */
 const noFacts = () => {
   return {
+    /** @type {Vec3 | null} */
+    up: null,
     axes: '',
     /** @type {Camera[]} */
     cameras: [],
@@ -61,12 +63,12 @@ export class SceneView {
   /**
    * @param {Rig} rig
    * @param {Controls} controls
-   * @param {string | null} axes instead of the file's
+   * @param {{up: Vec3 | null, axes: string | null}} wanted instead of the file's
    */
-  constructor(rig, controls, axes) {
+  constructor(rig, controls, wanted) {
     this.rig = rig;
     this.controls = controls;
-    this.wantedAxes = axes;
+    this.wanted = wanted;
     /** @type {Camera[]} of the address: for whatever scene */
     this.wantedCameras = [];
     this.first = 0;
@@ -110,6 +112,7 @@ export class SceneView {
    */
   read({ axes }, { metadata, cameras }) {
     this.facts = {
+      up: unitDirection(metadata?.up),
       axes,
       cameras: (cameras ?? []).flatMap(sound),
       start: [metadata?.view].flatMap(sound)[0] ?? null,
@@ -125,10 +128,18 @@ export class SceneView {
     return this.#namedUp() !== null;
   }
 
+  /** @returns {Vec3 | null} what the file says by itself, whoever took its pictures */
+  get saidUp() {
+    const { up, axes } = this.facts;
+    return up ?? (axes ? directionOf(axes, 'U') : null);
+  }
+
   /** @returns {Vec3 | null} */
   #namedUp() {
-    const axes = this.wantedAxes ?? this.facts.axes;
+    const { up, axes } = this.wanted;
+    if (up) return up;
     if (axes) return directionOf(axes, 'U');
+    if (this.saidUp) return this.saidUp;
     const { start } = this.facts;
     const known = [...(start ? [start] : []), ...this.cameras];
     return known.length ? upOfCameras(known) : null;
@@ -180,17 +191,16 @@ export class SceneView {
    *
    * @param {Bounds} bounds
    * @param {number} splatCount
-   * @returns {string} the axis that is up now
+   * @returns {{up: Vec3, isSaid: boolean}} what is up now, and whether the file says so
    */
   turnUpright(bounds, splatCount) {
     const all = waysUp(this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U'));
-    this.up = all[(all.findIndex((up) => dot(up, this.up) > 0.999) + 1) % all.length];
+    this.up = all[(all.findIndex((up) => dot(up, this.up) > SAME) + 1) % all.length];
     const pose = this.#automatic(bounds, splatCount, this.up);
     this.rig.home = pose;
     this.controls.touched = true;
     this.controls.glide(pose);
-    const k = this.up.findIndex((value) => Math.abs(value) > 0.9);
-    return k < 0 ? 'The cameras’ own direction' : `${this.up[k] < 0 ? '−' : '+'}${AXIS_NAMES[k]}`;
+    return { up: this.up, isSaid: this.saidUp !== null && dot(this.saidUp, this.up) > SAME };
   }
 
   /**
@@ -226,7 +236,8 @@ export class SceneView {
    * @param {Vec3} up
    */
   #automatic(bounds, splatCount, up) {
-    const axes = this.wantedAxes ?? this.facts.axes;
+    const named = this.wanted.axes ?? this.facts.axes;
+    const axes = named && dot(directionOf(named, 'U'), up) > Math.SQRT1_2 ? named : ''; // of another way up: no front
     const front = frontFor(axes || DEFAULT_AXES, up);
     const { pose, frame } = automaticPose(bounds, splatCount, { up, front, isFrontKnown: axes !== '' });
     this.rig.extent = frame.extent;

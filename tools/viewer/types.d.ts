@@ -127,6 +127,8 @@ export interface Engine {
   settled(): Promise<void>;
   /** The settled picture: RGBA, the top row first. */
   readPixels(): Promise<Uint8Array>;
+  /** The scene's file, but that it says which way is up: a direction of length 1. */
+  fileWithUp(up: [number, number, number]): Promise<Uint8Array<ArrayBuffer>>;
   /** Draw frames one after the other and wait for each: milliseconds of each. For benchmarks. */
   timeFrames(count: number): Promise<number[]>;
   readonly stats: Stats;

@@ -27,6 +27,18 @@ export const length = (a) => Math.hypot(a[0], a[1], a[2]);
 /** @type {(a: Vec3) => Vec3} */
 export const unit = (a) => scale(a, 1 / (length(a) || 1));
 
+/**
+ * A direction as files and addresses say it, at length 1.
+ *
+ * @param {unknown} value
+ * @returns {Vec3 | null} null where it is not three finite numbers, or all are 0
+ */
+export function unitDirection(value) {
+  if (!Array.isArray(value) || value.length !== 3 || !value.every(Number.isFinite)) return null;
+  const largest = Math.max(...value.map(Math.abs)); // squares of large ones are infinite
+  return largest > 0 ? unit(/** @type {Vec3} */ (value.map((one) => one / largest))) : null;
+}
+
 /** @type {(a: Vec3, b: Vec3, t: number) => Vec3} */
 export const mix = (a, b, t) => add(scale(a, 1 - t), scale(b, t));
 

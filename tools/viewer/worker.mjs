@@ -2,6 +2,7 @@
 
 import { cull } from './cull.mjs';
 import { load } from './loader.mjs';
+import { withUp } from './rewriting.mjs';
 import { DepthSorter } from './sort.mjs';
 
 /**
@@ -14,7 +15,12 @@ import { DepthSorter } from './sort.mjs';
  * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
+ *   | {type: 'rewrite', up: number[], port: MessagePort}
  *   | {type: 'stop'}} Request
+ *
+ * The answer to `rewrite`, to its port.
+ *
+ * @typedef {{bytes?: Uint8Array<ArrayBuffer>, error?: ErrorReport}} Rewritten
  *
  * Messages of the worker; all carry `scene`.
  *
@@ -44,6 +50,8 @@ class Job {
   constructor(scope) {
     this.scope = scope;
     this.scene = 0;
+    /** @type {string | Blob | ArrayBuffer} */
+    this.source = new ArrayBuffer(0);
     this.abort = new AbortController();
     /** @type {CullTile[]} */
     this.tiles = [];
@@ -64,7 +72,8 @@ class Job {
     else if (request.type === 'view') {
       this.camera = request;
       this.sortSoon(0);
-    } else if (request.type === 'stop') this.reset();
+    } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
+    else if (request.type === 'stop') this.reset();
     else if (this.spare.length < 2) this.spare.push(request.order);
   }
 
@@ -87,6 +96,7 @@ class Job {
   async open(scene, source) {
     this.reset();
     this.scene = scene;
+    this.source = source;
     const { signal } = this.abort;
     /** @type {(message: any, transfer?: Transferable[]) => void} */
     const post = (message, transfer = []) => {
@@ -98,6 +108,21 @@ class Job {
       post({ type: 'done' });
     } catch (error) {
       post({ type: 'error', error: reportOf(error) });
+    }
+  }
+
+  /**
+   * Give the file of the scene, saying another way up.
+   *
+   * @param {number[]} up
+   * @param {MessagePort} port
+   */
+  async rewrite(up, port) {
+    try {
+      const bytes = await withUp(await whole(this.source), up);
+      port.postMessage({ bytes }, [bytes.buffer]);
+    } catch (error) {
+      port.postMessage({ error: reportOf(error) });
     }
   }
 
@@ -166,6 +191,19 @@ class Job {
       order.buffer,
     ]);
   }
+}
+
+/**
+ * All bytes of a file.
+ *
+ * @param {string | Blob | ArrayBuffer} source
+ */
+async function whole(source) {
+  if (source instanceof ArrayBuffer) return source;
+  if (source instanceof Blob) return source.arrayBuffer();
+  const response = await fetch(source);
+  if (!response.ok) throw new Error(`${source}: HTTP status ${response.status}`);
+  return response.arrayBuffer();
 }
 
 /**

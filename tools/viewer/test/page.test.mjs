@@ -3,6 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
+import { keepCommand, upWord } from '../keep.mjs';
 import { explain } from '../messages.mjs';
 import { fetchCameras, readWishes } from '../page.mjs';
 
@@ -13,6 +14,7 @@ test('an empty address wishes nothing', () => {
     scene: null,
     camera: null,
     view: 0,
+    up: null,
     axes: null,
     size: null,
     background: [0, 0, 0],
@@ -31,7 +33,16 @@ test('every parameter is read', () => {
   assert.deepEqual([scene, camera, view, axes, ui], ['/a.csplat', '[]', 3, 'RUB', false]);
 });
 
-for (const query of ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x']) {
+test('up is a direction of length 1', () => {
+  const up = (text) => readWishes(new URLSearchParams({ up: text })).wishes.up;
+  assert.deepEqual(up('0,-1,0'), [0, -1, 0]);
+  assert.deepEqual(up('0,3,-4').map((x) => Math.round(1e9 * x) / 1e9), [0, 0.6, -0.8]);
+  assert.deepEqual(up('1e300,0,-0'), [1, 0, -0]);
+});
+
+const WRONG = ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x'];
+const NOWHERE = ['up=z', 'up=0,1', 'up=0,0,0', 'up=1,2,3,4', 'up=1,e,2', 'up=1e999,0,0'];
+for (const query of [...WRONG, ...NOWHERE]) {
   test(`${query} is complained about, and left out`, () => {
     const { wishes, complaints } = readWishes(new URLSearchParams(query));
     assert.equal(complaints.length, 1);
@@ -64,4 +75,14 @@ test('an error names its code, byte and clause once', () => {
 test('a PLY is recognised by its name', () => {
   assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.PLY').title, /PLY/);
   assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.zip').title, /not a \.csplat/);
+});
+
+test('the command that keeps what is up can be pasted into a shell', () => {
+  assert.equal(keepCommand('scene.csplat', [0, 0, 1]), 'csplat encode scene.ply scene.csplat --up z');
+  assert.equal(keepCommand('a.b.CSPLAT', [0, -1, -0]), 'csplat encode a.b.ply a.b.csplat --up -y');
+  assert.equal(
+    keepCommand("my dog's $HOME.csplat", [1, 0, 0]),
+    "csplat encode 'my dog'\\''s $HOME.ply' 'my dog'\\''s $HOME.csplat' --up x",
+  );
+  assert.equal(upWord([-0.006123456, -0.8760004, 0.4822]), '-0.006123,-0.876,0.4822');
 });

@@ -1,0 +1,154 @@
+// The same file, but that it says which way is up (spec 5.4): META is another, index and header follow.
+
+import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
+import { CsplatReader } from '../../codec/js/decoder.mjs';
+import { registeredFlags } from '../../codec/js/registry.mjs';
+import * as spec from '../../codec/js/spec.mjs';
+
+const AT_HEADER = spec.HEADER_OFFSETS;
+const AT_INDEX = spec.INDEX_HEAD_OFFSETS;
+const AT_RECORD = spec.DIRECTORY_RECORD_OFFSETS;
+const AT_CHUNK = spec.CHUNK_HEADER_OFFSETS;
+const AT_STREAM = spec.STREAM_HEAD_OFFSETS;
+const AXIS_AGREES = Math.SQRT1_2; // cosine: beyond 45 degrees another letter of the axes is up
+const HEADER_FIXED = AT_HEADER.header_crc;
+
+/**
+ * Write `up` into the metadata. Axes that it contradicts go; so do chunks that this version does not know and that say
+ * of themselves that they do not outlive a change (CHK-5).
+ *
+ * @param {ArrayBuffer} bytes of a file
+ * @param {number[]} up of length 1
+ * @returns {Promise<Uint8Array<ArrayBuffer>>} a file
+ */
+export async function withUp(bytes, up) {
+  const reader = await CsplatReader.open(bytes);
+  const { header } = reader;
+  const { metadata } = await reader.describe();
+  const directory = header.directory.filter(
+    ({ type, flags }) => Object.hasOwn(spec.CHUNK_NAMES, type) || flags & spec.CHUNK_FLAG_SAFE_TO_COPY,
+  );
+  const before = directory.find(({ type }) => type === spec.CHUNK_METADATA);
+  const flags = before?.flags ?? registeredFlags(spec.CHUNK_METADATA);
+  const meta = metadataChunk({ ...metadata, up }, flags);
+
+  const source = new Uint8Array(bytes);
+  const index = source.slice(0, spec.HEADER_SIZE + header.indexSize - CRC_SIZE); // with the header
+  const view = new DataView(index.buffer);
+  const head = spec.unpackIndexHead(view, spec.HEADER_SIZE);
+  const begin = spec.HEADER_SIZE + recordsBefore(head);
+  const end = begin + head.directory_count * head.directory_size;
+  const count = directory.length + (before ? 0 : 1);
+  const indexSize = header.indexSize + (count - head.directory_count) * head.directory_size;
+
+  const others = [...directory.filter((place) => place !== before), ...header.tiles.flatMap(({ layers }) => layers)];
+  const first = before?.offset ?? 0; // a new one comes before all others
+  const chunks = [{ offset: first, bytes: meta, field: 0 }];
+  for (const { offset, size, offsetField } of others) {
+    chunks.push({ offset, bytes: source.subarray(offset, offset + size), field: offsetField });
+  }
+  chunks.sort((a, b) => a.offset - b.offset);
+  let at = spec.HEADER_SIZE + indexSize;
+  let metaAt = 0;
+  for (const { bytes: chunk, field } of chunks) {
+    if (field) view.setBigUint64(field, BigInt(at), true);
+    else metaAt = at;
+    at += chunk.length;
+  }
+
+  const records = directory.map(({ recordOffset }) => index.subarray(recordOffset, recordOffset + head.directory_size));
+  const record = before ? records[directory.indexOf(before)] : new Uint8Array(head.directory_size);
+  if (!before) records.push(record);
+  putRecord(record, flags, meta, metaAt);
+  if (!isUpright(header.axes, up)) index.fill(0, spec.HEADER_SIZE + AT_INDEX.axes, spec.HEADER_SIZE + AT_INDEX.axes + 3);
+  view.setUint16(spec.HEADER_SIZE + AT_INDEX.directory_count, count, true);
+  view.setUint32(AT_HEADER.index_size, indexSize, true);
+  view.setBigUint64(AT_HEADER.file_size, BigInt(at), true);
+  view.setUint32(AT_HEADER.header_crc, crc32(index.subarray(0, HEADER_FIXED)), true);
+  const parts = [index.subarray(0, begin), ...records, index.subarray(end)];
+  const written = joined([...parts, new Uint8Array(CRC_SIZE), ...chunks.map((chunk) => chunk.bytes)], at);
+  const crcAt = spec.HEADER_SIZE + indexSize - CRC_SIZE;
+  new DataView(written.buffer).setUint32(crcAt, crc32(written.subarray(spec.HEADER_SIZE, crcAt)), true);
+  return written;
+}
+
+/**
+ * Bytes of the index before the directory.
+ *
+ * @param {ReturnType<typeof spec.unpackIndexHead>} head
+ */
+function recordsBefore(head) {
+  const { head_size, attribute_count, attribute_size, codebook_count, codebook_size, extra_count, extra_size } = head;
+  return head_size + attribute_count * attribute_size + codebook_count * codebook_size + extra_count * extra_size;
+}
+
+/**
+ * A chunk META, stored as it is (spec 5.1, 6.1).
+ *
+ * @param {object} metadata
+ * @param {number} flags
+ */
+function metadataChunk(metadata, flags) {
+  const text = new TextEncoder().encode(JSON.stringify(metadata));
+  const heads = spec.CHUNK_HEADER_SIZE + spec.STREAM_HEAD_SIZE;
+  const chunk = new Uint8Array(heads + text.length);
+  const view = new DataView(chunk.buffer);
+  putType(chunk, AT_CHUNK.type);
+  view.setUint16(AT_CHUNK.flags, flags, true);
+  view.setUint32(AT_CHUNK.payload_size, chunk.length - spec.CHUNK_HEADER_SIZE, true);
+  view.setUint8(spec.CHUNK_HEADER_SIZE + AT_STREAM.width, 1);
+  view.setUint8(spec.CHUNK_HEADER_SIZE + AT_STREAM.coder, spec.CODER_STORED);
+  for (const field of [AT_STREAM.count, AT_STREAM.packed_size, AT_STREAM.coded_size]) {
+    view.setUint32(spec.CHUNK_HEADER_SIZE + field, text.length, true);
+  }
+  chunk.set(text, heads);
+  return chunk;
+}
+
+/**
+ * @param {Uint8Array} record of the directory
+ * @param {number} flags
+ * @param {Uint8Array} chunk META
+ * @param {number} offset
+ */
+function putRecord(record, flags, chunk, offset) {
+  const view = new DataView(record.buffer, record.byteOffset, record.byteLength);
+  putType(record, AT_RECORD.type);
+  view.setUint16(AT_RECORD.flags, flags, true);
+  view.setUint32(AT_RECORD.size, chunk.length, true);
+  view.setBigUint64(AT_RECORD.offset, BigInt(offset), true);
+  view.setUint32(AT_RECORD.crc, crc32(chunk), true);
+}
+
+/**
+ * @param {Uint8Array} bytes
+ * @param {number} at
+ */
+function putType(bytes, at) {
+  bytes.set(new TextEncoder().encode(spec.CHUNK_METADATA), at);
+}
+
+/**
+ * Whether axes, where there are any, may stand beside a direction.
+ *
+ * @param {string} axes
+ * @param {number[]} up
+ */
+function isUpright(axes, up) {
+  const signs = [...axes].map((letter) => Number(letter === 'U') - Number(letter === 'D'));
+  return axes === '' || signs.reduce((sum, sign, k) => sum + sign * up[k], 0) >= AXIS_AGREES;
+}
+
+/**
+ * @param {Uint8Array[]} parts
+ * @param {number} size of all together
+ */
+function joined(parts, size) {
+  const whole = new Uint8Array(size);
+  let at = 0;
+  for (const part of parts) {
+    whole.set(part, at);
+    at += part.length;
+  }
+  return whole;
+}

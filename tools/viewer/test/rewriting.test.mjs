@@ -1,0 +1,52 @@
+// Files that are written again with another META: everything else in them stays.
+import assert from 'node:assert/strict';
+import { readFileSync, readdirSync } from 'node:fs';
+import { test } from 'node:test';
+
+import { decode } from '../../../codec/js/decoder.mjs';
+import { withUp } from '../rewriting.mjs';
+
+const FOLDER = new URL('../../../conformance/csplat_conformance/vectors/valid/', import.meta.url);
+const NAMES = readdirSync(FOLDER).filter((name) => name.endsWith('.csplat'));
+const UP = [0, 0.6, -0.8];
+
+const read = (name) => new Uint8Array(readFileSync(new URL(name, FOLDER))).buffer;
+
+/** What a scene is, and what it says; not where it stands in the file. */
+async function facts(bytes) {
+  const { header, metadata, checks, ...rest } = await decode(bytes);
+  const { axes, unitMetres, origin, attributes, splatCount } = header;
+  assert.equal(checks.chunks, header.directory.length + header.tiles.flatMap(({ layers }) => layers).length);
+  return { metadata, axes, rest, other: { unitMetres, origin, attributes, splatCount } };
+}
+
+test('every file keeps all but its metadata', async () => {
+  assert.ok(NAMES.length > 50);
+  let without = 0;
+  for (const name of NAMES) {
+    const bytes = read(name);
+    const before = await facts(bytes);
+    const written = await withUp(bytes, UP);
+    const after = await facts(written.buffer);
+    assert.deepEqual(after.rest, before.rest, name);
+    assert.deepEqual(after.other, before.other, name);
+    assert.deepEqual(after.metadata, { ...before.metadata, up: UP }, name);
+    assert.deepEqual(await withUp(written.buffer, UP), written, name); // and again: the same bytes
+    without += Number(before.metadata === null);
+  }
+  assert.ok(without > 0 && without < NAMES.length); // META is new in some, another in others
+});
+
+test('axes stay where they do not contradict', async () => {
+  let known = 0;
+  for (const name of NAMES) {
+    const { axes } = await facts(read(name));
+    if (!axes) continue;
+    known++;
+    const own = [...axes].map((letter) => Number(letter === 'U') - Number(letter === 'D'));
+    assert.equal((await facts((await withUp(read(name), own)).buffer)).axes, axes);
+    const opposite = own.map((value) => -value);
+    assert.equal((await facts((await withUp(read(name), opposite)).buffer)).axes, '');
+  }
+  assert.ok(known > 0);
+});

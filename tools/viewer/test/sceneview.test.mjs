@@ -1,0 +1,54 @@
+// Who says which way is up.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { SceneView } from '../sceneview.mjs';
+
+/** A camera of a file, held so that +z is up. */
+const LEVEL = {
+  K: [
+    [90, 0, 40],
+    [0, 90, 30],
+    [0, 0, 1],
+  ],
+  viewmat: [
+    [1, 0, 0, 0],
+    [0, 0, -1, 0],
+    [0, 1, 0, 0],
+    [0, 0, 0, 1],
+  ],
+  W: 80,
+  H: 60,
+};
+
+function opened({ axes = '', metadata = null, cameras = null }, wanted = {}) {
+  const view = new SceneView(null, { touched: false }, { up: null, axes: null, ...wanted });
+  view.read({ axes }, { metadata, cameras });
+  return view;
+}
+
+test('a person comes first, then the metadata, the axes, the cameras', () => {
+  const said = { axes: 'LUF', metadata: { up: [0, 0.6, -0.8] }, cameras: [LEVEL] };
+  assert.deepEqual(opened(said, { up: [1, 0, 0], axes: 'RFU' }).up, [1, 0, 0]);
+  assert.deepEqual(opened(said, { axes: 'RFD' }).up, [0, 0, -1]);
+  const [x, y, z] = opened(said).up;
+  assert.ok(Math.hypot(x, y - 0.6, z + 0.8) < 1e-9);
+  assert.deepEqual(opened({ ...said, metadata: null }).up, [0, 1, 0]);
+  assert.deepEqual(opened({ cameras: [LEVEL] }).up, [0, 0, 1]);
+  assert.deepEqual(opened({}).up, [0, -1, 0]);
+});
+
+test('who takes its word is offered no other way up', () => {
+  for (const said of [{ axes: 'RFU' }, { metadata: { up: [0, 0, 1] } }, { cameras: [LEVEL] }]) {
+    assert.ok(opened(said).knowsUp);
+  }
+  assert.ok(opened({}, { up: [0, 0, 1] }).knowsUp);
+  assert.ok(!opened({}).knowsUp);
+});
+
+test('metadata that say nothing sensible are not listened to', () => {
+  for (const up of ['z', [0, 1], [0, 0, 0], [0, null, 1], ['0', '0', '1'], [0, 0, 1, 0], { x: 1 }]) {
+    assert.deepEqual(opened({ axes: 'RFU', metadata: { up } }).up, [0, 0, 1]);
+    assert.ok(!opened({ metadata: { up } }).knowsUp);
+  }
+});
