@@ -9,6 +9,8 @@ import pytest
 pytest.importorskip("numba", reason="the benchmark renders: pip install 'csplat[render]'")
 pytest.importorskip("matplotlib", reason="the benchmark plots: pip install 'csplat[render]'")
 
+from csplat.ply import read_ply, write_ply
+from csplat_bench.common import scenes
 from csplat_bench.common.command import run as command
 from csplat_bench.common.curves import Point, Rate, bracket, front, psnr_at, rate_at
 from csplat_bench.common.kept import Kept
@@ -195,7 +197,10 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
 
 
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
-    """The scene that ships, beside a peer that was judged before."""
+    """A part of the scene that ships, beside a peer that was judged before."""
+    part = tmp_path / "part.ply"
+    write_ply(part, read_ply(scenes._SAMPLE).select(slice(None, None, 4)))
+    monkeypatch.setattr(scenes, "_SAMPLE", part)
     known = tmp_path / "sample.json"
     known.write_text(json.dumps({"peers": {"SPZ": asdict(Point(36.0, 60_000))}}))
     monkeypatch.setattr(distortion, "find_splat_transform", lambda _: (["none"], "judged before"))
