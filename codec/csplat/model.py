@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -124,6 +125,18 @@ class SplatModel:
 
     def __repr__(self) -> str:
         return f"SplatModel({len(self)} splats, sh_degree={self.sh_degree})"
+
+    def _repr_html_(self) -> str | None:
+        """What a notebook shows of it: a picture that can be turned; `None`, its `repr`, where the tools are absent."""
+        if not len(self):
+            return None
+        try:
+            # By its name: nothing of this package knows the tools, which stand on it.
+            notebook = import_module("csplat_tools.present.notebook")
+        except ModuleNotFoundError:
+            return None
+        shown: str = notebook.scene_html(self)
+        return shown
 
     @property
     def sh_degree(self) -> int:

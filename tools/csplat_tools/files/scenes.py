@@ -32,6 +32,10 @@ class LoadedModel:
     header: SceneHeader | None = None
     stated_errors: StatedErrors | None = None
 
+    def _repr_html_(self) -> str | None:
+        """What a notebook shows of it: see `SplatModel`."""
+        return self.model._repr_html_()  # a protocol of notebooks, and public there
+
     def as_json(self) -> dict[str, Any]:
         """Return size and counts as JSON-compatible values."""
         count = len(self.model)
