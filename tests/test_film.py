@@ -1,4 +1,6 @@
-"""`csplat render -o NAME.webp`: films of an orbit, in the formats that pillow writes."""
+"""`csplat render -o NAME.webp`: films of an orbit, in the formats that pillow writes, and as MP4."""
+
+import sys
 
 import numpy as np
 import pytest
@@ -59,6 +61,32 @@ def test_the_same_command_writes_the_same_film(ply, tmp_path):
     assert (tmp_path / "one.webp").read_bytes() == (tmp_path / "two.webp").read_bytes()
 
 
+def test_an_mp4_shows_what_the_pictures_show_and_is_the_same_again(ply, tmp_path):
+    av = pytest.importorskip("av", reason="MP4 needs PyAV: pip install 'csplat[film]'")
+    words = ("render", ply, "--orbit", 5, "--size", "65x49", "--background", "0.9,0.2,0.1", "--fps", 12.5)
+    for name in ("one.mp4", "two.mp4", "turn"):
+        assert 0 == invoke(*words, "-o", tmp_path / name).exit_code
+    assert (tmp_path / "one.mp4").read_bytes() == (tmp_path / "two.mp4").read_bytes()
+    with av.open(tmp_path / "one.mp4") as film:
+        stream = film.streams.video[0]
+        said = (stream.codec_context.name, stream.pix_fmt, stream.width, stream.height, stream.average_rate)
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(stream)]
+    assert ("h264", "yuv420p", 64, 48, 12.5) == said
+    assert 5 == len(frames)
+    for number, frame in enumerate(frames):
+        with Image.open(tmp_path / "turn" / f"{number:04d}.png") as picture:
+            expected = np.asarray(picture).astype(int)[:48, :64]
+        assert np.abs(expected[0, 0] - frame[0, 0]).max() < 5
+        assert np.abs(expected - frame).mean() < 8.0
+
+
+def test_without_pyav_one_line_says_what_to_install(ply, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    done = invoke("render", ply, "--orbit", 2, "-o", tmp_path / "turn.mp4")
+    assert (1, "error: this needs av: pip install 'csplat[film]' (E_INPUT)\n") == (done.exit_code, done.stderr)
+    assert not (tmp_path / "turn.mp4").exists()
+
+
 def test_an_existing_film_is_kept_without_force(ply, tmp_path):
     film = tmp_path / "turn.gif"
     film.write_bytes(b"mine")
@@ -111,7 +139,9 @@ def test_durations_do_not_drift():
 
 
 def test_names_tell_films_from_folders():
-    assert [True, True, True, False, False] == [is_film(name) for name in ("a.webp", "b.GIF", "c.png", "d", "e.mp4")]
+    assert [True, True, True, True, False, False] == [
+        is_film(name) for name in ("a.webp", "b.GIF", "c.png", "d.mp4", "e", "f.mkv")
+    ]
 
 
 def test_a_film_that_pillow_cannot_write_is_one_line(tmp_path, monkeypatch):

@@ -115,6 +115,13 @@ def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
     assert picture[15, 20, 0] > 200
 
 
+def test_an_orbit_with_cameras_leads_along_them(ply, cameras, tmp_path):
+    call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", "-o", tmp_path / "along")
+    call("render", ply, "--orbit", 2, "--size", "64x48", "-o", tmp_path / "around")
+    ball = {name: np.count_nonzero(pixels(tmp_path / name / "0001.png")[..., 0] > 128) for name in ("along", "around")}
+    assert 1.5 * ball["along"] < ball["around"]  # the cameras stand ten radii away: a small ball
+
+
 def test_a_csplat_file_shows_what_its_ply_shows(cameras, tmp_path, make_model):
     model = make_model(300, 1)
     write_ply(tmp_path / "many.ply", model)
@@ -161,7 +168,8 @@ def test_a_distorting_size_is_refused(ply, cameras, tmp_path):
     "words",
     [
         (),
-        ("--orbit", "3", "--cameras", "x.json"),
+        ("--data", "set", "--cameras", "x.json"),
+        ("--cameras", "x.json", "--up", "z"),
         ("--orbit", "0"),
         ("--orbit", "3", "--size", "12"),
         ("--orbit", "3", "--mode", "wrong"),

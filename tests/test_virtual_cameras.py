@@ -12,7 +12,8 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.cameras import load_cameras
 from csplat_render.cloud import cover, sample_cloud, weighted_quantiles
-from csplat_render.virtual import OBJECT_DISTANCES, SURROUNDING_DISTANCES, orbit_cameras, scene_frame, virtual_cameras
+from csplat_render.paths import orbit_cameras
+from csplat_render.virtual import OBJECT_DISTANCES, SURROUNDING_DISTANCES, scene_frame, virtual_cameras
 
 
 def model_of(means, size=0.03, **fields):
@@ -171,21 +172,14 @@ def test_degenerate_scenes_have_cameras():
         cameras = virtual_cameras(model)
         assert 8 == len(cameras)
         assert all(np.isfinite(camera.viewmat).all() for camera in cameras)
-        assert 3 == len(orbit_cameras(model, 3))
+        path = orbit_cameras(model, 3)
+        assert 3 == len(path)
+        assert all(np.isfinite(camera.viewmat).all() for camera in path)
 
 
 def test_refuses_no_cameras():
     with pytest.raises(InputError, match="at least 1"):
         virtual_cameras(ball(), 0)
-
-
-def test_an_orbit_shows_a_whole_object():
-    model = ball()
-    for camera in orbit_cameras(model, 6, 320, 240):
-        p = model.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        u = camera.K[0, 0] * p[:, 0] / p[:, 2] + camera.K[0, 2]
-        v = camera.K[1, 1] * p[:, 1] / p[:, 2] + camera.K[1, 2]
-        assert ((u > 0) & (u < 320) & (v > 0) & (v < 240)).all()
 
 
 def test_weighted_quantiles():

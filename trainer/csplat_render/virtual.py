@@ -34,7 +34,7 @@ from csplat_render.cloud import (
     weighted_quantiles,
 )
 
-__all__ = ["OBJECT_DISTANCES", "SURROUNDING_DISTANCES", "Frame", "orbit_cameras", "scene_frame", "virtual_cameras"]
+__all__ = ["OBJECT_DISTANCES", "SURROUNDING_DISTANCES", "Frame", "scene_frame", "virtual_cameras"]
 
 F64 = NDArray[np.float64]
 Kind = Literal["object", "surrounding"]
@@ -51,6 +51,9 @@ SURROUNDING_DISTANCES = (1.3, 0.8, 0.5)
 #: An object covers at least this much of each picture.
 MIN_COVER = 0.5
 
+#: Extents; what is nearer to a camera in surroundings only hides.
+HIDING = 0.4
+
 _COVER_MARGIN = 0.015  # the estimate of the cover errs by as much
 _OBJECT_ELEVATIONS = (5.0, 25.0, 50.0)
 _SURROUNDING_ELEVATIONS = (3.0, 15.0, 35.0)
@@ -61,9 +64,7 @@ _CLEAR_SHARE = 0.01  # of an object's surface, that may lie there
 _NEAR = 0.05  # near plane in extents, DEFAULT_NEAR at most
 _FAR_REACH = 4.0  # times the distance within which half the opacity lies: no object's surface
 _FAR_SHARE = 0.02  # of the surface; with more than that beyond, a scene is no object
-_WHOLE = 2.2  # extents from which a whole object fits into the picture
 _FLAT = 0.6  # an extent this much shorter than the next one points up
-_HIDING = 0.4  # extents; what is nearer to a camera in surroundings only hides
 _GOOD_DETAIL = 0.65  # of the best view's
 _AZIMUTH_STEP = 15.0  # degrees
 _POINTS = 60_000
@@ -141,31 +142,14 @@ def virtual_cameras(
     frame = scene_frame(model)
     begin = 360.0 * float(rng.random())
     if len(model) == 0:
-        return orbit_cameras(model, count, width, height)
+        K = intrinsics(width, height, FIELD_OF_VIEW)
+        return orbit(frame.centre, 2.2, frame.up, count, K, width, height, near=frame.near)
     cloud = sample_cloud(model, _POINTS, rng)
     K = intrinsics(width, height, FIELD_OF_VIEW)
     views = _Views(frame, K, width, height)
     if frame.kind == "object":
         return _around_object(views, cloud, count, begin, rng)
     return _in_surroundings(views, cloud, count, begin)
-
-
-def orbit_cameras(
-    model: SplatModel, count: int, width: int = 640, height: int = 480, elevation: float = 20.0
-) -> list[Camera]:
-    """Cameras on a circle around a scene, for a film: an object is seen whole.
-
-    Args:
-        model: the scene.
-        count: how many cameras.
-        width: pixels.
-        height: pixels.
-        elevation: degrees above the horizon.
-    """
-    frame = scene_frame(model)
-    distance = frame.extent * (_WHOLE if frame.kind == "object" else SURROUNDING_DISTANCES[0])
-    K = intrinsics(width, height, FIELD_OF_VIEW)
-    return orbit(frame.centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +213,7 @@ def _in_surroundings(views: _Views, cloud: Cloud, count: int, begin: float) -> l
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
     cameras = [views.at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
-    details = np.array([detail(cloud, camera, _HIDING * views.frame.extent) for camera in cameras])
+    details = np.array([detail(cloud, camera, HIDING * views.frame.extent) for camera in cameras])
     good = details >= _GOOD_DETAIL * details.max()
     enough = len(angles)
     while enough < len(cameras) and np.count_nonzero(good[:enough]) < count:

@@ -27,7 +27,6 @@ __all__ = ["render"]
 class _Views(Views):
     """From where pictures are made, all of them, and how large."""
 
-    one_of = (("cameras", "orbit", "data"),)
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("images", "test_every", "split"), ("data",))
 
     cameras: Annotated[
@@ -48,13 +47,14 @@ class _Views(Views):
 def render(
     source: Scene,
     output: Annotated[
-        str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.webp, .gif, .png: a film.")
+        str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.mp4, .webp, .gif, .png: a film.")
     ],
     views: _Views,
     upright: Upright,
     out: Output,
     orbit: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="N cameras on a circle around the scene.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="N cameras all around, or along those of --cameras or --data."),
     ] = None,
     split: SplitWord = "test",
     fps: Annotated[
@@ -65,17 +65,21 @@ def render(
     depth: Annotated[bool, typer.Option("--depth", help="Write NAME.depth.npy too, float32, scene units.")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Write NAME.alpha.png too.")] = False,
 ) -> None:
-    """Render a scene to PNG files, or to an animated WebP, GIF or PNG.
+    """Render a scene to PNG files, or to a film: MP4, or an animated WebP, GIF or PNG.
 
     Each picture takes the name of its camera's photograph, or a number. A
     film repeats for ever; WebP loses a little, GIF has 256 colours, PNG loses
-    nothing. Cameras stand relative to the scene's origin, those of a data set
-    where its pictures were taken. Needs the packages of the render extra.
+    nothing. MP4 is H.264 and wants the film extra. Cameras stand relative to
+    the scene's origin, those of a data set where its pictures were taken.
+    An orbit shows an object whole; inside of a room it goes where fine splats
+    are to be seen, or beside the cameras that you name. Needs the packages of
+    the render extra.
 
     Examples:
-      csplat render scene.csplat --orbit 120 turn.webp
-      csplat render scene.csplat film --orbit 120
-      ffmpeg -framerate 25 -i film/%04d.png -pix_fmt yuv420p film.mp4
+      csplat render scene.csplat --orbit 120 turn.mp4
+      csplat render scene.ply --orbit 120 turn.webp --up z
+      csplat render room.ply --orbit 240 room.mp4 --data capture
+      csplat render scene.csplat pictures --orbit 120
       csplat render scene.ply held-out --data capture --split test
       csplat render scene.ply views --cameras test.json --background white
       csplat render scene.ply small --orbit 8 --size 320x240 --sh-degree 0

@@ -10,6 +10,7 @@ from csplat_tools.files.console import note, progress_bar
 
 __all__ = [
     "missing",
+    "need_film",
     "need_photographs",
     "need_pictures",
     "need_plots",
@@ -89,6 +90,15 @@ def need_pictures() -> None:
     _need("PIL", "pillow")
 
 
+def need_film() -> None:
+    """Import what writing MP4 needs.
+
+    Raises:
+        InputError: PyAV is not installed.
+    """
+    _need("av", extra="film")
+
+
 def need_plots() -> None:
     """Import what drawing plots needs.
 
@@ -117,16 +127,16 @@ def _warm_up_adam() -> None:
     adam_step(Parameters.starting_at(values), values, dict.fromkeys(values, 0.0))
 
 
-def _need(module: str, package: str | None = None) -> None:
+def _need(module: str, package: str | None = None, *, extra: str = "render") -> None:
     try:
         import_module(module)
     except ModuleNotFoundError as error:
-        raise missing(error, package) from None
+        raise missing(error, package, extra=extra) from None
 
 
-def missing(error: ModuleNotFoundError, package: str | None = None) -> InputError:
+def missing(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
     """One line for a package that is not installed."""
-    return InputError(f"this needs {package or error.name}: pip install 'csplat[render]'")
+    return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 
 
 def _wait_frugally() -> None:

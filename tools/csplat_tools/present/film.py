@@ -1,9 +1,11 @@
-"""Pictures one after the other as one file: animated WebP, GIF or PNG."""
+"""Pictures one after the other as one file: animated WebP, GIF or PNG, or MP4."""
 
 from __future__ import annotations
 
 import io
+import tempfile
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat_tools.files.extras import need_pictures
+from csplat_tools.files.extras import need_film, need_pictures
 from csplat_tools.files.streams import write_bytes
 
 __all__ = ["DEFAULT_FPS", "FILM_ENDINGS", "MAX_FPS", "check_film", "is_film", "write_film"]
 
 U8 = NDArray[np.uint8]
 
-#: Names that end so are films, others are folders; with what pillow calls the format.
-FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
+_MP4 = "MP4"
+
+#: Names that end so are films, others are folders; with what pillow calls the format, which does not write MP4.
+FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG", ".mp4": _MP4}
 
 #: Pictures per second.
 DEFAULT_FPS, MAX_FPS = 25.0, 100.0
 
-_TICKS = {"WEBP": 1000, "GIF": 100, "PNG": 1000}  # per second: how finely the format tells time
-_MAX_SIDE = {"WEBP": 16383, "GIF": 65535, "PNG": 1 << 15}
+_TICKS = {"WEBP": 1000, "GIF": 100, "PNG": 1000, _MP4: 1000}  # per second: how finely the format tells time
+_MAX_SIDE = {"WEBP": 16383, "GIF": 65535, "PNG": 1 << 15, _MP4: 16384}
 _MAX_BYTES = 1 << 31  # of all pictures, which are in memory together
 _WEBP = {"quality": 90, "method": 4}
+_X264 = {
+    "crf": "18",
+    "preset": "medium",
+    "threads": "1",  # several: other bytes on other machines
+    "x264-params": "mbtree=0",  # with it two runs in four gave other bytes, on one thread, too
+}
+_BT709 = 1  # matrix, primaries and transfer function, as H.264 numbers them
+_LIMITED_RANGE = 1  # as players expect: black is 16
 
 
 def is_film(path: str) -> bool:
@@ -44,12 +56,19 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
         fps: pictures per second, above 0.
 
     Raises:
-        InputError: the pictures differ in size, are too large or too many, or come too fast.
+        InputError: the pictures differ in size, are too large or too many, or come too fast; or what writes such films
+            is not installed.
     """
     kind = FILM_ENDINGS[Path(path).suffix.lower()]
+    if kind == _MP4:
+        need_film()
+    else:
+        need_pictures()
     if len(set(sizes)) > 1:
         raise InputError(f"a film wants pictures of one size, the cameras have {len(set(sizes))}: give --size")
     width, height = sizes[0]
+    if kind == _MP4 and min(width, height) < 2:
+        raise InputError(f"MP4 pictures have at least 2 pixels a side, wanted {width}x{height}")
     if max(width, height) > _MAX_SIDE[kind]:
         raise InputError(f"{kind} pictures have at most {_MAX_SIDE[kind]} pixels a side, wanted {width}x{height}")
     if len(sizes) * width * height * 3 > _MAX_BYTES:
@@ -62,21 +81,27 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
 
 
 def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
-    """Write an animation that repeats for ever; the file appears when it is complete.
+    """Write a film; the file appears when it is complete. An animation repeats for ever.
 
     Args:
-        path: its ending tells the format. WebP loses a little, GIF has 256 colours a picture, PNG loses nothing.
+        path: its ending tells the format. WebP loses a little, GIF has 256 colours a picture, PNG loses nothing. MP4 is
+            H.264 with colours at half the resolution, as every player shows it; its sides are even, which may cost a
+            column and a row of pixels.
         frames: [H, W, 3] uint8 each, of one size, at least one.
         fps: pictures per second; each lasts as near to that as the format can say, and all together exactly.
 
     Raises:
-        InputError: pillow is not installed, or was built without WebP.
+        InputError: pillow or PyAV is not installed, or was built without this format.
         OSError: it cannot be written.
     """
+    kind = FILM_ENDINGS[Path(path).suffix.lower()]
+    write_bytes(path, _mp4(frames, fps) if kind == _MP4 else _animation(kind, frames, fps))
+
+
+def _animation(kind: str, frames: Sequence[U8], fps: float) -> bytes:
     need_pictures()
     from PIL import Image
 
-    kind = FILM_ENDINGS[Path(path).suffix.lower()]
     first, *others = [Image.fromarray(np.ascontiguousarray(frame)) for frame in frames]
     options: dict[str, Any] = {"duration": _durations(len(frames), fps, _TICKS[kind]), "loop": 0}
     if kind == "WEBP":
@@ -88,7 +113,32 @@ def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
         first.save(buffer, kind, save_all=bool(others), append_images=others, **options)
     except KeyError:  # pillow knows no such format
         raise InputError(f"this pillow cannot write {kind}: name a .gif or .png") from None
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _mp4(frames: Sequence[U8], fps: float) -> bytes:
+    need_film()
+    import av
+
+    height, width = (side - side % 2 for side in frames[0].shape[:2])  # colours have half the resolution
+    rate = Fraction(fps).limit_denominator(1001)
+    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
+        film = Path(folder) / "film.mp4"  # written twice over: what a player reads first has to stand first
+        options = {"movflags": "+faststart", "fflags": "+bitexact"}
+        with av.open(film, "w", format="mp4", options=options) as container:
+            try:
+                stream = container.add_stream("libx264", rate, options=_X264)
+            except ValueError:  # PyAV knows no such codec
+                raise InputError("this PyAV cannot write H.264: name a .webp, .gif or .png") from None
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            context = stream.codec_context
+            context.colorspace = context.color_primaries = context.color_trc = _BT709
+            context.color_range = _LIMITED_RANGE
+            for pixels in frames:
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
+                container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=_BT709)))
+            container.mux(stream.encode())
+        return film.read_bytes()
 
 
 def _durations(count: int, fps: float, ticks: int) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera, Mode, render
 from csplat_render.arrays import RenderResult
 from csplat_render.cameras import load_cameras, resized
-from csplat_render.virtual import orbit_cameras
+from csplat_render.paths import orbit_cameras
 from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
@@ -52,32 +52,36 @@ def find_cameras(
     *,
     split: Split = "test",
 ) -> list[Camera]:
-    """Get the cameras that a command line names: a file's, those of an orbit, or a data set's.
+    """Get the cameras that a command line names: a file's, a data set's, or those of an orbit.
 
     Args:
         model: the scene to orbit around; a data set's cameras are brought to its origin.
         path: of a camera file.
-        orbit_count: how many cameras on a circle.
-        data: a data set, whose size counts, not `size`.
+        orbit_count: how many cameras on a closed path; it leads along those of a file or a data set where one is named.
+        data: a data set, whose size counts, not `size`, unless there is an orbit.
         size: width and height of the pictures; the file's own, or 640 by 480, if left out.
         split: of a data set: which of its cameras.
 
     Raises:
-        InputError: not exactly one of the three is given; the file or the set is none; a picture of that size would be
-            distorted.
+        InputError: none of the three is given, or both a file and a set; the file or the set is none; a picture of that
+            size would be distorted.
     """
-    if (path is None) + (orbit_count is None) + (data is None) != 2:
-        raise InputError("wanted the cameras: a file of them, a number for an orbit, or a data set")
+    if (path, orbit_count, data) == (None, None, None) or None not in (path, data):
+        raise InputError("wanted the cameras: a file of them, a data set, or a number for an orbit")
+    cameras: list[Camera] = []
     if path is not None:
         cameras = load_cameras(path)
-        return cameras if size is None else [resized(camera, *size) for camera in cameras]
-    if data is not None:
-        cameras = list(find_view_set(model, data=data, count=0, split=split).judges)
+    elif data is not None:
+        shots = (
+            data if orbit_count is None else replace(data, size=None)
+        )  # where they were taken matters, not how large
+        found = find_view_set(model, data=shots, count=0, split=split)
+        cameras = [*found.judges, *(() if orbit_count is None else (*found.teaches, *found.decides))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} pictures")
-        return cameras
-    assert orbit_count is not None
-    return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE))
+    if orbit_count is not None:
+        return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE), along=cameras)
+    return cameras if size is None or data is not None else [resized(camera, *size) for camera in cameras]
 
 
 def render_folder(
@@ -161,7 +165,6 @@ def render_film(
         OSError: it cannot be written.
     """
     need_renderer()
-    need_pictures()
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0

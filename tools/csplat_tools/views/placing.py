@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
-from csplat_render.virtual import FIELD_OF_VIEW, Frame, scene_frame
+from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
 
 __all__ = ["CHECKS", "VIEW_COUNT", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
 
@@ -39,7 +39,6 @@ _AROUND_DISTANCE = (0.35, 1.45)
 _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
 _OUTWARDS = 5  # one view of so many looks away from the middle of surroundings
-_HIDING = 0.4  # extents; as for virtual cameras: what is nearer only hides
 _GOOD_DETAIL = 0.4  # of the best view's; views of walls from behind say nothing
 _CANDIDATES = 3  # for each view in surroundings
 _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
@@ -65,7 +64,7 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     points = _sequence(_CANDIDATES * count, seed)
     cameras = [_in_surroundings(frame, number, point, K, size) for number, point in enumerate(points)]
     cloud = sample_cloud(model, _POINTS, np.random.default_rng(seed))
-    details = np.array([detail(cloud, camera, _HIDING * frame.extent) for camera in cameras])
+    details = np.array([detail(cloud, camera, HIDING * frame.extent) for camera in cameras])
     inwards = np.arange(len(cameras)) % _OUTWARDS != 0
     best = np.where(inwards, details[inwards].max(), details[~inwards].max())
     good = np.flatnonzero(details >= _GOOD_DETAIL * best)

@@ -1,0 +1,240 @@
+"""Paths of a camera for a film, closed, so that a film that repeats does not jump.
+
+An *object* is circled about the direction that is up, from as far away as shows all of it. Inside *surroundings* a
+circle would lead through walls: where cameras are known, a path leads along them and looks as they do; else it is the
+longest arc, of several distances and heights, from which fine splats are to be seen, there and back.
+
+These cameras judge nothing: `virtual.virtual_cameras` are those of `psnr`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.upright import up_of
+from csplat_render.camera import Camera
+from csplat_render.cameras import direction, intrinsics, look_at, orbit
+from csplat_render.cloud import Cloud, detail, sample_cloud
+from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
+
+__all__ = ["orbit_cameras"]
+
+B = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+
+ELEVATION = 20.0  # degrees above the horizon, of an object
+_MARGIN = 0.08  # of half a picture, around an object
+_POINTS = 40_000
+_SHOWN = 0.999  # of the points of an object lie inside of each picture: the rest is haze
+_CELL = 0.1  # extents; what has a gap of a cell and more around it is another part
+_CELLS = 36  # each way from the centre
+_PART = 0.02  # of the surface: parts that have less are floaters
+_BODY = 0.5  # of the surface: what has no parts that hold so much is all shown
+_TURNS = 24  # directions that are tried
+_HEIGHTS = np.linspace(-0.3, 0.3, 7)  # of what is looked at, of an object's height above its middle
+
+_ARC_POINTS = 12_000
+_ARC_ELEVATIONS = (5.0, 20.0, 40.0)
+_ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
+_GOOD = 0.85  # of the detail of the best view: below, an arc had better end
+_ARC_MIN = 10.0  # degrees each way
+
+_REACH = 0.35  # of the longer half-axis of the ellipse: how far cameras have a say about a place of the path
+_EASE = 0.04  # of the path: over so much of it directions are smoothed
+
+
+def orbit_cameras(
+    model: SplatModel,
+    count: int,
+    width: int = 640,
+    height: int = 480,
+    *,
+    elevation: float = ELEVATION,
+    along: Sequence[Camera] = (),
+) -> list[Camera]:
+    """Cameras on a closed path, for a film.
+
+    Args:
+        model: the scene.
+        count: how many.
+        width: pixels.
+        height: pixels.
+        elevation: degrees above the horizon, of an object.
+        along: cameras near which the path is to lead, relative to the scene's origin. Left out: those that surroundings
+            carry, none of an object.
+
+    Raises:
+        InputError: `count` is below 1, or a camera of the scene is none.
+    """
+    if count < 1:
+        raise InputError(f"an orbit of {count} cameras, wanted at least 1")
+    frame, K = scene_frame(model), intrinsics(width, height, FIELD_OF_VIEW)
+    if not along and frame.kind == "surrounding":
+        along = [Camera.from_json(one) for one in model.cameras or ()]
+    if along:
+        eyes, ahead, up = _beside(along, count, up_of(model.metadata, model.coordinate_system))
+        near = min(frame.near, *(camera.near for camera in along))
+        return [look_at(eye, eye + way, up, K, width, height, near) for eye, way in zip(eyes, ahead, strict=True)]
+    if len(model) == 0:
+        return orbit(frame.centre, 1.0, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
+    rng = np.random.default_rng(0)
+    if frame.kind == "object":
+        body = _body(sample_cloud(model, _POINTS, rng), frame)
+        centre, distance = _whole(body, frame, elevation, K, width, height)
+        return orbit(centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
+    angles, elevation, distance = _arc(sample_cloud(model, _ARC_POINTS, rng), frame, count)
+    return [_towards(frame, float(angle), elevation, distance, K, width, height) for angle in angles]
+
+
+def _body(cloud: Cloud, frame: Frame) -> F64:
+    """[M, 3] points of an object without what floats around it: those of its parts that have any size.
+
+    Parts are cells of a grid that touch. Splats that lie scattered are all of the object.
+    """
+    side = 2 * _CELLS + 1
+    with np.errstate(invalid="ignore", over="ignore"):
+        places = np.floor(np.clip((cloud.points - frame.centre) / (_CELL * frame.extent), -_CELLS, _CELLS - 1))
+    cells = np.ravel_multi_index(tuple(np.nan_to_num(places).astype(np.int64).T + _CELLS), (side,) * 3)
+    masses = np.bincount(cells, cloud.masses, side**3)
+    left: B = np.bincount(cells, minlength=side**3) > 1
+    kept: B = np.zeros_like(left)
+    while left.any():
+        part = _touching(int(np.argmax(np.where(left, masses, -1.0))), left.reshape((side,) * 3)).ravel()
+        if not np.sum(masses[part]) > _PART * np.sum(masses):
+            break
+        kept |= part
+        left &= ~part
+    scattered = not np.sum(masses[kept]) > _BODY * np.sum(masses)
+    return cloud.points if scattered else cloud.points[kept[cells]]
+
+
+def _touching(first: int, filled: B) -> B:
+    """Filled cells that are reached from one of them without a gap."""
+    found: B = np.zeros_like(filled)
+    found.flat[first] = True
+    while True:
+        wider = found
+        for axis in range(3):  # the outermost cells of a grid are empty, or hold what is far away
+            wider = wider | np.roll(wider, 1, axis) | np.roll(wider, -1, axis)
+        wider = wider & filled
+        if (wider == found).all():
+            return found
+        found = wider
+
+
+def _whole(body: F64, frame: Frame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
+    """What to look at, and from how far away, so that an object is inside of all pictures around it."""
+    up = frame.up
+    first, second = direction(up, 0.0, 0.0), direction(up, 90.0, 0.0)
+    sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
+    low, high = np.quantile(sides, [1.0 - _SHOWN, _SHOWN], axis=1)
+    middle, tall = (low + high) / 2.0, float(high[2] - low[2])
+    slopes = (1.0 - _MARGIN) * 0.5 * np.array([width / K[0, 0], height / K[1, 1]])
+    best: tuple[float, F64] | None = None
+    for share in _HEIGHTS:
+        x, y, z = sides - (middle + np.array([0.0, 0.0, share * tall]))[:, None]
+        far = 0.0
+        e = math.radians(elevation)
+        for azimuth in np.radians(np.arange(_TURNS) * 360.0 / _TURNS):
+            out = x * math.cos(azimuth) + y * math.sin(azimuth)
+            across = y * math.cos(azimuth) - x * math.sin(azimuth)
+            nearer, above = out * math.cos(e) + z * math.sin(e), z * math.cos(e) - out * math.sin(e)
+            wanted = nearer + np.maximum(np.abs(across) / slopes[0], np.abs(above) / slopes[1])
+            far = max(far, float(np.quantile(wanted, _SHOWN)))
+        if best is None or far < best[0]:
+            best = far, middle + np.array([0.0, 0.0, share * tall])
+    assert best is not None
+    distance, (x, y, z) = best
+    centre = frame.centre + x * first + y * second + z * up
+    return centre, distance if math.isfinite(distance) and distance > frame.near else frame.extent
+
+
+def _arc(cloud: Cloud, frame: Frame, count: int) -> tuple[F64, float, float]:
+    """The longest good arc about the middle of surroundings: azimuths, there and back; elevation, distance."""
+    K = intrinsics(640, 480, FIELD_OF_VIEW)
+    azimuths = np.arange(_TURNS) * 360.0 / _TURNS
+    circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
+    details = np.array(
+        [
+            [detail(cloud, _towards(frame, a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
+            for circle in circles
+        ]
+    )
+    gains = details - _GOOD * details.max()
+    best = (-math.inf, 0, 0, 1)
+    for number, gain in enumerate(gains):
+        sums = np.concatenate([[0.0], np.cumsum(np.tile(gain, 2))])
+        for length in range(1, _TURNS + 1):
+            totals = sums[length : length + _TURNS] - sums[:_TURNS]
+            start = int(np.argmax(totals))
+            if totals[start] > best[0] + 1e-12:
+                best = float(totals[start]), number, start, length
+    _, number, start, length = best
+    turns = np.arange(count) / count
+    if length == _TURNS:
+        return 360.0 * turns, *circles[number]
+    step = 360.0 / _TURNS
+    half = max(0.5 * (length - 1) * step, _ARC_MIN)
+    return (start + 0.5 * (length - 1)) * step + half * np.sin(2.0 * np.pi * turns), *circles[number]
+
+
+def _towards(
+    frame: Frame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
+) -> Camera:
+    """A camera that looks at the middle of a scene: angles in degrees, the distance in extents."""
+    eye = frame.centre + distance * frame.extent * direction(frame.up, azimuth, elevation)
+    return look_at(eye, frame.centre, frame.up, K, width, height, frame.near)
+
+
+def _beside(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
+    """A path beside cameras that were given.
+
+    Its plan is the ellipse that lies as the cameras do. Each of its places moves to the mean of the cameras around it,
+    and looks where they look on the mean.
+
+    Returns:
+        [count, 3] positions; [count, 3] directions of unit length; [3], which way is up.
+    """
+    rotations = np.stack([camera.viewmat[:3, :3] for camera in cameras])
+    positions = np.stack([camera.position for camera in cameras])
+    above = -np.mean(rotations[:, 1], axis=0) if up is None else np.array(up, np.float64)
+    above = above / max(float(np.sqrt(np.sum(above**2))), 1e-9)
+    middle = positions.mean(axis=0)
+    flat = positions - middle
+    flat = flat - _along(flat, above)[:, None] * above
+    values, axes = np.linalg.eigh(np.mean(flat[:, :, None] * flat[:, None, :], axis=0))
+    halves = np.sqrt(2.0 * np.maximum(values[1:], 0.0))  # of the points on an ellipse these are its half-axes
+    angles = 2.0 * np.pi * np.arange(count) / count
+    plan = np.cos(angles)[:, None] * halves[1] * axes[:, 2] + np.sin(angles)[:, None] * halves[0] * axes[:, 1]
+    gaps = np.sum((plan[:, None, :] - flat[None, :, :]) ** 2, axis=2)
+    reach = max(_REACH * float(halves[1]), 1e-9)
+    weights = np.exp((gaps.min(axis=1, keepdims=True) - gaps) / (2.0 * reach**2))
+    weights /= np.sum(weights, axis=1, keepdims=True)
+    ahead = _smooth(np.einsum("ij,jk->ik", weights, rotations[:, 2]))
+    lengths = np.sqrt(np.sum(ahead**2, axis=1, keepdims=True))
+    nearest = rotations[np.argmin(gaps, axis=1), 2]
+    ahead = np.where(lengths > 0.1, ahead / np.maximum(lengths, 1e-9), nearest)
+    return np.einsum("ij,jk->ik", weights, positions), ahead, above
+
+
+def _smooth(rows: F64) -> F64:
+    """[N, 3] rows of a closed path, each the mean of those around it."""
+    count = len(rows)
+    steps = np.arange(count)
+    gaps = np.minimum(steps, count - steps) / count
+    weights = np.exp(-0.5 * (gaps / _EASE) ** 2)
+    turned = weights[(steps[:, None] - steps[None, :]) % count]
+    result: F64 = np.einsum("ij,jk->ik", turned, rows) / np.sum(weights)
+    return result
+
+
+def _along(rows: F64, axis: F64) -> F64:
+    """How far rows [N, 3] lie along an axis; no BLAS: the same on any machine's threads."""
+    result: F64 = np.sum(rows * axis, axis=1)
+    return result
