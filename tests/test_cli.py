@@ -5,6 +5,7 @@ import inspect
 import json
 import os
 import pty
+import re
 import resource
 import signal
 import subprocess
@@ -43,6 +44,19 @@ def csplat_file(tmp_path, ply):
     path = tmp_path / "scene.csplat"
     call("encode", ply, path, "--source-index", tmp_path / "index.npy", "--quiet")
     return path
+
+
+@pytest.fixture(autouse=True)
+def glanced(monkeypatch):
+    """No scene is rendered after encoding, but by the tests that say so; scenes that were to be, and what is seen."""
+    seen = {"scenes": [], "psnr": None}
+
+    def glance(source, data, *, threads):  # noqa: ARG001  # as the function has them
+        seen["scenes"].append(len(source))
+        return seen["psnr"]
+
+    monkeypatch.setattr("csplat_tools.cli.encode.glance", glance)
+    return seen
 
 
 def invoke(*words):
@@ -88,6 +102,28 @@ def test_encodes_and_decodes(tmp_path, ply):
 def test_quiet_says_nothing(tmp_path, ply):
     result = invoke("encode", ply, tmp_path / "out.csplat", "--quiet")
     assert (result.stdout, result.stderr) == ("", "")
+
+
+def test_encode_ends_with_bytes_and_quality(tmp_path, ply, glanced, monkeypatch):
+    out = tmp_path / "out.csplat"
+    glanced["psnr"] = 41.234
+    result = invoke("encode", ply, out, "--json")
+    assert re.fullmatch(
+        r"200 splats in 1 tile, [\d.]+ s: 33.8 kB -> [\d.]+ kB \([\d.]+ bytes per splat\), [\d.]+ times smaller,"
+        r" about 41.2 dB \(PSNR of eight small renders\)",
+        result.stderr.splitlines()[-1],
+    )
+    assert {"psnr": 41.23, "size": [480, 360]} == json.loads(result.stdout)["about"]
+    glanced["psnr"] = None  # nothing is compiled
+    last = invoke("encode", ply, out, "--force").stderr.splitlines()[-1]
+    assert last.endswith(f"times smaller; `csplat compare {ply} {out}` says how it looks")
+    assert [200, 200] == glanced["scenes"]
+    monkeypatch.setattr("csplat_tools.cli.encode._SPLATS_LOOKED_AT", 199)
+    for more in ((), ("--quiet",)):
+        assert "about" not in json.loads(call("encode", ply, out, "--force", "--json", *more))
+    monkeypatch.setattr("csplat_tools.cli.encode._SPLATS_LOOKED_AT", 200)
+    call("encode", ply, out, "--force", "--quiet")
+    assert [200, 200] == glanced["scenes"]  # too many, and quiet
 
 
 def test_reports_as_json(tmp_path, ply):

@@ -13,6 +13,7 @@ from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_tools.files.scenes import LoadedModel, load_model
 from csplat_tools.inspect.attributes import attribute_errors
+from csplat_tools.inspect.glance import glance
 from csplat_tools.views import comparison_cameras
 
 
@@ -68,6 +69,29 @@ def call(*words):
     result = invoke(*words)
     assert result.exit_code == 0, (result.stderr, result.exception)
     return result.stdout
+
+
+# a glance
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_glance_sees_what_compare_measures(scene):
+    from csplat_render.judge import Judge
+    from csplat_render.warmup import warm_up
+
+    warm_up(gradients=False)
+    data = encode(scene, EncodeOptions(preset="fast"))
+    measured = Judge.of_source(scene, comparison_cameras(scene)).psnr(decode(data))
+    assert abs(measured - glance(scene, data)) < 0.3
+    assert 10.0 < measured < 90.0
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_glance_waits_for_no_compiler(scene, monkeypatch):
+    from csplat_render import warmup
+
+    monkeypatch.setattr(warmup, "is_cached", lambda kernel: kernel is not warmup.blend)
+    assert glance(scene, encode(scene)) is None
 
 
 # pairs

@@ -24,6 +24,7 @@ __all__ = [
     "available_threads",
     "fast_exp2",
     "inline",
+    "is_cached",
     "kernel",
     "lane_run",
     "on_compiling",
@@ -153,6 +154,16 @@ def on_compiling(call: Callable[[], object]) -> Iterator[None]:
     """Call something once when a kernel is compiled meanwhile: not where all of them come from numba's cache."""
     with event.install_listener("numba:compile", _First(call)):
         yield
+
+
+def is_cached(kernel: Any) -> bool:
+    """Whether numba holds a kernel compiled, from now or from another time."""
+    compiled = getattr(kernel, "compiled", kernel)
+    if compiled.signatures:
+        return True
+    # What has no public name: the index of the cache, empty where the source is newer than it.
+    load = getattr(getattr(compiled._cache, "_cache_file", None), "_load_index", None)  # noqa: SLF001
+    return load is not None and bool(load())
 
 
 def fast_exp2(x: float) -> float:

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from csplat_render.arrays import Array
+from csplat_render.blending import blend
 from csplat_render.camera import Camera
-from csplat_render.jit import on_compiling
+from csplat_render.jit import is_cached, on_compiling
+from csplat_render.projecting import project
 from csplat_render.rasterise import Rasteriser, Splats
 
-__all__ = ["warm_up"]
+__all__ = ["is_compiled", "warm_up"]
 
 _SIZE = 16  # pixels on each side of what is rendered
 
@@ -68,6 +70,11 @@ def warm_up(
     if announce is not None and is_compiled:
         announce(f"the renderer is compiled, in {seconds:.0f} s")
     return seconds
+
+
+def is_compiled() -> bool:
+    """Whether pictures can be drawn at once: the kernels that project splats and blend them need no compiling."""
+    return all(map(is_cached, (project, blend)))
 
 
 def _warm_up_simplifying(camera: Camera) -> None:

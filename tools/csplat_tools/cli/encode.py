@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
@@ -22,6 +23,7 @@ from csplat_tools.files.console import Progress, format_bytes, format_table, not
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import check_name
+from csplat_tools.inspect.glance import SIZE, glance
 
 if TYPE_CHECKING:
     from csplat_tools.optimise.target import Target
@@ -31,6 +33,7 @@ __all__ = ["encode"]
 _TARGET = "Targets (one of the first four, which want the render extra)"
 _RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
 _SECONDS_WORTH_SAYING = 10.0
+_SPLATS_LOOKED_AT = 1_000_000  # more take longer to render than anybody wants to wait for a remark
 
 
 @dataclass(frozen=True)
@@ -182,8 +185,11 @@ def encode(
     out.findings(encoded.findings)
     for line in encoded.result.report.notes:
         note(line)
-    out.remark(*encoded.made.lines, *_summary(encoded))
-    out.publish(encoded.as_json())
+    out.remark(*encoded.made.lines, *_stated(encoded))
+    psnr = None if out.quiet else _psnr(encoded, encoding.threads)
+    about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
+    out.remark(_summary(encoded, psnr, source, output))
+    out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
 def _reach(
@@ -225,15 +231,33 @@ def _forecast(seconds: float, *, may_keep_all: bool) -> str:
     return f"this takes about {about} on two cores; {sooner}"
 
 
-def _summary(encoded: Encoded) -> list[str]:
+def _stated(encoded: Encoded) -> list[str]:
+    errors = encoded.result.report.errors
+    names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
+    rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
+    return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
+
+
+def _psnr(encoded: Encoded, threads: int | None) -> float | None:
+    """About how like its source a scene looks that is not too large; `None` where that is known, or not soon."""
+    is_known = encoded.made.said.get("psnr") is not None
+    if is_known or find_spec("numba") is None or not 0 < len(encoded.source) <= _SPLATS_LOOKED_AT:
+        return None
+    return glance(encoded.source, encoded.result.data, threads=threads)
+
+
+def _summary(encoded: Encoded, psnr: float | None, source: str, output: str) -> str:
+    """The last line: what it took, and what became of it."""
     report = encoded.result.report
-    per_splat = f", {report.size_bytes / report.splat_count:.2f} bytes per splat" if report.splat_count else ""
+    per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
-    sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}"
-    times = f"({ratio:.1f} times smaller{per_splat}), {encoded.seconds:.2f} s"
-    lines = [f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}: {sizes} {times}"]
-    if report.errors:
-        names = sorted(report.errors, key=list(MEASURE_NAMES.values()).index)
-        rows = [(name, *(f"{value:.4g}" for value in report.errors[name])) for name in names]
-        lines.append(format_table(("stated error", "max", "rms"), rows))
-    return lines
+    splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
+    sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
+    quality, found = "", encoded.made.said.get("psnr")
+    if psnr is not None:
+        quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
+    elif found is not None:
+        quality = f", PSNR {found:.2f} dB"
+    elif len(encoded.source) and "-" not in (source, output):
+        quality = f"; `csplat compare {source} {output}` says how it looks"
+    return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -88,12 +88,14 @@ class Encoded:
     """What an encoding took and gave.
 
     Attributes:
+        source: the scene, as it was encoded.
         made: the file.
         findings: what lint noticed in the PLY.
         source_bytes: size of the PLY.
         seconds: reading, encoding and writing.
     """
 
+    source: SplatModel
     made: EncodedScene
     findings: tuple[Finding, ...]
     source_bytes: int
@@ -221,7 +223,7 @@ def encode_file(
     write_bytes(target, made.result.data)
     if source_index is not None:
         write_array(source_index, made.result.source_index)
-    return Encoded(made, read.findings, read.size_bytes, time.perf_counter() - start)
+    return Encoded(model, made, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
 def decode_file(
