@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -95,11 +95,14 @@ def _imported(kinds: Sequence[str]) -> list[type]:
 
 
 def _names(kind: type, taken: Collection[str]) -> list[tuple[str, type]]:
-    """Fields of plain types that no option is named after."""
+    """Fields of plain types, words among them, that no option is named after."""
     hints = get_type_hints(kind)
     found = []
     for one in fields(kind):
-        types = [each for each in get_args(hints[one.name]) or (hints[one.name],) if each is not type(None)]
+        hint = hints[one.name]
+        each_of = (hint,) if get_origin(hint) is Literal else get_args(hint) or (hint,)
+        # Which words there are the dataclass says when it is made.
+        types = [str if get_origin(each) is Literal else each for each in each_of if each is not type(None)]
         if one.name not in taken and len(types) == 1 and types[0] in _READERS:
             found.append((one.name, types[0]))
     return found
