@@ -1,7 +1,10 @@
 """`csplat tradeoff`: what it measures, which files it marks, what it writes, and how it fails."""
 
+import hashlib
+import html
 import json
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +20,9 @@ pytest.importorskip("matplotlib", reason="plots need matplotlib: pip install 'cs
 
 # Importing them needs what is looked for above.
 from captures import cameras, photograph, shell
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat._spec import CHUNK_CODEBOOK
@@ -25,6 +31,9 @@ from csplat.errors import InputError
 from csplat_render.cameras import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.files.scenes import without_bands
+from csplat_tools.study import Reduction
+from csplat_tools.tradeoffs.commands import reduction_command, target_command
+from csplat_tools.tradeoffs.labels import label_marks
 from csplat_tools.tradeoffs.measuring import StageClock, fetched_bytes
 from csplat_tools.tradeoffs.options import USUAL, Wanted, parse_what
 from csplat_tools.tradeoffs.page import make_page, shown_points
@@ -33,11 +42,12 @@ from csplat_tools.tradeoffs.points import Failure, pareto_front
 from csplat_tools.tradeoffs.running import measure_tradeoff
 from csplat_tools.tradeoffs.setting import read_setting
 from csplat_tools.tradeoffs.tables import format_tradeoff
+from csplat_tools.views import DataOptions
 
 POINT = {
-    "name", "family", "error", "settings", "size_bytes", "sha256", "bytes_per_source_splat", "ratio", "splats",
-    "sh_degree", "psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "photographs", "seconds", "render",
-    "attribute_bytes", "first_picture_bytes", "partial",
+    "name", "family", "error", "command", "settings", "size_bytes", "sha256", "bytes_per_source_splat", "ratio",
+    "splats", "sh_degree", "psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "photographs", "seconds",
+    "render", "attribute_bytes", "first_picture_bytes", "partial",
 }  # fmt: skip
 QUICK = ["--what", "presets"]
 
@@ -293,15 +303,105 @@ def test_the_page_opens_and_its_table_sorts(tab, swept):
     tab.page.goto((swept[0] / "report.html").as_uri())
     assert "scene.ply: size, quality and time" == tab.page.title()
     names = "[...document.querySelectorAll('.sortable tbody tr')].map((row) => row.cells[{}].dataset.value)"
-    sizes = [int(value) for value in tab.page.evaluate(names.format(1))]
+    sizes = [int(value) for value in tab.page.evaluate(names.format(3))]
     assert sorted(sizes) == sizes
     for _ in range(2):
-        tab.page.click(".sortable th:nth-child(2) button")
-    assert sizes[::-1] == [int(value) for value in tab.page.evaluate(names.format(1))]
+        tab.page.click(".sortable th:nth-child(4) button")
+    assert sizes[::-1] == [int(value) for value in tab.page.evaluate(names.format(3))]
+    tab.page.click(".sortable th:nth-child(1) button")
+    sorted_names = tab.page.evaluate(names.format(0))
+    assert sorted(sorted_names, key=str.casefold) == sorted_names
     broken = "[...document.images].filter((one) => !one.naturalWidth).length"
     assert 0 == tab.page.evaluate(broken)
-    coloured = "getComputedStyle(document.querySelector('.plot path[fill]:not([fill=none])')).fill"
+    coloured = "getComputedStyle(document.querySelector('.plot use[fill^=\"#\"]')).fill"
     assert tab.page.evaluate(coloured).startswith("rgb")
+
+
+def test_copy_copies_the_command_of_a_row(tab, swept):
+    tab.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    tab.page.goto((swept[0] / "report.html").as_uri())
+    row = tab.page.locator(".sortable tbody tr").filter(has=tab.page.get_by_role("cell", name="SH 1", exact=True))
+    row.locator("button").click()
+    tab.until("document.querySelector('.sortable').textContent.includes('copied')")
+    command = next(one["command"] for one in swept[2]["points"] if one["name"] == "SH 1")
+    assert command == tab.page.evaluate("navigator.clipboard.readText()")
+
+
+def test_the_page_explains_every_heading_and_shows_every_command(swept):
+    text = html.unescape((swept[0] / "report.html").read_text())
+    heads = re.findall(r'<th scope="col" title="([^"]+)"><button type="button">([^<]+)<', text)
+    assert len(heads) > 12
+    for hint, title in heads:
+        assert f"<dt>{title}</dt> <dd>{hint}</dd>" in text
+    for point in swept[2]["points"]:
+        if point["error"] is None:
+            assert f">{point['command']}</code>" in text
+
+
+@pytest.mark.parametrize("count", [3, 10, 30])
+def test_labels_of_a_plot_do_not_overlap(count):
+    figure = Figure(figsize=(7.0, 4.4), dpi=100)
+    axes = figure.add_subplot()
+    rng = np.random.default_rng(count)
+    sizes = np.sort(rng.lognormal(0.0, 0.4, count))
+    marks = [(float(x), float(30.0 + 8.0 * np.log(x) + y)) for x, y in zip(sizes, rng.normal(0, 2, count), strict=True)]
+    axes.plot(*zip(*marks, strict=True), "o")
+    names = [f"attributes {number} dB" for number in range(count)]
+    numbered = label_marks(axes, marks, names, [str(number) for number in range(count)], marks[:5])
+    assert (count == 30) == numbered
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = canvas.get_renderer()
+    boxes = [Text.get_window_extent(text, drawn) for text in axes.texts]  # without the lines to the marks
+    assert count == len(boxes)
+    for place, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:place])
+        assert not any(box.contains(*axes.transData.transform(mark)) for mark in marks)
+        assert axes.bbox.contains(box.x0, box.y0)
+        assert axes.bbox.contains(box.x1, box.y1)
+
+
+def test_plots_that_stand_alone_are_light_or_dark_as_the_reader_has_it(measured):
+    for name in ("size-quality", "attribute-bytes"):
+        alone, inside = (draw_plot(name, measured, inline=inline) for inline in (False, True))
+        assert "prefers-color-scheme:dark" in alone
+        assert "currentColor" in alone
+        assert "<style" not in inside
+        assert "#123457" not in alone + inside
+
+
+# the commands of the rows
+
+
+@pytest.mark.parametrize("name", ["fast", "attributes 40 dB", "SH 1", "SH 0, distilled", "k-means 16", "keep 0.5"])
+def test_the_command_of_a_row_makes_its_bytes(swept, tmp_path, monkeypatch, name):
+    point = next(one for one in swept[2]["points"] if one["name"] == name)
+    monkeypatch.chdir(tmp_path)
+    program, *words = shlex.split(point["command"])
+    if program == "csplat":
+        done = CliRunner().invoke(app, [*words, "--quiet"])
+        assert 0 == done.exit_code, done.output
+    else:
+        assert ["python", "-c"] == [program, words[0]]
+        exec(compile(words[1], "command", "exec"), {})  # noqa: S102 -- what the page offers is what is tested
+    (made,) = tmp_path.iterdir()
+    assert point["sha256"] == hashlib.sha256(made.read_bytes()).hexdigest()
+
+
+def test_commands_quote_what_a_shell_would_read(setting):
+    told = replace(
+        setting, path="my scenes/it's.ply", cameras="$HOME/cams.json", background=(0.1, 0.0, 1.0),
+        data=DataOptions('a "set"', (480, 270), None, 5),
+    )  # fmt: skip
+    words = shlex.split(target_command(told, "target 2.0 MB", "small", target_size=2_000_000))
+    assert [
+        "csplat", "encode", "my scenes/it's.ply", "it's-target-2.0-MB.csplat", "--target-size", "2000000", "--preset",
+        "small", "--cameras", "$HOME/cams.json", "--data", 'a "set"', "--size", "480x270", "--test-every", "5",
+        "--background", "0.1,0.0,1.0",
+    ] == words  # fmt: skip
+    *_, program = shlex.split(reduction_command(told, "SH 0, distilled", "small", Reduction(sh_degree=0, distil=True)))
+    compile(program, "command", "exec")
+    assert r'data=DataOptions("a \"set\"", (480, 270), None, 5), background=(0.1, 0.0, 1.0)' in program
 
 
 # how it fails

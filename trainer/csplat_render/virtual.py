@@ -34,7 +34,14 @@ from csplat_render.cloud import (
     weighted_quantiles,
 )
 
-__all__ = ["OBJECT_DISTANCES", "SURROUNDING_DISTANCES", "Frame", "scene_frame", "virtual_cameras"]
+__all__ = [
+    "OBJECT_DISTANCES",
+    "SURROUNDING_DISTANCES",
+    "Frame",
+    "far_apart",
+    "scene_frame",
+    "virtual_cameras",
+]
 
 F64 = NDArray[np.float64]
 Kind = Literal["object", "surrounding"]
@@ -222,12 +229,12 @@ def _in_surroundings(views: _Views, cloud: Cloud, count: int, begin: float) -> l
     if len(pool) < count:
         pool = np.argsort(-details, kind="stable")[: max(count, len(pool))]
     positions = np.stack([camera.position for camera in cameras])
-    chosen = _far_apart(positions[pool], int(np.argmax(details[pool])), min(count, len(pool)))
+    chosen = far_apart(positions[pool], int(np.argmax(details[pool])), min(count, len(pool)))
     picked = [cameras[i] for i in pool[chosen]]
     return [picked[i % len(picked)] for i in range(count)]
 
 
-def _far_apart(points: F64, first: int, count: int) -> list[int]:
+def far_apart(points: F64, first: int, count: int) -> list[int]:
     """Positions of `count` points, each the farthest from those before it."""
     chosen = [first]
     gap = np.sum((points - points[first]) ** 2, axis=1)

@@ -28,9 +28,6 @@ from csplat_tools.files.streams import check_name
 
 __all__ = ["finetune"]
 
-_RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
-_MOST_ASIDE = 16  # but no more than these
-
 
 @command(
     one_of=(("data", "itself"), ("data", "views"), ("data", "view_size")),
@@ -133,7 +130,7 @@ def finetune(
     read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra)
     out.findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
-    aside_count = aside or _usually_aside(views, given["count"])
+    aside_count = aside or tuning.usually_aside(given["count"], cameras=views.cameras, data=views.data)
     around = views.find(read.model, out, near=near, aside=aside_count, **given)
     around.read()
     report = tuning.run_finetuning(
@@ -142,10 +139,3 @@ def finetune(
     )  # fmt: skip
     out.remark(format_report(report))
     out.publish(report)
-
-
-def _usually_aside(views: Views, count: int) -> int | None:
-    """How many views decide which step was best: of photographs some that teach do, of few virtual views few."""
-    if views.data is not None:
-        return 0
-    return min(_MOST_ASIDE, count // _RENDERS_ASIDE) if views.cameras is None else None

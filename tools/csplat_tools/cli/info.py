@@ -10,34 +10,53 @@ import typer
 
 from csplat.decoder import StatedErrors
 from csplat.errors import counted
-from csplat.training import TRAINING, TrainedOn
-from csplat.upright import UP, up_of
 from csplat_tools.cli.options import Output, command
-from csplat_tools.files.console import format_bytes, format_table
+from csplat_tools.files.console import format_table
+from csplat_tools.files.extras import need_pictures, prepare_renderer
 from csplat_tools.files.streams import mapped_csplat
 from csplat_tools.inspect.info import AttributeFacts, CodebookFacts, FileFacts, LayerFacts, describe_file
+from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
 
 __all__ = ["info"]
 
 
-@command()
+@command(needs={"beside": ("page",)})
 def info(
     source: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
     out: Output,
+    page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write a page about it.")] = None,
+    beside: Annotated[
+        str | None,
+        typer.Option(
+            "--source",
+            metavar="SCENE",
+            help="What it was made from, PLY or .csplat: the page shows where they differ. Wants the render extra.",
+        ),
+    ] = None,
 ) -> None:
     """Say what is in a file: scene, sizes, options, stated errors.
 
     Reads the header, the index and the heads of the blocks: a large file
     takes hardly longer than a small one. Nothing is decoded: whether the
-    file is intact is what `csplat verify` tells.
+    file is intact is what `csplat verify` tells. --page writes the same as
+    one HTML page that opens from a disk, with words for all of it.
 
     Examples:
       csplat info scene.csplat
       csplat info scene.csplat --json | jq .attributes.means.bits_per_splat
+      csplat info scene.csplat --page scene.html --source scene.ply
     """
-    out.check(inputs=(source,))
+    out.check(inputs=(source, beside), named={"--page": page})
+    if beside is not None:
+        prepare_renderer(quiet=out.quiet, ssim=True)
+        need_pictures()
     with mapped_csplat(source) as data:
         facts = describe_file(data)
+        if page is not None:
+            from csplat_tools.inspect.page import write_page
+
+            with out.bar() as progress:
+                write_page(page, source, data, facts, beside, progress=progress)
     out.publish(facts.as_json(), _format(facts))
 
 
@@ -45,7 +64,7 @@ def _format(facts: FileFacts) -> str:
     size = facts.header.file_size
     parts = [
         _scene(facts),
-        _sizes("attribute", facts.attributes, size, [_coding(one) for one in facts.attributes.values()]),
+        _sizes("attribute", facts.attributes, size, [coding_words(one) for one in facts.attributes.values()]),
         _sizes("layer", facts.layers, size, [counted(one.tiles, "tile") for one in facts.layers.values()]),
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in facts.overhead.items()),
     ]
@@ -53,55 +72,16 @@ def _format(facts: FileFacts) -> str:
         parts.append("\n".join(_codebook(one) for one in facts.codebooks))
     if facts.stated_errors is not None:
         parts.append(_stated_errors(facts.stated_errors))
-    metadata = dict(facts.metadata or {})
-    if TrainedOn.of(metadata) is not None:  # in words above
-        del metadata[TRAINING]
-    if up_of(metadata) is not None:
-        del metadata[UP]
     parts += [
         f"{title}  {json.dumps(value, sort_keys=True)}"
-        for title, value in (("options ", facts.options), ("metadata", metadata))
+        for title, value in (("options ", facts.options), ("metadata", other_metadata(facts)))
         if value
     ]
     return "\n\n".join(parts)
 
 
 def _scene(facts: FileFacts) -> str:
-    header, per_splat = facts.header, facts.bytes_per_splat
-    average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-    version = f"csplat {header.version[0]}.{header.version[1]}"
-    flags = [name for name in ("antialiased", "flat") if getattr(header, name)]
-    up = up_of(facts.metadata or {}, header.coordinate_system)
-    lines = [
-        f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}",
-        f"splats       {header.splat_count:,}, SH degree {header.sh_degree}",
-        f"axes         {header.coordinate_system}",
-        f"up           {'unknown' if up is None else ' '.join(f'{value:g}' for value in up)}",
-        f"unit         {'unknown' if header.unit_metres is None else f'{header.unit_metres:g} m'}",
-        f"origin       {' '.join(f'{value:.17g}' for value in header.origin)}",
-        f"flags        {', '.join(flags) or 'none'}",
-        f"tiles        {_tiles(facts)}",
-    ]
-    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
-    if extras:
-        lines.append(f"extra        {extras}")
-    if facts.cameras is not None:
-        lines.append(f"cameras      {facts.cameras}")
-    trained = TrainedOn.of(facts.metadata or {})
-    if trained is not None:
-        lines.append(f"trained on   {trained}")
-    return "\n".join(lines)
-
-
-def _tiles(facts: FileFacts) -> str:
-    words = {
-        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in facts.spans.items()
-    }
-    if not words:
-        return "0"
-    count = len(facts.header.tiles)
-    bits = f"{words['bits_per_axis']} bits per axis, exponents {words['exponents']}"
-    return f"{count} of {words['splats']} splats, {bits}"
+    return "\n".join([headline(facts), *(f"{name:12} {value}" for name, value in scene_words(facts).items())])
 
 
 def _sizes(
@@ -118,24 +98,6 @@ def _sizes(
     ]
     lines = format_table((title, "bytes", "bits/splat", "% of file"), rows).splitlines()
     return "\n".join(f"{line}  {text}".rstrip() for line, text in zip(lines, ["", *remarks], strict=True))
-
-
-def _coding(attribute: AttributeFacts) -> str:
-    words = ["+".join(attribute.codings)]
-    if attribute.step is not None:
-        words.append(f"step {attribute.step:.4g}")
-    if attribute.levels:
-        words.append(f"{attribute.levels} levels")
-    if attribute.mapping not in (None, "lattice", "unit_w"):
-        words.append(str(attribute.mapping))
-    if attribute.chroma_shift:
-        words.append(f"chroma / {2**attribute.chroma_shift}")
-    if attribute.codebook_bytes:
-        words.append(f"codebook {format_bytes(attribute.codebook_bytes)}")
-    if attribute.escaped_splats:
-        words.append(f"{attribute.escaped_splats} escaped")
-    words.append("+".join(attribute.coders))
-    return ", ".join(word for word in words if word)
 
 
 def _codebook(codebook: CodebookFacts) -> str:

@@ -20,7 +20,7 @@ __all__ = ["tradeoff"]
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 
 
-@command()
+@command(needs={"background": ("cameras", "data")})
 def tradeoff(
     source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
     views: Views,
@@ -55,9 +55,10 @@ def tradeoff(
     each, and marks those that no other one beats: presets, values of
     --attribute-psnr, targets (the slowest: they remove and refit splats),
     shares of the splats, fewer SH bands, and simple strategies. A small scene
-    takes minutes. `psnr` is against the source's own renders, as that of
-    `csplat compare`; photographs judge beside it. Needs the packages of the
-    render extra.
+    takes minutes. PSNR is against the source's own renders, as `psnr` of
+    `csplat compare`; photographs judge beside it. The page has the command
+    that makes each file, and pictures of where it differs most. Needs the
+    packages of the render extra.
 
     Examples:
       csplat tradeoff scene.ply

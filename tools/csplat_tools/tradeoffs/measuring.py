@@ -17,15 +17,15 @@ from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
 from csplat_render import Mode
 from csplat_render.cameras import relative_to
-from csplat_render.judge import renderer
+from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_tools.files.console import Progress
 from csplat_tools.inspect.info import byte_shares
+from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile
 from csplat_tools.tradeoffs.setting import Setting
-from csplat_tools.tradeoffs.showing import WorstView
 from csplat_tools.tradeoffs.sweep import Candidate
-from csplat_tools.views import evenly
+from csplat_tools.views import evenly, showing_cameras
 
 __all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer", "fetched_bytes"]
 
@@ -78,6 +78,12 @@ class Measurer:
         self._setting, self._modes, self._threads = setting, modes, threads
         views = setting.views
         self._judge = views.judge(setting.source, threads=threads)
+        shown = showing_cameras(setting.source, views)
+        self._showing = (
+            None
+            if shown is views.judges
+            else Judge.of_source(setting.source, shown, views.judging_background, threads=threads)
+        )
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
         places = evenly(range(len(views.judges)), TIMED_VIEWS)
         self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
@@ -95,12 +101,15 @@ class Measurer:
         encode_seconds = time.perf_counter() - start
         setting, header = self._setting, read_header(made.data)
         decoded, decode_seconds = self._decoded(made.data, None)
-        worst = WorstView()
-        quality, photographs = self._compared(decoded, worst)
+        hardest = HardestPlace()
+        quality, photographs = self._compared(decoded, hardest)
+        if self._showing is not None:
+            self._showing.scores(decoded, ssim=False, on_view=hardest.look)
         modes: dict[str, ModeTime] = {mode: self._mode_time(decoded, mode) for mode in self._modes}
         return Point(
             name=candidate.name,
             family=candidate.family,
+            command=candidate.command,
             settings=made.settings,
             size_bytes=len(made.data),
             sha256=hashlib.sha256(made.data).hexdigest(),
@@ -117,7 +126,7 @@ class Measurer:
             attribute_bytes=byte_shares(made.data, header),
             first_picture_bytes=fetched_bytes(header, 0),
             partial=self._partial(made, header) if candidate.is_partial else (),
-            shown=worst.shown(),
+            hardest=hardest.found(),
         )
 
     def _partial(self, made: TriedFile, header: SceneHeader) -> list[Partial]:
@@ -143,14 +152,15 @@ class Measurer:
             seconds.append(time.perf_counter() - start)
         return models[0], statistics.median(seconds)
 
-    def _compared(self, decoded: SplatModel, worst: WorstView | None) -> tuple[Scores, Scores | None]:
-        """Against the source's renders; without a `WorstView` neither by LPIPS nor by photographs."""
-        distance = None if worst is None else self._setting.distance
+    def _compared(self, decoded: SplatModel, hardest: HardestPlace | None) -> tuple[Scores, Scores | None]:
+        """Against the source's renders; without a `HardestPlace` neither by LPIPS nor by photographs."""
+        distance = None if hardest is None else self._setting.distance
         each = list[ViewScore]()
 
         def look(number: int, source: F32, other: F32) -> None:
-            if worst is not None:
-                worst.look(number, source, other)
+            if hardest is not None:
+                if self._showing is None:
+                    hardest.look(number, source, other)
                 if self._photographs is not None:
                     each.append(self._photographs.score(number, other, lpips=distance))
 

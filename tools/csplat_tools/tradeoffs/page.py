@@ -8,21 +8,23 @@ from html import escape
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.pictures import check_folder
 from csplat_tools.files.streams import write_bytes
+from csplat_tools.pages.hardest import PICTURES, picture_row
+from csplat_tools.pages.parts import command_line, copy_button, definitions, document, table
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS
-from csplat_tools.tradeoffs.page_parts import SCRIPT, STYLE, policy
 from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
 from csplat_tools.tradeoffs.points import Point
 from csplat_tools.tradeoffs.running import Tradeoff
-from csplat_tools.tradeoffs.showing import AMPLIFICATION, as_data_uri
 from csplat_tools.tradeoffs.tables import columns_of, mode_rows, partial_rows, views_line
+from csplat_tools.views import VIRTUAL
 
 __all__ = ["check_plots", "make_page", "write_page", "write_plots"]
 
-_MOST_SHOWN = 9  # points with pictures: some 100 kB each
+_MOST_SHOWN = 9  # points with pictures: some 60 kB each
+_FRONT = ' class="front"'
 
 
 def make_page(tradeoff: Tradeoff) -> str:
-    """Write the page: plots, tables, pictures, and how everything was measured."""
+    """Write the page: plots, tables, commands, pictures, and how everything was measured."""
     title = f"{tradeoff.setting.name}: size, quality and time"
     parts = [
         _head(tradeoff, title),
@@ -35,15 +37,7 @@ def make_page(tradeoff: Tradeoff) -> str:
         _renderer(tradeoff),
         _measured(tradeoff),
     ]
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="referrer" content="no-referrer">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
-    )
+    return document(title, parts)
 
 
 def _head(tradeoff: Tradeoff, title: str) -> str:
@@ -55,8 +49,8 @@ def _head(tradeoff: Tradeoff, title: str) -> str:
 
 def _quality(tradeoff: Tradeoff) -> str:
     text = (
-        "Each mark is a file. The dashed line joins those that no other file beats: none is smaller and at least as"
-        " good. Left is smaller, up is better; rest the mouse on a mark for its name."
+        "Each mark is a file, with its name or its number in the table below. Left is smaller, up is better. The dashed"
+        " line joins the files to choose from: none of the others is smaller and at least as good."
     )
     plots = _figure(tradeoff, "size-quality") + _figure(tradeoff, "size-photographs")
     return f'<h2>Size and quality</h2>\n<p>{text}</p>\n<div class="plots">{plots}</div>'
@@ -65,36 +59,59 @@ def _quality(tradeoff: Tradeoff) -> str:
 def _files(tradeoff: Tradeoff) -> str:
     columns = columns_of(tradeoff)
     front = {one.name for one in tradeoff.front}
-    heads = '<th scope="col"><button type="button">file</button></th>' + "".join(
-        f'<th scope="col" title="{escape(one.hint)}"><button type="button">{escape(one.title)}</button></th>'
-        for one in columns
-    )
-    marks = {point.name: ' class="front"' if point.name in front else "" for point in tradeoff.measured}
+    heads = (
+        f'<th scope="col" class="name" data-kind="text">{_sorting("file")}</th><th scope="col">{_sorting("no.")}</th>'
+        '<th scope="col" title="The command that makes the file.">run</th>'
+    ) + "".join(f'<th scope="col" title="{escape(one.hint)}">{_sorting(one.title)}</th>' for one in columns)
     rows = [
-        f"<tr{marks[point.name]}><td>{escape(point.name)}</td>"
+        f"<tr{_FRONT if point.name in front else ''}>"
+        f'<td class="name" data-value="{escape(point.name)}">{escape(point.name)}</td>'
+        f'<td data-value="{number}">{number}</td><td>{copy_button(f"command-{number}", point.command)}</td>'
         + "".join(f'<td data-value="{_value(one.value(point))}">{one.text(point)}</td>' for one in columns)
         + "</tr>"
-        for point in tradeoff.measured
+        for number, point in enumerate(tradeoff.measured, 1)
     ]
-    failures = "".join(
-        f"<tr><td>{escape(one.name)}</td><td colspan={len(columns)}>{escape(one.error)}</td></tr>"
-        for one in tradeoff.failures
-    )
-    lost = f"<h3>Not measured</h3>\n<table><tbody>{failures}</tbody></table>" if failures else ""
+    legend = definitions({one.title: one.hint for one in columns}, "legend")
+    failures = [(one.name, one.error) for one in tradeoff.failures]
+    lost = f"<h3>Not measured</h3>\n{table(('file', 'why'), failures, words=(1,))}" if failures else ""
     return (
-        "<h2>Files</h2>\n<p>Those with a coloured ground are on the dashed line. A click on a heading sorts.</p>\n"
+        "<h2>Files</h2>\n<p>Those with a coloured ground are on the dashed line. A click on a heading sorts; copy takes"
+        " the command that makes the file.</p>\n"
         f'<div class="scroll"><table class="sortable"><thead><tr>{heads}</tr></thead>'
-        "<tbody>\n" + "\n".join(rows) + f"\n</tbody></table></div>\n{lost}"
+        "<tbody>\n" + "\n".join(rows) + f"\n</tbody></table></div>\n{legend}\n{_commands(tradeoff)}\n{lost}"
     )
+
+
+def _sorting(title: str) -> str:
+    return f'<button type="button">{escape(title)}</button>'
+
+
+def _commands(tradeoff: Tradeoff) -> str:
+    """All commands as text, for readers without scripts."""
+    text = (
+        "Each makes the same bytes as were measured here, run where the report was made. Those that begin with python"
+        " are no commands of csplat; they want a Python that has csplat."
+    )
+    entries = "\n".join(
+        f"<div>{number} {escape(point.name)} {copy_button(f'command-{number}', point.command)}<br>"
+        f"{command_line(f'command-{number}', point.command)}</div>"
+        for number, point in enumerate(tradeoff.measured, 1)
+    )
+    return f'<details class="commands"><summary>All commands</summary>\n<p>{text}</p>\n{entries}\n</details>'
 
 
 def _pictures(tradeoff: Tradeoff) -> str:
-    blocks = [_panel(point) for point in shown_points(tradeoff) if point.shown is not None]
-    text = (
-        f"The worst view of some files: the source, the file, and their difference times {AMPLIFICATION:g}."
-        " The pictures are compressed for this page; the numbers are not measured on them."
+    blocks = []
+    for number, point in enumerate(tradeoff.measured, 1):
+        if point.hardest is not None and point in shown_points(tradeoff):
+            facts = f"{format_bytes(point.size_bytes)}, {point.psnr:.2f} dB"
+            head = f'<h3>{number} {escape(point.name)} <span class="quiet">{facts}</span></h3>'
+            blocks.append(f"{head}\n{picture_row(point.hardest, point.name)}")
+    virtual = tradeoff.setting.views.name == VIRTUAL
+    text = f"The presets, and files of the dashed line. {PICTURES}" + (
+        " The views are other ones than those that judge: chosen because they show the scene well." if virtual else ""
     )
-    return f"<h2>Pictures</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
+    return f"<h2>The hardest places</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
 
 
 def shown_points(tradeoff: Tradeoff) -> list[Point]:
@@ -107,19 +124,6 @@ def shown_points(tradeoff: Tradeoff) -> list[Point]:
     return sorted({*presets, *others}, key=lambda one: (one.size_bytes, one.name))
 
 
-def _panel(point: Point) -> str:
-    shown = point.shown
-    assert shown is not None
-    words = {"source": shown.source, "file": shown.decoded, f"difference × {AMPLIFICATION:g}": shown.difference}
-    images = "".join(
-        f'<figure><img src="{as_data_uri(pixels)}" width="{pixels.shape[1]}" height="{pixels.shape[0]}"'
-        f' alt="{escape(f"{point.name}, view {shown.view}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
-        for word, pixels in words.items()
-    )
-    facts = f"{format_bytes(point.size_bytes)}, {point.psnr:.2f} dB; view {shown.view}: {shown.psnr:.2f} dB"
-    return f'<h3>{escape(point.name)} <span class="quiet">{facts}</span></h3>\n<div class="pictures">{images}</div>'
-
-
 def _times(tradeoff: Tradeoff) -> str:
     plots = _figure(tradeoff, "size-encode-time", "From the splats to the bytes, with the renders that decide.")
     plots += _figure(tradeoff, "quality-decode-time", "From the bytes in memory to float32 arrays.")
@@ -127,8 +131,8 @@ def _times(tradeoff: Tradeoff) -> str:
         (point.name, f"{point.encode_seconds:.2f}", ", ".join(f"{k} {v:.2f}" for k, v in point.stages.items()) or "-")
         for point in tradeoff.measured
     ]
-    table = _table(("file", "encode s", "stages, as far as they are known, s"), stages)
-    details = f'<details><summary>Stages of encoding</summary><div class="scroll">{table}</div></details>'
+    rows = table(("file", "encode s", "stages, as far as they are known, s"), stages, words=(2,))
+    details = f"<details><summary>Stages of encoding</summary>{rows}</details>"
     return f'<h2>Time</h2>\n<div class="plots">{plots}</div>\n{details}'
 
 
@@ -145,22 +149,20 @@ def _layers(tradeoff: Tradeoff) -> str:
         "A viewer shows the scene as soon as it has header, index and layer 0, and fetches the bands of spherical"
         " harmonics afterwards, or never. Bytes are those that it has fetched by then."
     )
-    table = _table(("file", *rows[0]), rows[1:])
     plot = _figure(tradeoff, "sh-layers")
-    return f'<h2>Fewer SH layers</h2>\n<p>{text}</p>\n{plot}\n<div class="scroll">{table}</div>'
+    return f"<h2>Fewer SH layers</h2>\n<p>{text}</p>\n{plot}\n{table(('file', *rows[0]), rows[1:])}"
 
 
 def _renderer(tradeoff: Tradeoff) -> str:
     rows = mode_rows(tradeoff)
-    text = "Milliseconds for a view, and psnr against the source in mode standard: what a faster renderer loses."
-    table = _table(("mode", *rows[0]), rows[1:])
-    return f'<h2>Modes of the renderer</h2>\n<p>{text}</p>\n<div class="scroll">{table}</div>'
+    text = "Milliseconds for a view, and PSNR against the source in mode standard: what a faster renderer loses."
+    return f"<h2>Modes of the renderer</h2>\n<p>{text}</p>\n{table(('mode', *rows[0]), rows[1:])}"
 
 
 def _measured(tradeoff: Tradeoff) -> str:
     machine, scores = tradeoff.machine, tradeoff.source_photographs
     facts = {
-        "psnr": "of the squared error pooled over views, pixels and channels, against the source's own renders, 99 dB"
+        "PSNR": "of the squared error pooled over views, pixels and channels, against the source's own renders, 99 dB"
         " at most; other cameras or another background give other numbers",
         "times": f"single runs on this machine; decoding is the median of {DECODE_RUNS},"
         " rendering the median over views",
@@ -173,8 +175,7 @@ def _measured(tradeoff: Tradeoff) -> str:
     }
     if scores is not None:
         facts["photographs"] = f"{len(scores.each)} that were held out; the source itself scores {scores.psnr:.2f} dB"
-    entries = "\n".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in facts.items())
-    return f"<h2>How it was measured</h2>\n<dl>\n{entries}\n</dl>"
+    return f"<h2>How it was measured</h2>\n{definitions(facts)}"
 
 
 def _figure(tradeoff: Tradeoff, name: str, caption: str = "") -> str:
@@ -182,13 +183,7 @@ def _figure(tradeoff: Tradeoff, name: str, caption: str = "") -> str:
     if text is None:
         return ""
     words = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure class="plot">{text}{words}</figure>\n'
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    heads = "".join(f'<th scope="col">{escape(one)}</th>' for one in header)
-    cells = "\n".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{heads}</tr></thead><tbody>\n{cells}\n</tbody></table>"
+    return f'<figure class="plot"><div class="scroll">{text}</div>{words}</figure>\n'
 
 
 def _value(value: float | None) -> str:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from csplat_tools.files.console import format_bytes
+from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.tradeoffs.labels import label_marks
 from csplat_tools.tradeoffs.points import Point
 from csplat_tools.tradeoffs.running import Tradeoff
 from csplat_tools.tradeoffs.svg import INK, drawn, hover
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, FigureBase
 
 __all__ = ["PLOTS", "draw_plot"]
 
@@ -34,21 +37,9 @@ _NAMES = {
     "simplify": "simplified",
     "finetune": "fine-tuned",
 }
-_ATTRIBUTE_COLOURS = {
-    "opacities": "#88ccee",
-    "scales": "#4477aa",
-    "quats": "#44aa99",
-    "means": "#117733",
-    "sh0": "#ddcc77",
-    "sh1": "#cc6677",
-    "sh2": "#aa4499",
-    "sh3": "#882255",
-    "overhead": "#8a8a8a",
-}
-_OTHER = "#bbbbbb"
 _FEW, _MANY, _TICKS = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0), 15  # ticks in each decade, and in all
 _LARGE = 1_000_000  # bytes of a file, from which on they are counted in MB
-_LABELLED = ("presets", "simplify", "targets", "finetune")
+_KEY_COLUMNS = 4  # of numbers and names, below a plot that stands alone
 
 Value = Callable[[Point], "float | None"]
 
@@ -68,7 +59,7 @@ def draw_plot(name: str, tradeoff: Tradeoff, *, inline: bool) -> str | None:
 
 
 def _quality(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
-    return _front_plot(tradeoff, name, inline, lambda one: one.psnr, tradeoff.front, "psnr against the source, dB")
+    return _front_plot(tradeoff, name, inline, lambda one: one.psnr, tradeoff.front, "PSNR against the source, dB")
 
 
 def _photographs(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
@@ -92,16 +83,12 @@ def _front_plot(
     def draw(figure: Figure) -> None:
         axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
         size = _size_in(divisor)
-        axes.plot(
-            [size(one) or 0.0 for one in front], [value(one) or 0.0 for one in front], "--", color=INK, linewidth=1,
-            label="no other is better", zorder=1,
-        )  # fmt: skip
+        line = [(size(one) or 0.0, value(one) or 0.0) for one in front]
+        axes.plot(*zip(*line, strict=True), "--", color=INK, linewidth=1, label="none is smaller and better", zorder=1)
         if level is not None:
             axes.axhline(level, color=INK, linewidth=1, linestyle=":", label="the source itself")
-        _scatter(axes, tradeoff, size, value, name)
         axes.set(xscale="log", xlabel=f"size, {unit}", ylabel=label)
-        _plain_ticks(axes, "x")
-        axes.legend(loc="lower right", fontsize="small")
+        _scatter(axes, tradeoff, size, value, name, inline, line)
 
     return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
 
@@ -109,12 +96,8 @@ def _front_plot(
 def _encode_time(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
     def draw(figure: Figure) -> None:
         axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
-        size = _size_in(divisor)
-        _scatter(axes, tradeoff, size, lambda one: one.encode_seconds, name)
         axes.set(xscale="log", yscale="log", xlabel=f"size, {unit}", ylabel="seconds to encode")
-        _plain_ticks(axes, "x")
-        _plain_ticks(axes, "y")
-        axes.legend(fontsize="small")
+        _scatter(axes, tradeoff, _size_in(divisor), lambda one: one.encode_seconds, name, inline)
 
     return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
 
@@ -122,32 +105,18 @@ def _encode_time(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
 def _decode_time(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        _scatter(axes, tradeoff, lambda one: one.psnr, lambda one: 1000.0 * one.decode_seconds, name)
-        axes.set(xlabel="psnr against the source, dB", ylabel="milliseconds to decode", ylim=(0.0, None))
-        axes.legend(fontsize="small")
+        axes.set(xlabel="PSNR against the source, dB", ylabel="milliseconds to decode")
+        _scatter(axes, tradeoff, lambda one: one.psnr, lambda one: 1000.0 * one.decode_seconds, name, inline)
 
     return drawn(draw, (_WIDE, _HIGH), name, inline=inline, titles=_titles(tradeoff, name))
 
 
-def _attributes(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
-    points = tradeoff.measured[::-1]
-    names = list(dict.fromkeys([*_ATTRIBUTE_COLOURS, *(key for one in points for key in one.attribute_bytes)]))
-    used = [key for key in names if any(one.attribute_bytes.get(key) for one in points)]
-
-    def draw(figure: Figure) -> None:
-        axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
-        left = [0.0] * len(points)
-        for key in used:
-            widths = [one.attribute_bytes.get(key, 0) / divisor for one in points]
-            colour = _ATTRIBUTE_COLOURS.get(key, _OTHER)
-            axes.barh(range(len(points)), widths, left=left, color=colour, height=0.75, label=key)
-            left = [a + b for a, b in zip(left, widths, strict=True)]
-        axes.set_yticks(range(len(points)), [one.name for one in points], fontsize="small")
-        axes.set(xlabel=f"size, {unit}", ylim=(-0.6, len(points) - 0.4))
-        axes.grid(visible=False, axis="y")
-        axes.legend(ncols=min(5, len(used)), loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small")
-
-    return drawn(draw, (_WIDE, 1.4 + 0.22 * len(points)), name, inline=inline)
+def _attributes(tradeoff: Tradeoff, _name: str, inline: bool) -> str | None:
+    bars = [
+        Bar(f"{number} {one.name}", one.attribute_bytes, format_bytes(one.size_bytes))
+        for number, one in enumerate(tradeoff.measured, 1)
+    ]
+    return draw_bars(bars, key=True, inline=inline)
 
 
 def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
@@ -170,7 +139,7 @@ def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
                     f"SH {one.sh_degree}", (x, y), (7, -3), textcoords="offset points", fontsize="x-small",
                     color=colour,
                 )  # fmt: skip
-        axes.set(xlabel=f"{unit} fetched", ylabel="psnr against the source, dB")
+        axes.set(xlabel=f"{unit} fetched", ylabel="PSNR against the source, dB")
         axes.margins(0.08)
         axes.legend(loc="lower right", fontsize="small")
 
@@ -188,25 +157,49 @@ PLOTS: dict[str, Callable[[Tradeoff, str, bool], str | None]] = {
 }
 
 
-def _scatter(axes: Axes, tradeoff: Tradeoff, x: Value, y: Value, plot: str) -> None:
-    for family, (colour, marker) in _STYLES.items():
-        shown = [one for one in tradeoff.measured if one.family == family]
-        for number, one in enumerate(shown):
-            across, up = x(one) or 0.0, y(one) or 0.0
-            (line,) = axes.plot(
-                [across], [up], marker, color=colour, markersize=6.5, label="" if number else _NAMES[family]
-            )
-            line.set_gid(hover(plot, one.name))
-            if family in _LABELLED:
-                axes.annotate(
-                    _short(one.name), (across, up), (-5, 5), textcoords="offset points",
-                    fontsize="x-small", color=colour, ha="right",
-                )  # fmt: skip
+def _scatter(
+    axes: Axes,
+    tradeoff: Tradeoff,
+    x: Value,
+    y: Value,
+    plot: str,
+    inline: bool,
+    line: Sequence[tuple[float, float]] = (),
+) -> None:
+    """A mark for each file, and beside it the file's name, or its number in the table where names do not fit."""
+    points, marks = tradeoff.measured, list[tuple[float, float]]()
+    named = set[str]()
+    for one in points:
+        colour, marker = _STYLES[one.family]
+        marks.append((x(one) or 0.0, y(one) or 0.0))
+        label = "" if one.family in named else _NAMES[one.family]
+        named.add(one.family)
+        (mark,) = axes.plot(*([at] for at in marks[-1]), marker, color=colour, markersize=6.5, label=label)
+        mark.set_gid(hover(plot, one.name))
     axes.margins(0.08)
+    for which in "xy":
+        _plain_ticks(axes, which)
+    handles, labels = axes.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda at: [*_NAMES.values(), labels[at]].index(labels[at]))
+    figure = axes.get_figure()
+    assert figure is not None
+    figure.legend(
+        [handles[at] for at in order], [labels[at] for at in order], loc="outside upper left", ncols=4, fontsize="small"
+    )
+    numbers = [str(number) for number in range(1, len(points) + 1)]
+    if label_marks(axes, marks, [one.name for one in points], numbers, line) and not inline:
+        _write_key(figure, [f"{number} {one.name}" for number, one in zip(numbers, points, strict=True)])
 
 
-def _short(name: str) -> str:
-    return name.removeprefix("target ")
+def _write_key(figure: FigureBase, lines: Sequence[str]) -> None:
+    """What numbers stand for, below a plot that no table is beside of."""
+    from matplotlib.lines import Line2D
+
+    nothing = [Line2D([], [], linestyle="none") for _ in lines]
+    figure.legend(
+        nothing, lines, loc="outside lower left", ncols=_KEY_COLUMNS, fontsize="x-small", handlelength=0,
+        handletextpad=0,
+    )  # fmt: skip
 
 
 def _titles(tradeoff: Tradeoff, plot: str) -> dict[str, str]:
@@ -232,6 +225,8 @@ def _plain_ticks(axes: Axes, which: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis
+    if axis.get_scale() != "log":
+        return
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(10.0, _FEW if high > 12.0 * low else _MANY, numticks=_TICKS))
     axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))

@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat_render.metrics import Scores
+from csplat_tools.pages.hardest import Place
 
-__all__ = ["Failure", "ModeTime", "Partial", "Point", "Shown", "TriedFile", "pareto_front"]
-
-U8 = NDArray[np.uint8]
+__all__ = ["Failure", "ModeTime", "Partial", "Point", "TriedFile", "pareto_front"]
 
 _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
@@ -79,23 +77,6 @@ class Partial:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """The view in which a file looks worst.
-
-    Attributes:
-        view: its number.
-        psnr: of this view, dB.
-        source, decoded, difference: [H, W, 3] uint8; the difference is amplified.
-    """
-
-    view: int
-    psnr: float
-    source: U8
-    decoded: U8
-    difference: U8
-
-
 @dataclass(frozen=True)
 class Failure:
     """A point that could not be measured.
@@ -121,6 +102,7 @@ class Point:
     Attributes:
         name: unique among the points.
         family: which group it belongs to.
+        command: makes the same file.
         settings: how the file was made, JSON-compatible.
         size_bytes: of the file. sha256: of its bytes, in hexadecimal digits.
         splats, sh_degree: of the file.
@@ -133,11 +115,12 @@ class Point:
         attribute_bytes: by attribute, and everything else as `overhead`.
         first_picture_bytes: header, index, and everything but the SH bands.
         partial: quality by SH layers fetched, where it was looked at.
-        shown: its worst view.
+        hardest: where it differs most from the source.
     """
 
     name: str
     family: str
+    command: str
     settings: Mapping[str, Any]
     size_bytes: int
     sha256: str
@@ -154,7 +137,7 @@ class Point:
     attribute_bytes: Mapping[str, int]
     first_picture_bytes: int
     partial: Sequence[Partial] = ()
-    shown: Shown | None = field(default=None, repr=False)
+    hardest: Place | None = field(default=None, repr=False)
 
     @property
     def ratio(self) -> float:
@@ -182,6 +165,7 @@ class Point:
             "name": self.name,
             "family": self.family,
             "error": None,
+            "command": self.command,
             "settings": dict(self.settings),
             "size_bytes": self.size_bytes,
             "sha256": self.sha256,

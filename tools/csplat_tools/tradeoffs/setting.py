@@ -21,17 +21,22 @@ class Setting:
     """A scene, and by what its files are decided on and judged.
 
     Attributes:
-        name: of the PLY. source: its splats. source_bytes: its size.
+        path: of the PLY, as it was given. name: of the file. source: its splats. source_bytes: its size.
         findings: what lint noticed in it.
         views: all files are judged by the same ones, which none of them was chosen by.
+        cameras, data, background: by which these were found, see `find_view_set`.
         distance: LPIPS, if wanted.
     """
 
+    path: str
     name: str
     source: SplatModel
     source_bytes: int
     findings: Sequence[Finding]
     views: ViewSet
+    cameras: str | None = None
+    data: DataOptions | None = None
+    background: Colour | None = None
     distance: Distance | None = None
 
 
@@ -61,4 +66,6 @@ def read_setting(
     views = find_view_set(source.model, cameras=cameras, data=data, background=background)
     if not views.judges:
         raise InputError(f"{views.name} has no photographs that were held out")
-    return Setting(source.name, source.model, source.size_bytes, source.findings, views, distance)
+    return Setting(
+        path, source.name, source.model, source.size_bytes, source.findings, views, cameras, data, background, distance
+    )

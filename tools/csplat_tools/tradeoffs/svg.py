@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
+from csplat_tools.pages.bars import STANDALONE
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -19,7 +21,7 @@ INK = "#123457"
 
 _SVG = "{http://www.w3.org/2000/svg}"
 _XLINK = "{http://www.w3.org/1999/xlink}"
-_BLACK = "#1a1a1a"
+_BLACK = "#1d2126"  # where no style is understood
 # `font` is no attribute of SVG; older versions of matplotlib write sizes so.
 _FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
 _SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
@@ -62,7 +64,8 @@ def drawn(
         draw: is given an empty figure.
         size: width and height, inches.
         name: of the plot: ids inside begin with it, so that several plots can share a page.
-        inline: for a page: transparent, and lines and letters have the page's colour; else on white, with a prologue.
+        inline: for a page, whose colour lines and letters have; else with a prologue and a ground, light or dark as
+            the reader has set it.
         titles: by id, what appears where the mouse rests.
 
     Returns:
@@ -78,16 +81,22 @@ def drawn(
         draw(figure)
         buffer = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(buffer, format="svg", metadata=nothing, transparent=inline)
+        figure.savefig(buffer, format="svg", metadata=nothing, transparent=True)
     root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
     _clean(root, name, titles or {})
     if inline:
         root.attrib.pop("height", None)
         root.attrib.pop("width", None)
-    else:
-        root.set("font-family", "sans-serif")
-    text = ET.tostring(root, encoding="unicode").replace(INK, "currentColor" if inline else _BLACK)
-    return text if inline else f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'
+        return _text(root)
+    root.set("font-family", "sans-serif")
+    root.set("color", _BLACK)
+    for place, child in enumerate(ET.fromstring(f"<g>{STANDALONE}</g>")):  # noqa: S314 -- our own text
+        root.insert(place, child)
+    return f'<?xml version="1.0" encoding="utf-8"?>\n{_text(root)}\n'
+
+
+def _text(root: ET.Element) -> str:
+    return ET.tostring(root, encoding="unicode").replace(INK, "currentColor")
 
 
 def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:

@@ -12,6 +12,7 @@ from csplat.model import SplatModel
 from csplat_tools.files.console import Progress, format_bytes
 from csplat_tools.optimise.optimiser import encode_to
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
+from csplat_tools.tradeoffs.commands import encode_command, finetune_command, reduction_command, target_command
 from csplat_tools.tradeoffs.options import Wanted
 from csplat_tools.tradeoffs.points import TriedFile
 from csplat_tools.tradeoffs.setting import Setting
@@ -24,6 +25,7 @@ from csplat_tools.training.finetune import (
     Clock,
     plan_tuning,
     tune,
+    usually_aside,
 )
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
@@ -41,6 +43,7 @@ class Candidate:
     Attributes:
         name: unique.
         family: one of `FAMILIES`.
+        command: makes the same file for whoever pastes it into a shell.
         make: makes the file; is told the callback that wants to know how far it has come.
         is_partial: whether it is looked at with fewer SH layers, too.
         cost: like which family's the time is that it takes; `None`: its own.
@@ -48,6 +51,7 @@ class Candidate:
 
     name: str
     family: str
+    command: str
     make: Callable[[Progress], TriedFile]
     is_partial: bool = False
     cost: str | None = None
@@ -69,14 +73,17 @@ def candidates(setting: Setting, wanted: Wanted) -> list[Candidate]:
 def _presets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for preset in PRESETS:
         options = EncodeOptions(preset=preset, threads=wanted.threads)
+        command = encode_command(setting, preset, preset)
         has_bands = setting.source.sh_degree > 0
-        yield Candidate(preset, "presets", partial(_encode, setting.source, options), is_partial=has_bands)
+        yield Candidate(preset, "presets", command, partial(_encode, setting.source, options), is_partial=has_bands)
 
 
 def _precisions(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for decibels in wanted.attribute_psnr:
+        name = f"attributes {decibels:g} dB"
         options = EncodeOptions(preset=wanted.preset, attribute_psnr=decibels, threads=wanted.threads)
-        yield Candidate(f"attributes {decibels:g} dB", "precision", partial(_encode, setting.source, options))
+        command = encode_command(setting, name, wanted.preset, attribute_psnr=decibels)
+        yield Candidate(name, "precision", command, partial(_encode, setting.source, options))
 
 
 def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
@@ -84,11 +91,14 @@ def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> Candidate:
         how = replace(reduction, threads=wanted.threads)
-        return Candidate(name, "strategies", partial(_reduce, setting, wanted, how), cost=cost)
+        command = reduction_command(setting, name, wanted.preset, reduction)
+        return Candidate(name, "strategies", command, partial(_reduce, setting, wanted, how), cost=cost)
 
     degree = setting.source.sh_degree
     for kept in reversed(range(degree)):
-        yield strategy(f"SH {kept}", Reduction(sh_degree=kept))
+        options = EncodeOptions(preset=wanted.preset, sh_degree=kept, threads=wanted.threads)
+        command = encode_command(setting, f"SH {kept}", wanted.preset, sh_degree=kept)
+        yield Candidate(f"SH {kept}", "strategies", command, partial(_encode, setting.source, options))
     for tau in wanted.opacities:
         yield strategy(f"opacity > {tau:g}", Reduction(prune_opacity=tau))
     if degree and wanted.opacities:
@@ -102,20 +112,30 @@ def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 def _targets(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for psnr in wanted.psnr:
-        yield Candidate(f"target {psnr:g} dB", "targets", partial(_reach, setting, wanted, psnr=psnr))
+        yield _target(setting, wanted, f"target {psnr:g} dB", psnr=psnr)
     for size in wanted.sizes:
-        yield Candidate(f"target {format_bytes(size)}", "targets", partial(_reach, setting, wanted, size=size))
+        yield _target(setting, wanted, f"target {format_bytes(size)}", size=size)
+
+
+def _target(
+    setting: Setting, wanted: Wanted, name: str, psnr: float | None = None, size: int | None = None
+) -> Candidate:
+    command = target_command(setting, name, wanted.preset, target_psnr=psnr, target_size=size)
+    return Candidate(name, "targets", command, partial(_reach, setting, wanted, psnr=psnr, size=size))
 
 
 def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
     for keep in wanted.keep:
-        yield Candidate(f"keep {keep:g}", "simplify", partial(_reach, setting, wanted, keep=keep))
+        command = target_command(setting, f"keep {keep:g}", wanted.preset, keep=keep)
+        yield Candidate(f"keep {keep:g}", "simplify", command, partial(_reach, setting, wanted, keep=keep))
 
 
 def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
-    yield Candidate("tuned", "finetune", partial(_tune, setting, wanted, None))
-    for keep in wanted.keep[len(wanted.keep) // 2 :][:1]:  # the middle one: each takes minutes
-        yield Candidate(f"tuned, keep {keep:g}", "finetune", partial(_tune, setting, wanted, keep))
+    one_keep = wanted.keep[len(wanted.keep) // 2 :][:1]  # the middle one: each takes minutes
+    for keep in (None, *one_keep):
+        name = "tuned" if keep is None else f"tuned, keep {keep:g}"
+        command = finetune_command(setting, name, wanted, keep)
+        yield Candidate(name, "finetune", command, partial(_tune, setting, wanted, keep))
 
 
 def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> TriedFile:
@@ -142,7 +162,7 @@ def _made(result: EncodeResult, **said: Any) -> TriedFile:
 
 
 def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> TriedFile:
-    """The file that `csplat finetune` makes with its usual options, but for which virtual views decide."""
+    """The file that `csplat finetune` makes with its usual options."""
     itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
     options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
@@ -160,11 +180,11 @@ def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progre
 def _tuning_views(setting: Setting) -> ViewSet:
     """Those of `csplat finetune`: of photographs, all teach that do not judge; of virtual views, there are more."""
     views = setting.views
-    if views.photographs:
+    if views.photographs:  # which are in memory already
         judging = {pose(camera) for camera in views.judges}
         teaches = [one.camera for one in views.photographs if pose(one.camera) not in judging]
         return replace(views, teaches=teaches, decides=())
-    if views.virtual:
-        more = find_view_set(setting.source, background=views.background, count=VIEWS, size=VIEW_SIZE)
-        return replace(views, teaches=more.teaches, decides=more.decides)
-    return views
+    return find_view_set(
+        setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,
+        aside=usually_aside(VIEWS, cameras=setting.cameras, data=None),
+    )  # fmt: skip

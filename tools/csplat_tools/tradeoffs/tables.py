@@ -46,35 +46,43 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
     """The columns that have anything to say for a sweep."""
     columns = [
         Column("bytes", "Size of the file.", lambda one: one.size_bytes, 0),
-        Column("B/splat", "Bytes of the file for each splat of the source.", lambda one: one.bytes_per_source_splat, 2),
-        Column("ratio", "How many times the file is smaller than the PLY.", lambda one: one.ratio, 1),
-        Column("psnr", "dB, of the squared error pooled over all views, against the source's renders.",
+        Column("bytes/splat", "Size of the file over the number of splats of the source: comparable between scenes.",
+               lambda one: one.bytes_per_source_splat, 2),
+        Column("smaller", "How many times the file is smaller than the PLY.", lambda one: one.ratio, 1),
+        Column("PSNR", "How near pictures of the file come to pictures of the source, in dB, more is better: at 30"
+               " people see a difference, at 40 they hardly do. Of the squared error pooled over all views.",
                lambda one: one.psnr, 2),
-        Column("mean", "dB, mean over the views.", lambda one: one.quality.psnr_mean, 2, detailed=True),
-        Column("worst", "dB, of the worst view.", lambda one: one.quality.psnr_worst, 2),
-        Column("ssim", "Mean over the views.", lambda one: one.quality.ssim, 4),
+        Column("worst PSNR", "Of the view that came out worst.", lambda one: one.quality.psnr_worst, 2),
+        Column("SSIM", "Likeness of structure, 1 at best: the mean over the views.", lambda one: one.quality.ssim, 4),
     ]  # fmt: skip
     if tradeoff.setting.distance is not None:
         columns.append(
-            Column("lpips", "Perceptual distance (Alex), mean over the views.", lambda one: one.quality.lpips, 4)
-        )
+            Column("LPIPS", "Distance as a trained network sees it (Alex), 0 at best: the mean over the views.",
+                   lambda one: one.quality.lpips, 4)
+        )  # fmt: skip
     if tradeoff.setting.views.photographs:
-        columns.append(Column("photos", "dB against held-out photographs.", lambda one: one.photograph_psnr, 2))
+        columns.append(
+            Column("photo PSNR", "dB against photographs that training has not seen.",
+                   lambda one: one.photograph_psnr, 2)
+        )  # fmt: skip
     columns += [
-        Column("splats", "Splats of the file.", lambda one: one.splats, 0),
-        Column("SH", "Degree of its spherical harmonics.", lambda one: one.sh_degree, 0, detailed=True),
-        Column("encode s", "Seconds from splats to bytes, one run.", lambda one: one.encode_seconds, 2),
-        Column("decode ms", "Milliseconds from bytes to splats.", lambda one: 1000.0 * one.decode_seconds, 1),
-        Column("first kB", "kB that a viewer fetches before the first picture: all but the SH bands.",
-               lambda one: one.first_picture_bytes / 1000.0, 1),
-        Column("loaded s", f"Seconds until a line of {_LINE_MBITS:g} Mbit/s has brought all of it.",
-               lambda one: _line_seconds(one.size_bytes), 2, detailed=True),
-        Column("first s", "Seconds until it has brought the first picture.",
+        Column("splats", "How many the file holds.", lambda one: one.splats, 0),
+        Column("SH degree", "Of the spherical harmonics that the file holds: colours that change with the direction of"
+               " view. 0: none.", lambda one: one.sh_degree, 0, detailed=True),
+        Column("encode s", "Seconds that making the file took, one run.", lambda one: one.encode_seconds, 2),
+        Column("decode ms", "Milliseconds from the bytes to arrays of splats.",
+               lambda one: 1000.0 * one.decode_seconds, 1),
+        Column("preview kB", "What a viewer fetches before it shows the first picture, kB: everything but the spherical"
+               " harmonics, which come afterwards.", lambda one: one.first_picture_bytes / 1000.0, 1),
+        Column("preview s", f"Seconds that this takes on a line of {_LINE_MBITS:g} Mbit/s.",
                lambda one: _line_seconds(one.first_picture_bytes), 2, detailed=True),
+        Column("download s", "Seconds that the whole file takes on the same line.",
+               lambda one: _line_seconds(one.size_bytes), 2, detailed=True),
     ]  # fmt: skip
     for mode in tradeoff.source_modes:
-        hint = f"Milliseconds to render a view in mode {mode}, median over views."
-        columns.append(Column(f"{mode} ms", hint, _milliseconds(mode), 1))
+        title = "render ms" if mode == "standard" else f"render ms, {mode}"
+        hint = f"Milliseconds to draw a view on this machine's processor in the renderer's mode {mode}; the median."
+        columns.append(Column(title, hint, _milliseconds(mode), 1))
     return columns
 
 
@@ -91,7 +99,8 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
     parts = [
         f"{setting.name}: {count}, {format_bytes(setting.source_bytes)}; {views_line(tradeoff)}",
         format_table(("  file", *(column.title for column in columns)), rows)
-        + f"\n{MARK} no other file is smaller and at least as good, by psnr",
+        + f"\n{MARK} no other file is smaller and at least as good, by PSNR",
+        "\n".join(f"{column.title:{max(len(one.title) for one in columns)}}  {column.hint}" for column in columns),
     ]
     if tradeoff.failures:
         parts.append("\n".join(f"not measured: {one.name}: {one.error}" for one in tradeoff.failures))
@@ -125,8 +134,8 @@ def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
     shown = _presets(tradeoff) or tradeoff.front[-1:]
     header: tuple[str, ...] = (
         "source ms",
-        "source psnr",
-        *(f"{one.name} {what}" for one in shown for what in ("ms", "psnr")),
+        "source PSNR",
+        *(f"{one.name} {what}" for one in shown for what in ("ms", "PSNR")),
     )
     rows = list[tuple[str, ...]]([header])
     for mode, source in tradeoff.source_modes.items():
@@ -140,7 +149,7 @@ def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
 def partial_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
     """What files look like of which fewer SH layers are fetched: a header without its first cell, and the rows."""
     rows: list[tuple[str, ...]] = [
-        ("bytes", "of the file", "psnr", "worst", "ssim", "decode ms", "render ms"),
+        ("bytes", "of the file", "PSNR", "worst PSNR", "SSIM", "decode ms", "render ms"),
     ]
     rows += [_partial_row(point, one) for point in tradeoff.measured for one in point.partial]
     return rows

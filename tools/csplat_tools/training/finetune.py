@@ -37,6 +37,7 @@ __all__ = [
     "plan_tuning",
     "run_finetuning",
     "tune",
+    "usually_aside",
 ]
 
 I64 = NDArray[np.int64]
@@ -50,6 +51,21 @@ BYTE_COST = {False: 1e-4, True: 2e-5}
 SHAPE_ENTRIES = 4096
 #: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
+
+_RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
+_MOST_ASIDE = 16  # but no more than these
+
+
+def usually_aside(count: int, *, cameras: str | None, data: object | None) -> int | None:
+    """How many views decide which step was best: of photographs some that teach do, of few virtual views few.
+
+    Args:
+        count: virtual views that teach.
+        cameras, data: as for `find_view_set`.
+    """
+    if data is not None:
+        return 0
+    return min(_MOST_ASIDE, count // _RENDERS_ASIDE) if cameras is None else None
 
 
 @dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from csplat_tools.views.finding import DataOptions, comparison_cameras, find_view_set, with_deciders
 from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced
+from csplat_tools.views.showing import showing_cameras
 from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet
 
 __all__ = [
@@ -23,5 +24,6 @@ __all__ = [
     "evenly",
     "find_view_set",
     "reduced",
+    "showing_cameras",
     "with_deciders",
 ]

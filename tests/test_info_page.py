@@ -1,0 +1,180 @@
+"""`csplat info --page`: one page about one file, and what stands beside it; hardest places, and views worth showing."""
+
+import html
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+
+# Importing them needs what is looked for above.
+from captures import cameras, shell
+
+from csplat import EncodeOptions, encode, read_ply, write_ply
+from csplat_render.cloud import detail, sample_cloud
+from csplat_render.virtual import scene_frame
+from csplat_tools.cli.app import app
+from csplat_tools.inspect.info import describe_file
+from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.hardest import HardestPlace
+from csplat_tools.views import comparison_cameras, find_view_set, showing_cameras
+from csplat_tools.views.viewset import ViewSet
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["info", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A scene and a file made of it."""
+    folder = tmp_path_factory.mktemp("files")
+    scene = shell(8)
+    write_ply(folder / "scene.ply", scene)
+    (folder / "a & b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
+    return folder / "a & b.csplat", folder / "scene.ply"
+
+
+@pytest.fixture(scope="module")
+def page(files):
+    """The page of the file beside its source."""
+    path = files[0].with_name("page.html")
+    result = invoke(files[0], "--page", path, "--source", files[1])
+    assert 0 == result.exit_code, result.output
+    return path
+
+
+def test_the_page_says_what_the_text_says(files, page):
+    text = html.unescape(page.read_text())
+    facts = describe_file(files[0].read_bytes())
+    assert "<h1>a & b.csplat</h1>" in text
+    for name, one in facts.attributes.items():
+        assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
+    for record in facts.stated_errors.records:
+        assert re.search(
+            rf"{record.measure}</td><td[^>]*>[^<]+</td><td>{record.max:.4g}</td><td>{record.rms:.4g}<", text
+        )
+    for name in facts.layers:
+        assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td>", text)
+
+
+def test_the_page_shows_the_source_beside_the_file(files, page):
+    text = page.read_text()
+    assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
+    words = ["compare", str(files[1]), str(files[0])]
+    compared = CliRunner().invoke(app, words).stdout
+    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: how near", text)[1]
+
+
+def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
+    tab.page.set_viewport_size({"width": 400, "height": 700})
+    tab.page.goto(page.as_uri())
+    assert "a & b.csplat: what is in it" == tab.page.title()
+    assert 0 == tab.page.evaluate("[...document.images].filter((one) => !one.naturalWidth).length")
+    root = "document.documentElement"
+    assert tab.page.evaluate(f"{root}.scrollWidth <= {root}.clientWidth")
+    grounds = []
+    for scheme in ("light", "dark"):
+        tab.page.emulate_media(color_scheme=scheme)
+        grounds.append(tab.page.evaluate("getComputedStyle(document.body).backgroundColor"))
+    assert grounds[0] != grounds[1]
+
+
+def test_the_page_refers_to_nothing_outside(page):
+    text = page.read_text()
+    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
+    assert all(one.startswith("data:image/webp") for one in re.findall(r'(?:src|href)="([^"]*)"', text))
+    assert "default-src 'none'" in text
+
+
+def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
+    target = tmp_path / "page.html"
+    target.write_text("mine")
+    refused = invoke(files[0], "--page", target)
+    assert 1 == refused.exit_code
+    assert f"error: {target} exists: --force replaces it (E_INPUT)\n" == refused.stderr
+    assert "mine" == target.read_text()
+    assert 0 == invoke(files[0], "--page", target, "--force").exit_code
+    assert target.read_text().startswith("<!doctype html>")
+
+
+def test_a_file_without_splats_has_a_page(tmp_path, make_model):
+    (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
+    write_ply(tmp_path / "empty.ply", make_model(0))
+    done = invoke(tmp_path / "empty.csplat", "--page", tmp_path / "a.html", "--source", tmp_path / "empty.ply")
+    assert 0 == done.exit_code, done.output
+    assert "0 splats" in (tmp_path / "a.html").read_text()
+
+
+def test_a_source_without_a_page_is_a_wrong_command_line(files):
+    assert 2 == invoke(files[0], "--source", files[1]).exit_code
+    assert 2 == invoke(files[0], "--page", "-").exit_code
+
+
+def test_without_the_renderer_there_is_a_page_but_no_comparison(files, tmp_path):
+    code = "import sys; sys.modules['numba'] = sys.modules['PIL'] = None;"
+    code += "from csplat_tools.__main__ import main; main()"
+    words = [sys.executable, "-c", code, "info", str(files[0]), "--page", str(tmp_path / "a.html")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (0, "") == (done.returncode, done.stderr)
+    assert "How exact it says it is" in (tmp_path / "a.html").read_text()
+    again = [*words[:-1], str(tmp_path / "b.html"), "--source", str(files[1])]
+    done = subprocess.run(again, capture_output=True, text=True, check=False)
+    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n" == done.stderr
+    assert not (tmp_path / "b.html").exists()
+
+
+def test_bars_are_as_long_as_their_bytes():
+    text = draw_bars([Bar("a", {"means": 100, "sh0": 300}, "400"), Bar("b", {"means": 50}, "50")], key=True)
+    widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
+    assert 3 == len(widths)
+    np.testing.assert_allclose(np.array(widths) / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
+
+
+def test_the_hardest_place_is_where_the_error_is():
+    source = np.full((80, 120, 3), 0.5, np.float32)
+    slightly, badly = source.copy(), source.copy()
+    slightly[:, :] += 0.05
+    badly[31:39, 70:80] = 1.0
+    place = HardestPlace()
+    for number, seen in enumerate((source, badly, slightly)):
+        place.look(number, source, seen)
+    found = place.found()
+    assert 1 == found.view
+    assert (20, 30, 3) == found.source.shape == found.decoded.shape
+    assert 80 * 3 == np.count_nonzero(found.decoded == 255)
+    assert found.psnr == pytest.approx(10.0 * np.log10(600.0 / (80 * 0.25)), abs=0.01)
+    frame = np.argwhere((found.where == 255).all(axis=2))
+    (top, left), (bottom, right) = frame.min(axis=0), frame.max(axis=0)
+    assert top <= 32
+    assert left <= 71
+    assert bottom >= 37
+    assert right >= 78
+    assert HardestPlace().found() is None
+
+
+def test_views_that_are_shown_show_detail(sample_path):
+    source = read_ply(sample_path)
+    views = find_view_set(source, count=0)
+    shown = showing_cameras(source, views)
+    assert 2 <= len(shown) <= 6
+    cloud, nearest = sample_cloud(source, 20_000, np.random.default_rng(1)), 0.4 * scene_frame(source).extent
+    best = max(detail(cloud, camera, nearest) for camera in comparison_cameras(source))
+    assert all(detail(cloud, camera, nearest) > 0.6 * best for camera in shown)
+
+
+def test_views_of_a_user_are_shown_as_they_are():
+    own = cameras(3)
+    assert showing_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
+
+
+def test_equal_pictures_have_a_place_too():
+    place = HardestPlace()
+    place.look(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
+    assert 99.0 == place.found().psnr

@@ -1,0 +1,83 @@
+"""What a file holds, in words: for the text and for the page of `csplat info`."""
+
+from __future__ import annotations
+
+from csplat.training import TRAINING, TrainedOn
+from csplat.upright import UP, up_of
+from csplat_tools.files.console import format_bytes
+from csplat_tools.inspect.info import AttributeFacts, FileFacts
+
+__all__ = ["coding_words", "headline", "other_metadata", "scene_words"]
+
+
+def headline(facts: FileFacts) -> str:
+    """Format, size, bytes per splat."""
+    header, per_splat = facts.header, facts.bytes_per_splat
+    average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
+    version = f"csplat {header.version[0]}.{header.version[1]}"
+    return f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}"
+
+
+def scene_words(facts: FileFacts) -> dict[str, str]:
+    """The scene, by what is told."""
+    header = facts.header
+    flags = [name for name in ("antialiased", "flat") if getattr(header, name)]
+    up = up_of(facts.metadata or {}, header.coordinate_system)
+    words = {
+        "splats": f"{header.splat_count:,}, SH degree {header.sh_degree}",
+        "axes": str(header.coordinate_system),
+        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
+        "unit": "unknown" if header.unit_metres is None else f"{header.unit_metres:g} m",
+        "origin": " ".join(f"{value:.17g}" for value in header.origin),
+        "flags": ", ".join(flags) or "none",
+        "tiles": _tiles(facts),
+    }
+    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
+    if extras:
+        words["extra"] = extras
+    if facts.cameras is not None:
+        words["cameras"] = str(facts.cameras)
+    trained = TrainedOn.of(facts.metadata or {})
+    if trained is not None:
+        words["trained on"] = str(trained)
+    return words
+
+
+def other_metadata(facts: FileFacts) -> dict[str, object]:
+    """The metadata that `scene_words` does not tell."""
+    metadata = dict(facts.metadata or {})
+    if TrainedOn.of(metadata) is not None:
+        del metadata[TRAINING]
+    if up_of(metadata) is not None:
+        del metadata[UP]
+    return metadata
+
+
+def coding_words(attribute: AttributeFacts) -> str:
+    """How an attribute is coded."""
+    words = ["+".join(attribute.codings)]
+    if attribute.step is not None:
+        words.append(f"step {attribute.step:.4g}")
+    if attribute.levels:
+        words.append(f"{attribute.levels} levels")
+    if attribute.mapping not in (None, "lattice", "unit_w"):
+        words.append(str(attribute.mapping))
+    if attribute.chroma_shift:
+        words.append(f"chroma / {2**attribute.chroma_shift}")
+    if attribute.codebook_bytes:
+        words.append(f"codebook {format_bytes(attribute.codebook_bytes)}")
+    if attribute.escaped_splats:
+        words.append(f"{attribute.escaped_splats} escaped")
+    words.append("+".join(attribute.coders))
+    return ", ".join(word for word in words if word)
+
+
+def _tiles(facts: FileFacts) -> str:
+    words = {
+        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in facts.spans.items()
+    }
+    if not words:
+        return "0"
+    count = len(facts.header.tiles)
+    bits = f"{words['bits_per_axis']} bits per axis, exponents {words['exponents']}"
+    return f"{count} of {words['splats']} splats, {bits}"

@@ -1,0 +1,124 @@
+"""The command that makes a file of the sweep again, for readers to paste into a shell.
+
+Targets, removal and tuning depend on views, so that their commands name them as the sweep was told.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import PurePath
+from typing import Any
+
+from csplat_tools.files.streams import STANDARD_STREAM
+from csplat_tools.study import Reduction
+from csplat_tools.tradeoffs.options import Wanted
+from csplat_tools.tradeoffs.setting import Setting
+
+__all__ = ["encode_command", "file_name", "finetune_command", "reduction_command", "target_command"]
+
+_REDUCED = "from pathlib import Path; from csplat import EncodeOptions, read_ply; from csplat_tools.study import"
+
+
+def file_name(setting: Setting, name: str) -> str:
+    """What the file of a point is called: `scene-target-40-dB.csplat`."""
+    stem = "scene" if setting.path == STANDARD_STREAM else PurePath(setting.path).stem
+    return f"{stem}-{re.sub(r'[^A-Za-z0-9.]+', '-', name)}.csplat"
+
+
+def encode_command(setting: Setting, name: str, preset: str, **options: Any) -> str:
+    """A file of `csplat encode` that takes no views.
+
+    Args:
+        setting: the scene.
+        name: of the point.
+        preset: of the encoder.
+        options: others, as `sh_degree`, and their values.
+    """
+    return _line("encode", setting, name, "--preset", preset, *_options(options))
+
+
+def target_command(setting: Setting, name: str, preset: str, **options: Any) -> str:
+    """A file of `csplat encode` that views decide on; see `encode_command`."""
+    return _line("encode", setting, name, *_options(options), "--preset", preset, *_views(setting))
+
+
+def finetune_command(setting: Setting, name: str, wanted: Wanted, keep: float | None) -> str:
+    """A file of `csplat finetune`."""
+    options = {"keep": keep, "iterations": None if wanted.iterations == Wanted.iterations else wanted.iterations}
+    itself = () if setting.views.photographs else ("--self",)
+    return _line("finetune", setting, name, *itself, *_options(options), "--preset", wanted.preset, *_views(setting))
+
+
+def reduction_command(setting: Setting, name: str, preset: str, reduction: Reduction) -> str:
+    """A file of `csplat_tools.study`, which is no command but a library: a line of Python."""
+    names, before, others, views = ["Reduction", "encode_reduced"], "", [], ""
+    if reduction.prune_opacity is not None:
+        others.append(f"prune_opacity={reduction.prune_opacity!r}")
+    if reduction.sh_degree is not None:
+        others.append(f"sh_degree={reduction.sh_degree}")
+    if reduction.kmeans is not None:
+        names.append("parse_kmeans")
+        sizes = ",".join(f"{attribute}={size:g}" for attribute, size in reduction.kmeans.sizes.items())
+        one = set(reduction.kmeans.sizes.values())
+        others.append(f"kmeans=parse_kmeans({_text(f'{one.pop():g}' if len(one) == 1 else sizes)})")
+    if reduction.distil:
+        others.append("distil=True")
+        before = "from csplat_tools.views import DataOptions, find_view_set; "
+        views = f", views=find_view_set(scene{_arguments(setting)})"
+    source = "/dev/stdin" if setting.path == STANDARD_STREAM else setting.path
+    program = (
+        f"{_REDUCED} {', '.join(names)}; {before}scene = read_ply({_text(source)}); "
+        f"made = encode_reduced(scene, Reduction({', '.join(others)}), EncodeOptions(preset={_text(preset)}){views}); "
+        f"Path({_text(file_name(setting, name))}).write_bytes(made.data)"
+    )
+    return f"python -c {shlex.quote(program)}"
+
+
+def _line(command: str, setting: Setting, name: str, *words: str) -> str:
+    return shlex.join(["csplat", command, setting.path, file_name(setting, name), *words])
+
+
+def _options(values: dict[str, Any]) -> list[str]:
+    given = {name: value for name, value in values.items() if value is not None}
+    return [word for name, value in given.items() for word in (f"--{name.replace('_', '-')}", _number(value))]
+
+
+def _number(value: Any) -> str:
+    """As people write it, where that is exact."""
+    short = str(value) if isinstance(value, int) else f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def _views(setting: Setting) -> list[str]:
+    """The options of `view_options.Views`."""
+    words, data = list[str](), setting.data
+    if setting.cameras is not None:
+        words += ["--cameras", setting.cameras]
+    if data is not None:
+        words += ["--data", data.path]
+        words += ["--size", f"{data.size[0]}x{data.size[1]}"] if data.size else []
+        words += ["--images", data.images] if data.images else []
+        words += ["--test-every", str(data.test_every)] if data.test_every else []
+    if setting.background is not None:
+        words += ["--background", ",".join(repr(one) for one in setting.background)]
+    return words
+
+
+def _arguments(setting: Setting) -> str:
+    """The same as arguments of `find_view_set`."""
+    words, data = list[str](), setting.data
+    if setting.cameras is not None:
+        words.append(f"cameras={_text(setting.cameras)}")
+    if data is not None:
+        images = None if data.images is None else _text(data.images)
+        words.append(f"data=DataOptions({_text(data.path)}, {data.size}, {images}, {data.test_every})")
+    if setting.background is not None:
+        words.append(f"background={setting.background}")
+    return "".join(f", {word}" for word in words)
+
+
+def _text(value: str) -> str:
+    """A string of Python, in quotation marks that a shell leaves alone."""
+    return json.dumps(value, ensure_ascii=False)
