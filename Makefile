@@ -9,7 +9,7 @@ BENCH := $(BIN)/python -m csplat_bench
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format spec sample bench fuzz clean
+.PHONY: help demo test lint format spec sample docs bench fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
@@ -41,6 +41,10 @@ spec: $(VENV)/.dev ## write constants and tables from the registry
 
 sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, train; some minutes
 	$(BIN)/python tools/sample/make_sample.py
+
+docs: $(VENV)/.dev ## the documentation, as a site in out/site
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[docs]'
+	$(BIN)/python tools/docs/make_site.py
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).codec

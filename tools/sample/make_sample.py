@@ -9,6 +9,7 @@ Some minutes on two cores; wants the packages of the render extra.
 
 Usage:
     python tools/sample/make_sample.py [OUT.ply] [--keep FOLDER]
+    python tools/sample/make_sample.py --photographs FOLDER [--views 48] [--size 200]     # the pictures alone
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import json
 import math
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -178,12 +180,20 @@ def camera_to_world(camera: Camera) -> F64:
     return pose
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Read the command line, make the sample."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", nargs="?", type=Path, default=SAMPLE, metavar="OUT.ply")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the pictures there")
-    arguments = parser.parse_args()
+    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="write pictures there and train nothing")
+    parser.add_argument("--views", type=int, default=48, metavar="N", help="of --photographs; a sixth more is held out")
+    parser.add_argument("--size", type=int, default=200, metavar="PIXELS", help="of --photographs: width and height")
+    arguments = parser.parse_args(words)
+    if arguments.photographs is not None:
+        arguments.photographs.mkdir(parents=True, exist_ok=True)
+        held_out = -(-arguments.views // 6)
+        photograph_all(arguments.photographs, Recipe(arguments.views, held_out, arguments.size))
+        return
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)

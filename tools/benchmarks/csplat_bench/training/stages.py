@@ -61,7 +61,7 @@ def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: 
         return Parameters.starting_at(starting_splats(pictures, scene, splats, _DEGREE, rng))
 
     with thread_count(threads):
-        # Engines stay, as when FIGURES.md was measured: what one gives back the next one would take, unseen. The second
+        # Engines stay, as for trainer/FIGURES.md: what one gives back the next one would take, unseen. The second
         # one counts twice by that: training by itself takes about half as much.
         compiled = _walk(pictures[:1], options, start(_WARM_SPLATS), 2)
         before = reset_peak()

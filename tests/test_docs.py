@@ -1,0 +1,151 @@
+"""README and documentation: links lead somewhere, figures are those that were measured, what is shown runs."""
+
+import itertools
+import json
+import re
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+from csplat_tools.cli.app import app
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "tools" / "docs"
+README = (ROOT / "README.md").read_text("utf-8")
+MEASURED = json.loads((DOCS / "measured.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def site():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(DOCS)
+        import make_site
+
+        yield make_site
+
+
+def blocks(text, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def test_every_link_of_a_page_leads_to_a_file(site):
+    for path in site.pages().values():
+        text = (ROOT / path).read_text("utf-8")
+        for match in site.links(text):
+            if "://" not in match[3]:
+                site.target_of(path, match[3])
+
+
+def test_every_place_that_a_link_names_is_a_heading(site):
+    for path in site.pages().values():
+        for match in site.links((ROOT / path).read_text("utf-8")):
+            if "#" in match[3] and "://" not in match[3]:
+                target, place = site.target_of(path, match[3])
+                headings = re.findall(r"^#+ (.+)$", (ROOT / target).read_text("utf-8"), re.MULTILINE)
+                assert place in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+
+
+def test_a_link_that_leads_nowhere_is_refused(site):
+    with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
+        site.rewritten("see [this](nowhere.md)", "README.md")
+
+
+def test_links_between_files_become_links_between_pages(site):
+    text = "[a](../spec/format.md#1-scope), [b](js/decoder.d.ts), `[c](x.md)`, [d](https://example.org)"
+    expected = "[a](format.md#1-scope), b, `[c](x.md)`, [d](https://example.org)"
+    assert expected == site.rewritten(text, "codec/EMBEDDING.md")
+
+
+def test_the_navigation_names_every_page(site):
+    named = re.findall(r": ([\w-]+\.md)$", (DOCS / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
+    assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)
+
+
+def test_the_readme_is_short_and_its_pictures_are_small():
+    assert len(README.splitlines()) <= 130
+    assert sum(path.stat().st_size for path in (DOCS / "pictures").iterdir()) < 300_000
+
+
+def test_the_readme_states_what_was_measured(sample_path):
+    assert MEASURED["source"]["bytes"] == sample_path.stat().st_size
+    for name, one in MEASURED["presets"].items():
+        assert f"| `{name}` | {one['bytes']:,} | {one['psnr']:.1f} | {one['seconds']:.1f} |" in README
+    shown = MEASURED["presets"]["balanced"]
+    assert f"`csplat encode`: {shown['bytes'] / 1000:.0f} kB, {shown['psnr']:.1f} dB" in README
+
+
+def test_the_encoder_still_writes_files_of_the_sizes_that_the_readme_states(sample_path):
+    model = csplat.read_ply(sample_path)
+    for name in ("fast", "small"):
+        size = len(csplat.encode(model, csplat.EncodeOptions(preset=name)))
+        assert size == pytest.approx(MEASURED["presets"][name]["bytes"], rel=0.02)
+
+
+def test_all_files_that_name_the_version_name_the_same():
+    assert csplat.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    assert csplat.__version__ == json.loads((ROOT / "codec" / "js" / "package.json").read_text("utf-8"))["version"]
+    assert f"\nversion: {csplat.__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+
+
+def test_the_commands_of_readme_and_guides_are_ones_that_csplat_knows():
+    """Their words are parsed, nothing is run: options that are gone are found."""
+    from typer.main import get_command
+
+    group = get_command(app)
+    texts = [README, *(path.read_text("utf-8") for path in sorted((DOCS / "guide").glob("*.md")))]
+    lines = [line for text in texts for block in blocks(text, "sh") for line in block.splitlines()]
+    commands = [line.split("||")[0].strip() for line in lines if line.strip().startswith("csplat ")]
+    assert len(commands) > 20
+    for line in commands:
+        name, *words = shlex.split(line, comments=True)[1:]
+        command = group.get_command(None, name)
+        command.make_context(name, words, resilient_parsing=False)
+
+
+def test_the_python_of_readme_and_batch_runs(sample_path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "encoded").mkdir()
+    model = csplat.read_ply(sample_path)
+    for name in ("scene.ply", "scenes/one.ply"):
+        csplat.write_ply(tmp_path / name, model.select(range(200)))
+    (tmp_path / "scenes" / "two.ply").write_bytes(b"not a PLY")
+    names = {}
+    exec(blocks(README, "python")[0], names)  # noqa: S102  # the README's own lines
+    assert 200 == len(names["again"])
+    exec(blocks((DOCS / "guide" / "batch.md").read_text("utf-8"), "python")[0], {})  # noqa: S102  # likewise
+    one, two = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"scenes/one\.ply: \d+\.\d% of its size", one)
+    assert two.startswith("scenes/two.ply: ")
+    assert ["one.csplat"] == [path.name for path in (tmp_path / "encoded").iterdir()]
+
+
+def test_the_commands_of_the_tutorial_run_one_after_the_other(tmp_path, monkeypatch):
+    """As they stand there, but for fewer, smaller pictures and fewer steps."""
+    pytest.importorskip("numba", reason="it trains: pip install 'csplat[render]'")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "tools" / "sample")
+    text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")
+    lines = list(itertools.chain.from_iterable(block.splitlines() for block in blocks(text, "sh")))
+    first, *others = [shlex.split(line) for line in lines]
+    assert ["python", "tools/sample/make_sample.py"] == first[:2]
+    import make_sample
+
+    make_sample.main(smaller(first[2:], {"--views": "3", "--size": "16"}))
+    for line in others:
+        words = smaller(line, {"--iterations": "6", "--max-splats": "50"})
+        result = CliRunner().invoke(app, [*words[1:], "--quiet"])
+        assert 0 == result.exit_code, (words, result.output, result.exception)
+    assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "back.ply"} == {
+        path.name for path in tmp_path.iterdir()
+    }
+    sys.modules.pop("make_sample")
+
+
+def smaller(words, numbers):
+    return [numbers.get(before, word) for before, word in zip(["", *words], words, strict=False)]

@@ -1,0 +1,189 @@
+"""Build the documentation site: collect its pages from all over the repository, then have them laid out.
+
+Nothing is written twice: a page is a file of the repository, which stays where it lies, or made by a program. What is
+collected is plain Markdown, whose links lead from page to page; any generator that knows mkdocstrings can take it.
+
+Usage:
+    python tools/docs/make_site.py            # into out/site; the pages as collected: out/docs
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDE = "tools/docs/guide"
+CONFIGURATION = ROOT / "tools" / "docs" / "mkdocs.yml"
+COLLECTED = ROOT / "out" / "docs"  # as the configuration says
+
+#: Pages that are files of the repository.
+SOURCES = {
+    "index.md": "README.md",
+    "study.md": "tools/STUDY.md",
+    "embedding.md": "codec/EMBEDDING.md",
+    "implementers.md": "conformance/IMPLEMENTERS.md",
+    "javascript.md": "codec/js/README.md",
+    "format.md": "spec/format.md",
+    "conformance.md": "conformance/README.md",
+    "codec-figures.md": "codec/FIGURES.md",
+    "trainer-figures.md": "trainer/FIGURES.md",
+    "compression.md": "tools/COMPRESSION.md",
+    "extremes.md": "codec/EXTREMES.md",
+    "architecture.md": "ARCHITECTURE.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "changelog.md": "CHANGELOG.md",
+}
+#: Packages whose `__all__` is the Python interface.
+PACKAGES = ("csplat", "csplat_tools", "csplat_render")
+_DOCSTRING_ALONE = "{members: false, show_root_heading: false, show_root_toc_entry: false}"
+_PICTURES = {".svg", ".png", ".webp"}
+_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+_FENCE = re.compile(r"^\s*(`{3,}|~{3,})")
+_ITEM = re.compile(r"^(?:[-*]|\d+\.) ")
+_COLUMNS = "80"
+
+
+def pages() -> dict[str, str]:
+    """All pages that are files, with the path of each in the repository."""
+    own = {path.name: f"{GUIDE}/{path.name}" for path in sorted((ROOT / GUIDE).glob("*.md"))}
+    return own | SOURCES
+
+
+def links(text: str) -> Iterator[re.Match[str]]:
+    """The links and pictures of a Markdown text, but for those inside code."""
+    code = [match.span() for match in re.finditer(r"(?ms)^(`{3,}).*?^\1|`[^`\n]+`", text)]
+    for match in _LINK.finditer(text):
+        target = match.start(3)
+        if not any(start <= target < end for start, end in code):
+            yield match
+
+
+def target_of(source: str, link: str) -> tuple[str, str]:
+    """What a link of a file of the repository leads to: a path in it, and a place there.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    path, _, place = link.partition("#")
+    found = posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source
+    if not (ROOT / found).exists():
+        raise FileNotFoundError(f"{source}: {link} leads nowhere")
+    return found, place
+
+
+def rewritten(text: str, source: str, on_picture: Callable[[str], object] | None = None) -> str:
+    """A text with its links as the site has them.
+
+    Links to files that are no pages become plain text: the site has no address of the repository to offer.
+
+    Args:
+        text: Markdown.
+        source: its path in the repository.
+        on_picture: is told the path of each picture in the repository.
+    """
+    page_of = {path: page for page, path in pages().items()}
+
+    def one(match: re.Match[str]) -> str:
+        mark, words, link = match.groups()
+        if "://" in link or link.startswith("mailto:"):
+            return match[0]
+        path, place = target_of(source, link)
+        if Path(path).suffix in _PICTURES:
+            if on_picture is not None:
+                on_picture(path)
+            return f"{mark}[{words}](pictures/{Path(path).name})"
+        if path in page_of:
+            return f"{mark}[{words}]({page_of[path]}{'#' * bool(place)}{place})"
+        return words if "`" in words or path != link.rstrip("/") else f"`{words}`"
+
+    parts, last = [], 0
+    for match in links(text):
+        parts += [text[last : match.start()], one(match)]
+        last = match.end()
+    return "".join([*parts, text[last:]])
+
+
+def collect(folder: Path) -> None:
+    """Write all pages, their pictures and styles into a folder, which is emptied before."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "pictures").mkdir(parents=True)
+    pictures: set[str] = set()
+    for page, source in pages().items():
+        text = rewritten((ROOT / source).read_text("utf-8"), source, pictures.add)
+        (folder / page).write_text(with_room_for_lists(text), "utf-8")
+    for path in pictures:
+        shutil.copy(ROOT / path, folder / "pictures")
+    (folder / "commands.md").write_text(commands(), "utf-8")
+    (folder / "python.md").write_text(python(), "utf-8")
+    shutil.copy(CONFIGURATION.with_name("site.css"), folder)
+
+
+def commands() -> str:
+    """The reference of the command line, as the commands print it themselves."""
+    from typer.main import get_command
+
+    from csplat_tools.cli.app import app  # the commands, in their order
+
+    group: Any = get_command(app)
+    parts = ["# Commands\n\nEach as `--help-all` prints it: every option, setting and example.\n"]
+    parts += [f"## csplat {name}\n\n```text\n{_help(name)}\n```\n" for name in group.list_commands(None)]
+    return "\n".join(parts)
+
+
+def python() -> str:
+    """The reference of the Python interface: directives for mkdocstrings, which reads the docstrings."""
+    parts = ["# Python\n"]
+    for package in PACKAGES:
+        names = [name for name in import_module(package).__all__ if name.isidentifier() and not name.isupper()]
+        parts += [f"## {package}\n\n::: {package}\n    options: {_DOCSTRING_ALONE}\n"]
+        parts += [f"::: {package}.{name}\n" for name in names if not name.startswith("_")]
+    return "\n".join(parts)
+
+
+def _help(name: str) -> str:
+    words = [sys.executable, "-m", "csplat_tools", name, "--help-all"]
+    found = subprocess.run(words, capture_output=True, text=True, env=_environment(), check=False)
+    if found.returncode:  # a group of commands has none
+        words[-1] = "--help"
+        found = subprocess.run(words, capture_output=True, text=True, env=_environment(), check=True)
+    lines = [line.rstrip() for line in found.stdout.splitlines()]
+    return "\n".join(lines).strip("\n")
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "COLUMNS": _COLUMNS, "NO_COLOR": "1", "TERM": "dumb", "PYTHONIOENCODING": "utf-8"}
+
+
+def with_room_for_lists(text: str) -> str:
+    """Put an empty line before each list: Python-Markdown wants one, GitHub does not."""
+    lines: list[str] = []
+    fence = ""
+    for line in text.split("\n"):
+        mark = _FENCE.match(line)
+        if mark and (not fence or line.strip() == fence):
+            fence = "" if fence else mark[1]
+        before = lines[-1] if lines else ""
+        if not fence and _ITEM.match(line) and before.strip() and not _ITEM.match(before) and before[0] not in " |":
+            lines.append("")
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Collect the pages, run the generator; a warning of its is an error."""
+    collect(COLLECTED)
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-f", str(CONFIGURATION)]
+    return subprocess.run(words, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
