@@ -45,7 +45,7 @@ def render(
 
     Example:
         >>> import csplat, csplat_render
-        >>> from csplat_render.virtual import orbit_cameras
+        >>> from csplat_render.paths import orbit_cameras
         >>> model = csplat.read_ply("scene.ply")
         >>> camera = orbit_cameras(model, 1, 64, 48)[0]
         >>> csplat_render.render(model, camera, mode="exact").rgb.shape
