@@ -91,6 +91,14 @@ def test_the_page_is_forbidden_the_network(tab, site, make_model):
     tab.problems.clear()
 
 
+def test_no_charset_can_spoil_the_page(sample):
+    exported = export_page(sample, "Gärtchen 🌷.csplat")
+    assert exported.page.isascii()
+    text = exported.page.decode()
+    assert "<title>G&#228;rtchen &#127799;.csplat &#8211; csplat viewer</title>" in text
+    assert '"name":"G\\u00e4rtchen \\ud83c\\udf37.csplat"' in text
+
+
 def test_parts_of_the_page_are_what_the_report_says(sample):
     exported = export_page(sample, "scene.csplat")
     assert len(exported.page) == exported.code_bytes + exported.scene_bytes
@@ -115,7 +123,7 @@ def test_cameras_and_axes_go_into_the_page(tab, tmp_path, make_model):
 
 
 def test_names_with_markup_stay_text(tab, make_model, tmp_path):
-    name = "</script><script>alert(1)</script>&.csplat"
+    name = "</script><script>alert('é')</script>&.csplat"
     (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), name).page)
     tab.page.goto((tmp_path / "page.html").as_uri())
     tab.until("'csplatViewer' in window")

@@ -3,7 +3,8 @@
 A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
 all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
 `import`, and Chromium to a worker that is a module. So the modules become functions of one classic script. The page
-runs it, and so does the worker, made from a blob of the same text. A policy in the page forbids it the network.
+runs it, and so does the worker, made from a blob of the same text. A policy in the page forbids it the network. All of
+it is ASCII: a server that names another charset would change what the policy has digests of.
 """
 
 from __future__ import annotations
@@ -97,8 +98,11 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     order = list(modules)
     boot = _BOOT.replace("WORKER", str(order.index(WORKER))).replace("MAIN", str(order.index(main)))
     script = f"'use strict';\n{{\nconst modules = [\n{''.join(modules.values())}];\n{boot}}}\n"
-    assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script can stand in an element"
+    script = script.encode("ascii", "backslashreplace").decode()  # \x… and \u… mean the same in JavaScript
     style = f"\n{texts[f'{folder}/viewer.css']}"
+    assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script can stand in an element"
+    assert "\\U000" not in script, "JavaScript spells characters beyond U+FFFF otherwise"
+    assert style.isascii(), "characters of a style have no other spelling that a page may use"
     coded = base64.b64encode(scene).decode()
     described = _json({"name": name, "wishes": dict(wishes or {})})
     body = (
@@ -113,7 +117,7 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     page = _replaced(page, "</body>", f"{body}</body>")
     page, found = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
     assert found == 1, "the page has one policy"
-    data = page.encode()
+    data = page.encode("ascii", "xmlcharrefreplace")
     return Exported(data, len(data) - len(coded), len(coded))
 
 
@@ -167,7 +171,7 @@ def _as_function(path: str, text: str) -> str:
 
 def _json(value: object) -> str:
     """JSON that can stand in a script element: nothing in it looks like markup."""
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _policy(style: str, script: str) -> str:
