@@ -21,7 +21,7 @@ from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import TrainResult
 from csplat_trainer.pictures import Picture
-from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, finetune, renders_of, split_views
+from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, renders_of, split_views, tune
 
 COPIES = 2_000  # of a million: learning looks at each splat again and again, and all are alike
 SMALL = (160, 120)
@@ -78,7 +78,7 @@ def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
     aside = Judge(
         [view.camera for view in views.validation], [Look(view.wanted.astype(np.float32)) for view in views.validation]
     )
-    return frozen, finetune(frozen, views, SHORT), aside
+    return frozen, tune(frozen, views, SHORT), aside
 
 
 def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:

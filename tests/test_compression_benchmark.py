@@ -25,7 +25,7 @@ from csplat_bench.compression.controls import Unquantised, eight_bits
 from csplat_bench.compression.memory import finetuned
 from csplat_bench.compression.sizes import Book, books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 from csplat_bench.compression.tables import tables
-from csplat_trainer.tuning import FinetuneOptions, finetune, renders_of, split_views
+from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 
 BLACK = np.zeros(3, np.float32)
 BOOKS = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
@@ -98,7 +98,7 @@ def test_the_control_learns(source):
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
     frozen = Unquantised.freeing(Draft.of(off, EncodeOptions(preset="fast", sh_coding="scalar")).frozen())
     options = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, byte_cost=0.0)
-    log = finetune(frozen, split_views(wanted, BLACK, aside=2), options).log
+    log = tune(frozen, split_views(wanted, BLACK, aside=2), options).log
     assert log["best_psnr"] > log["start_psnr"] + 3.0
 
 

@@ -41,7 +41,7 @@ from csplat_trainer.parameters import Parameters, from_model
 from csplat_trainer.resume import adapt
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-from csplat_trainer.tuning import finetune, renders_of, split_views
+from csplat_trainer.tuning import renders_of, split_views, tune
 
 pytestmark = pytest.mark.extremes
 
@@ -203,7 +203,7 @@ def test_splats_wider_than_float32_are_tuned():
     source = replace(source, scales=np.full_like(source.scales, 100.0))
     views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, aside=2)
     frozen = Draft.of(source, COARSE).frozen()
-    result = finetune(frozen, views, replace(SHORT, iterations=20))
+    result = tune(frozen, views, replace(SHORT, iterations=20))
     assert_finite(decode(frozen.coded(result.held).write().data))
 
 

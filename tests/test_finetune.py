@@ -16,6 +16,8 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 # Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
 
+import csplat
+import csplat_trainer
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import read_options, read_stated_errors
 from csplat.encoder import Draft
@@ -27,7 +29,7 @@ from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.loss import PhotometricLoss
-from csplat_trainer.tuning import FinetuneOptions, View, Views, finetune, renders_of, split_views
+from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
 from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
 
@@ -51,6 +53,28 @@ def psnr(model, views):
     return -10.0 * math.log10(float(np.mean(error)))
 
 
+# from a program
+
+
+def test_a_program_hands_over_a_model_and_views_and_is_told_of_every_step(source, views):
+    steps, stages = [], []
+    found = csplat_trainer.finetune(
+        source, views, COARSE, QUICK, on_step=steps.append, progress=lambda stage, done: stages.append((stage, done))
+    )
+    assert len(found.data) < len(csplat.encode(source))
+    assert psnr(found.decoded, views.validation) > psnr(decode(found.plain.data), views.validation)
+    assert np.array_equal(decode(found.data).sh0, found.decoded.sh0)
+    assert list(range(10, 61, 10)) == [one.iteration for one in steps]
+    assert {"measuring sensitivity", "tuning"} <= {stage for stage, _ in stages}
+    assert ("tuning", 1.0) == stages[-1]
+
+
+def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(capture):
+    model, data = csplat.read_ply(capture / "scene.ply"), csplat_trainer.load(capture)
+    found = csplat_trainer.finetune(model, data, COARSE, replace(QUICK, iterations=2))
+    assert (len(data.train), 2) == (found.log["train_views"], found.log["steps"])
+
+
 # learning
 
 
@@ -67,7 +91,7 @@ def psnr(model, views):
 def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
     frozen = Draft.of(source, encoding).frozen()
     before = frozen.coded(frozen.start()).write().data
-    tuned = finetune(frozen, views, replace(QUICK, iterations=300))
+    tuned = tune(frozen, views, replace(QUICK, iterations=300))
     after = frozen.coded(tuned.held).write().data
     assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 1.0
     assert len(after) < 1.1 * len(before)
@@ -75,7 +99,7 @@ def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(sou
 
 def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
     frozen = Draft.of(source, COARSE).frozen()
-    tuned = finetune(frozen, views, QUICK)
+    tuned = tune(frozen, views, QUICK)
     decoded = decode(frozen.coded(tuned.held).write().data)
     rasteriser, error = Rasteriser(), []
     rows = np.argsort(frozen.source_index)
@@ -94,14 +118,14 @@ def test_costly_bytes_make_small_files(source, views):
     sizes = []
     for cost in (0.0, 1e-3, 1e-2):
         frozen = Draft.of(source, EncodeOptions(sh_coding="scalar")).frozen()
-        tuned = finetune(frozen, views, replace(QUICK, iterations=150, byte_cost=cost))
+        tuned = tune(frozen, views, replace(QUICK, iterations=150, byte_cost=cost))
         sizes.append(len(frozen.coded(tuned.held).write().data))
     assert sizes[0] > sizes[1] > sizes[2]
 
 
 def test_what_does_not_get_better_stays_as_it_was(source, views):
     frozen = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
-    tuned = finetune(frozen, views, replace(QUICK.scaled(5.0), byte_cost=0.0))
+    tuned = tune(frozen, views, replace(QUICK.scaled(5.0), byte_cost=0.0))
     assert 0 == tuned.log["best_iteration"]
     start = frozen.start()
     assert np.array_equal(start.sh, tuned.held.sh)
@@ -110,10 +134,10 @@ def test_what_does_not_get_better_stays_as_it_was(source, views):
 def test_a_run_that_gains_nothing_ends_early(source, views):
     frozen = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
     options = replace(QUICK, iterations=300, patience=2, byte_cost=0.0).scaled(5.0)
-    log = finetune(frozen, views, options).log
+    log = tune(frozen, views, options).log
     assert log["settled"]
     assert 2 / 3 * 300 < log["steps"] < 300  # not before values have calmed down
-    assert not finetune(frozen, views, replace(options, patience=0)).log["settled"]
+    assert not tune(frozen, views, replace(options, patience=0)).log["settled"]
 
 
 # gradients
@@ -256,7 +280,7 @@ def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, vie
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
         frozen = Draft.of(source, COARSE).frozen()
-        tuned = finetune(frozen, views, replace(QUICK, seed=seed, iterations=40), threads=threads)
+        tuned = tune(frozen, views, replace(QUICK, seed=seed, iterations=40), threads=threads)
         files.append(frozen.coded(tuned.held).write().data)
     assert files[0] == files[1]
     assert files[0] != files[2]
@@ -273,9 +297,9 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
         if now.iteration == 40:
             middle.append(file.read_bytes())  # the one of step 30
 
-    whole = finetune(frozen, views, QUICK, progress=keep, checkpoint=file, checkpoint_every=15)
+    whole = tune(frozen, views, QUICK, progress=keep, checkpoint=file, checkpoint_every=15)
     file.write_bytes(middle[0])
-    rest = finetune(frozen, views, QUICK, resume=file)
+    rest = tune(frozen, views, QUICK, resume=file)
     assert frozen.coded(whole.held).write().data == frozen.coded(rest.held).write().data
     assert whole.log["losses"] == rest.log["losses"]
     assert whole.log["looks"] == rest.log["looks"]
@@ -283,21 +307,21 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
 
 def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
     frozen, file = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz"
-    finetune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
+    tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
     with pytest.raises(InputError, match="another byte_cost"):
-        finetune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
+        tune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
     with pytest.raises(InputError, match="other views"):
-        finetune(frozen, replace(views, train=views.train[1:]), QUICK, resume=file)
+        tune(frozen, replace(views, train=views.train[1:]), QUICK, resume=file)
     with pytest.raises(InputError, match="other views"):
-        finetune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
+        tune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
     file = tmp_path / "c.npz"
-    finetune(Draft.of(source, COARSE).frozen(), views, replace(QUICK, iterations=5), checkpoint=file)
+    tune(Draft.of(source, COARSE).frozen(), views, replace(QUICK, iterations=5), checkpoint=file)
     other = Draft.of(source, replace(COARSE, attribute_psnr=29.0)).frozen()
     with pytest.raises(InputError, match="another scene"):
-        finetune(other, views, QUICK, resume=file)
+        tune(other, views, QUICK, resume=file)
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
     np.save(tmp_path / "n.npy", np.zeros(3))
     data, entry = file.read_bytes(), file.read_bytes().index(b"PK\x01\x02")
@@ -307,7 +331,7 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_pat
     for content in (*wrong, (tmp_path / "n.npz").read_bytes(), (tmp_path / "n.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(InputError, match="not a checkpoint") as caught:
-            finetune(Draft.of(source, COARSE).frozen(), views, QUICK, resume=tmp_path / "bad.npz")
+            tune(Draft.of(source, COARSE).frozen(), views, QUICK, resume=tmp_path / "bad.npz")
         assert "pickle" not in str(caught.value)
 
 
@@ -321,7 +345,7 @@ def test_values_that_are_not_finite_end_a_run(source, views, monkeypatch):
 
     monkeypatch.setattr(TunedScene, "step", spoilt)
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="a value is not finite at step 20"):
-        finetune(Draft.of(source, COARSE).frozen(), views, QUICK)
+        tune(Draft.of(source, COARSE).frozen(), views, QUICK)
 
 
 # options and views
@@ -427,7 +451,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
         model = decode(data)
         return replace(model, sh0=model.sh0 + np.float32(1e-6))
 
-    monkeypatch.setattr("csplat_tools.training.finetune.decode", wrong)
+    monkeypatch.setattr("csplat_trainer.tuning.finetuning.decode", wrong)
     out = tmp_path / "s.csplat"
     result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1)
     assert "holds other sh0 than were tuned" in str(result.exception)
@@ -622,7 +646,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     white = np.ones(3, np.float32)
     views = split_views([View(picture.camera, picture) for picture in data.train], white)
     frozen = Draft.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)).frozen()
-    tuned = finetune(frozen, views, FinetuneOptions(iterations=400))
+    tuned = tune(frozen, views, FinetuneOptions(iterations=400))
     judges = [View(one.camera, one) for one in data.test[::10]]
 
     def score(scene):

@@ -39,7 +39,7 @@ from csplat_tools.tradeoffs.options import USUAL, Wanted, parse_what
 from csplat_tools.tradeoffs.page import make_page, shown_points
 from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
 from csplat_tools.tradeoffs.points import Failure, pareto_front
-from csplat_tools.tradeoffs.running import measure_tradeoff
+from csplat_tools.tradeoffs.running import tradeoff
 from csplat_tools.tradeoffs.setting import read_setting
 from csplat_tools.tradeoffs.tables import format_tradeoff
 from csplat_tools.views import DataOptions
@@ -84,7 +84,7 @@ def setting(capture):
 
 @pytest.fixture(scope="module")
 def measured(setting):
-    return measure_tradeoff(setting, Wanted(what=("presets", "precision"), attribute_psnr=(36.0,)))
+    return tradeoff(setting, Wanted(what=("presets", "precision"), attribute_psnr=(36.0,)))
 
 
 # what is measured
@@ -157,7 +157,7 @@ def test_numbers_are_those_of_compare(capture, swept, tmp_path):
 
 
 def test_the_same_scene_gives_the_same_files_and_numbers(setting, measured):
-    again = measure_tradeoff(setting, measured.wanted).as_json()
+    again = tradeoff(setting, measured.wanted).as_json()
     assert timeless(measured.as_json()) == timeless(again)
 
 
@@ -410,12 +410,12 @@ def test_commands_quote_what_a_shell_would_read(setting):
 def test_without_one_point_that_can_be_measured_it_fails(setting):
     wanted = Wanted(what=("strategies",), opacities=(0.99,), kmeans=())
     with pytest.raises(InputError, match=r"no point could be measured; opacity > 0.99: no splat"):
-        measure_tradeoff(replace(setting, source=without_bands(setting.source, 0)), wanted)
+        tradeoff(replace(setting, source=without_bands(setting.source, 0)), wanted)
 
 
 def test_a_scene_without_splats_is_swept(setting, make_model):
     empty = replace(setting, source=make_model(0, 1), source_bytes=1000)
-    found = measure_tradeoff(empty, Wanted(what=("presets", "precision"), attribute_psnr=(40.0,)))
+    found = tradeoff(empty, Wanted(what=("presets", "precision"), attribute_psnr=(40.0,)))
     assert [None] * 4 == [one.bytes_per_source_splat for one in found.measured]
     assert {99.0} == {one.psnr for one in found.measured}
     assert "0 splats" in format_tradeoff(found)
@@ -428,7 +428,7 @@ def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
 
     monkeypatch.setattr("csplat_tools.tradeoffs.sweep.encode_with_report", fail)
     with pytest.raises(RuntimeError, match="a defect"):
-        measure_tradeoff(setting, Wanted(what=("presets",)))
+        tradeoff(setting, Wanted(what=("presets",)))
 
 
 def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
@@ -442,7 +442,7 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
         return whole(model, options, **others)
 
     monkeypatch.setattr(sweep, "encode_with_report", fail)
-    found = measure_tradeoff(setting, Wanted(what=("presets",)))
+    found = tradeoff(setting, Wanted(what=("presets",)))
     assert [Failure("small", "presets", "out of memory")] == found.failures
 
 

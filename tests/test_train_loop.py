@@ -81,7 +81,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, t
         if now.iteration == 40:
             stopped.write_bytes((tmp_path / "c.npz").read_bytes())  # the one of step 25
 
-    train(data, options, stop, Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    train(data, options, on_step=stop, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
     again = train(data, options, outputs=Outputs(resume=stopped))
     assert np.array_equal(whole.model.means, again.model.means)
     assert np.array_equal(whole.model.shN, again.model.shN)
@@ -100,7 +100,10 @@ def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_
 def test_progress_log_and_previews_tell_where_it_stands(make_data, make_model, tmp_path):
     seen = []
     result = train(
-        make_data(make_model), TrainOptions(**QUICK), seen.append, Outputs(previews=tmp_path / "p", preview_every=30)
+        make_data(make_model),
+        TrainOptions(**QUICK),
+        on_step=seen.append,
+        outputs=Outputs(previews=tmp_path / "p", preview_every=30),
     )
     assert [20, 40, 60] == [now.iteration for now in seen]
     assert seen[-1].seconds_left == 0

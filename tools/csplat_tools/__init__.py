@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from csplat_tools.optimise.optimiser import encode_to
     from csplat_tools.optimise.report import Optimised
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+    from csplat_tools.tradeoffs.options import Wanted
+    from csplat_tools.tradeoffs.running import Tradeoff, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
@@ -33,12 +35,15 @@ __all__ = [
     "SceneLike",
     "Simplified",
     "SimplifyOptions",
+    "Tradeoff",
     "ViewSet",
+    "Wanted",
     "compare",
     "encode_to",
     "find_view_set",
     "load_model",
     "simplify",
+    "tradeoff",
 ]
 
 #: Of the program and of the format.
@@ -52,12 +57,15 @@ _MODULE_OF = {
     "SceneLike": "csplat_tools.files.scenes",
     "Simplified": "csplat_tools.optimise.simplify",
     "SimplifyOptions": "csplat_tools.optimise.simplify",
+    "Tradeoff": "csplat_tools.tradeoffs.running",
     "ViewSet": "csplat_tools.views",
+    "Wanted": "csplat_tools.tradeoffs.options",
     "compare": "csplat_tools.inspect.compare",
     "encode_to": "csplat_tools.optimise.optimiser",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.files.scenes",
     "simplify": "csplat_tools.optimise.simplify",
+    "tradeoff": "csplat_tools.tradeoffs.running",
 }
 __getattr__ = lazy_exports(__name__, _MODULE_OF)
 

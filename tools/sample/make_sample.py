@@ -99,7 +99,7 @@ def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> Tra
     points, colours = photograph_all(folder, recipe)
     warm_up(_say)
     data = replace(load(folder), points=points, points_rgb=colours)
-    result = train(data, recipe.training, _show)
+    result = train(data, recipe.training, on_step=_show)
     result = replace(result, model=finish(result.model))
     write_ply(output, result.model)
     return result

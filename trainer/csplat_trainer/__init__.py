@@ -1,5 +1,52 @@
 """Training of Gaussian splats on the CPU: data sets, loss, optimisation, and a torch wrapper of the renderer.
 
-Nothing is imported here: `csplat_trainer.loop` trains with numba alone; torch is wanted by
+    >>> import csplat_trainer
+    >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
+
+The names load their modules when first used. `train` and `finetune` work with numba alone; torch is wanted by
 `autograd`, `perceptual` and `cuda`.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from csplat import lazy_exports
+
+if TYPE_CHECKING:
+    from csplat_trainer.data import DataSet, load
+    from csplat_trainer.loop import train
+    from csplat_trainer.options import TrainOptions
+    from csplat_trainer.outputs import Outputs, TrainResult
+    from csplat_trainer.tuning import Finetuned, FinetuneOptions, Views, finetune
+
+__all__ = [
+    "DataSet",
+    "FinetuneOptions",
+    "Finetuned",
+    "Outputs",
+    "TrainOptions",
+    "TrainResult",
+    "Views",
+    "finetune",
+    "load",
+    "train",
+]
+
+_MODULE_OF = {
+    "DataSet": "csplat_trainer.data",
+    "FinetuneOptions": "csplat_trainer.tuning",
+    "Finetuned": "csplat_trainer.tuning",
+    "Outputs": "csplat_trainer.outputs",
+    "TrainOptions": "csplat_trainer.options",
+    "TrainResult": "csplat_trainer.outputs",
+    "Views": "csplat_trainer.tuning",
+    "finetune": "csplat_trainer.tuning",
+    "load": "csplat_trainer.data",
+    "train": "csplat_trainer.loop",
+}
+__getattr__ = lazy_exports(__name__, _MODULE_OF)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import platform
 import time
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from csplat.upright import with_up
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from csplat_trainer.data import DataSet
+from csplat_trainer.data import DataSet, load
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.evaluate import evaluate
@@ -47,28 +48,47 @@ _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there a
 
 
 def train(
-    data: DataSet,
+    data: DataSet | str | os.PathLike[str],
     options: TrainOptions | None = None,
-    progress: Callable[[TrainingStep], None] | None = None,
+    *,
     outputs: Outputs | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    on_step: Callable[[TrainingStep], None] | None = None,
 ) -> TrainResult:
-    """Train splats on pictures.
+    """Train splats on pictures, as `csplat train` does; wants the packages of the render extra.
 
     The same pictures, options and library versions give the same splats on the same machine, at
     any number of threads.
 
     Args:
-        data: pictures, and points of the scene where they are known.
+        data: pictures, and points of the scene where they are known; or what `load` makes them of: a folder, or a
+            `transforms.json`.
         options: how.
-        progress: told every `log_every` steps.
         outputs: checkpoints and early pictures.
+        progress: is told the stage and the share of it that is done, 0 to 1, every `log_every` steps.
+        on_step: is told then where the run stands.
+
+    Returns:
+        The scene, the log, and scores on the pictures that were held out.
+
+    Example:
+        >>> import csplat, csplat_trainer
+        >>> found = csplat_trainer.train("capture", csplat_trainer.TrainOptions(max_splats=5000))  # doctest: +SKIP
+        >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP
 
     Raises:
         InputError: there is no picture, an option does not suit the data, or a file is not what it
             is said to be.
     """
-    run = _Run(data, options or TrainOptions(), outputs or Outputs())
-    return run.to_the_end(progress)
+
+    def show(now: TrainingStep) -> None:
+        if progress is not None:
+            progress("training", now.iteration / now.iterations)
+        if on_step is not None:
+            on_step(now)
+
+    pictures = data if isinstance(data, DataSet) else load(data)
+    return _Run(pictures, options or TrainOptions(), outputs or Outputs()).to_the_end(show)
 
 
 @dataclass
@@ -102,7 +122,7 @@ class _Run:
         self._behind = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._behind, np.float32)
 
-    def to_the_end(self, progress: Callable[[TrainingStep], None] | None) -> TrainResult:
+    def to_the_end(self, show: Callable[[TrainingStep], None]) -> TrainResult:
         options, outputs = self._options, self._outputs
         window = _Window()
         spent = float(self._log["seconds"])  # by what was resumed
@@ -121,8 +141,7 @@ class _Run:
                 left = seconds / (step - first) * (options.iterations - step)
                 now = self._entry(window, degree, spent + seconds, left)
                 window = _Window()
-                if progress is not None:
-                    progress(now)
+                show(now)
             if options.eval_every and step % options.eval_every == 0 and step < options.iterations and self._data.test:
                 self._evaluate(options.eval_views)
             if outputs.preview_due(step, options.iterations):

@@ -11,6 +11,7 @@ from csplat_tools.cli.encoder_options import Preset
 from csplat_tools.cli.options import Lpips, Output, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_mode
 from csplat_tools.cli.view_options import Views
+from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_pictures, need_plots, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
@@ -82,8 +83,8 @@ def tradeoff(
         need_plots()
     prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
     need_pictures()
+    import csplat_tools
     from csplat_tools.tradeoffs.page import check_plots, write_page, write_plots
-    from csplat_tools.tradeoffs.running import measure_tradeoff
     from csplat_tools.tradeoffs.setting import read_setting
     from csplat_tools.tradeoffs.tables import format_tradeoff
 
@@ -93,7 +94,8 @@ def tradeoff(
     )
     out.findings(setting.findings)
     out.remark(*setting.views.notes)
-    measured = measure_tradeoff(setting, wanted, quiet=out.quiet)
+    with out.bar() as progress:
+        measured = csplat_tools.tradeoff(setting, wanted, say=None if out.quiet else note, progress=progress)
     if plots is not None:
         write_plots(plots, measured)
     if page is not None:

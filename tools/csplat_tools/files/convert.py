@@ -5,26 +5,25 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.errors import InputError
+from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat.upright import Direction, with_up
 from csplat_tools.files.console import Progress
-from csplat_tools.files.scenes import without_bands
-from csplat_tools.files.streams import STANDARD_STREAM, mapped_csplat, ply_path, write_array, write_bytes, write_model
+from csplat_tools.files.scenes import LoadedModel, without_bands
+from csplat_tools.files.streams import mapped_csplat, ply_path, write_array, write_bytes, write_model
 
 __all__ = [
     "Encoded",
     "EncodedScene",
     "Encoder",
     "SceneOverrides",
-    "Source",
     "decode_file",
     "encode_file",
     "findings_as_json",
@@ -126,34 +125,18 @@ class Encoded:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A PLY that was read to be encoded.
-
-    Attributes:
-        name: of the file. size_bytes: its size.
-        model: its splats.
-        findings: what lint noticed.
-    """
-
-    name: str
-    size_bytes: int
-    model: SplatModel
-    findings: tuple[Finding, ...]
-
-
 def read_source(
-    path: str,
+    file: File,
     facts: SceneOverrides | None = None,
     *,
     strict: bool = False,
     keep_extra: bool = False,
     progress: Progress | None = None,
-) -> Source:
+) -> LoadedModel:
     """Read a PLY, repaired where that is safe.
 
     Args:
-        path: of the PLY, or `-`.
+        file: the PLY: a path, or `-`; an open binary file; or bytes.
         facts: what it does not say.
         strict: refuse what would be repaired.
         keep_extra: carry columns that splats do not have.
@@ -166,12 +149,11 @@ def read_source(
     findings: list[Finding] = []
     report = progress or (lambda _stage, _done: None)
     report("reading", 0.0)
-    with ply_path(path) as local:
+    with ply_path(file) as local:
         model = read_ply(local, strict=strict, keep_extra=keep_extra, report=findings)
-        size_bytes = local.stat().st_size
+        size_bytes, name = local.stat().st_size, local.name
     report("reading", 1.0)
-    name = "standard input" if path == STANDARD_STREAM else Path(path).name
-    return Source(name, size_bytes, (facts or SceneOverrides()).applied(model), tuple(findings))
+    return LoadedModel((facts or SceneOverrides()).applied(model), size_bytes, name=name, findings=tuple(findings))
 
 
 def encode_file(

@@ -9,6 +9,7 @@ import numpy as np
 
 from csplat.decoder import SceneHeader, StatedErrors, decode_scene
 from csplat.inputs import File
+from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
@@ -25,12 +26,16 @@ class LoadedModel:
         size_bytes: of the file; of a model that was in no file, that of its plain PLY.
         header: of a .csplat file; `None` for a PLY.
         stated_errors: of a .csplat file that states them.
+        name: of the file.
+        findings: what lint noticed in a PLY that was read to be encoded.
     """
 
     model: SplatModel
     size_bytes: int
     header: SceneHeader | None = None
     stated_errors: StatedErrors | None = None
+    name: str = "scene"
+    findings: tuple[Finding, ...] = ()
 
     def _repr_html_(self) -> str | None:
         """What a notebook shows of it: see `SplatModel`."""
@@ -73,12 +78,12 @@ def load_model(scene: SceneLike) -> LoadedModel:
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
-        size_bytes = local.stat().st_size
+        size_bytes, name = local.stat().st_size, local.name
         if not is_csplat(local):
-            return LoadedModel(read_ply(local), size_bytes)
+            return LoadedModel(read_ply(local), size_bytes, name=name)
         with mapped_csplat(str(local)) as data:
             decoded = decode_scene(data)
-    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors)
+    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
 
 
 def ply_splat_bytes(sh_degree: int) -> int:

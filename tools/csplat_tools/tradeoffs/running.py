@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from csplat.errors import CsplatError, InputError
+from csplat.inputs import File
+from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import Progress, format_bytes, note, progress_bar
+from csplat_tools.files.console import Progress, format_bytes
+from csplat_tools.files.extras import need_renderer
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
 from csplat_tools.tradeoffs.options import Wanted
 from csplat_tools.tradeoffs.points import Failure, ModeTime, Point, pareto_front
-from csplat_tools.tradeoffs.setting import Setting
+from csplat_tools.tradeoffs.setting import Setting, read_setting
 from csplat_tools.tradeoffs.sweep import Candidate, candidates
+from csplat_tools.views import Colour, DataOptions
 
-__all__ = ["Tradeoff", "estimated_seconds", "measure_tradeoff"]
+__all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
 # Seconds by kind of point, on two cores: for each million splats, and for each second that eight
 # pictures of the source take; for an estimate that a person decides by, no more.
@@ -104,33 +108,61 @@ class Tradeoff:
         }
 
 
-def measure_tradeoff(setting: Setting, wanted: Wanted, *, quiet: bool = True) -> Tradeoff:
-    """Make every file that is wanted, and measure it.
+def tradeoff(
+    scene: SplatModel | File | Setting,
+    wanted: Wanted | None = None,
+    *,
+    cameras: str | None = None,
+    data: DataOptions | None = None,
+    background: Colour | None = None,
+    lpips: str | None = None,
+    say: Callable[[str], None] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Tradeoff:
+    """Make every file that is wanted, and measure it: what `csplat tradeoff` calls; minutes, and the render extra.
 
     Args:
-        setting: the scene and its views.
-        wanted: what is swept.
-        quiet: say nothing; else how long it may take, and how far it has come.
+        scene: a model, or a PLY; or, instead of that and of all that is read, the `Setting` of an earlier sweep.
+        wanted: what is swept; `None`: presets, precision, strategies, targets and simplification.
+        cameras, data, background: by which views files are decided on and judged, as for `find_view_set`: by name,
+            so that the report can say how each file is made.
+        lpips: a file of LPIPS weights, or `auto`; it is not computed if left out.
+        say: is told in a line how long it may take, and each file as soon as it is measured.
+        progress: is told the stage and the share of it that is done, 0 to 1.
+
+    Returns:
+        All points, measured or failed; those on the front; and all as JSON (`as_json`).
+
+    Example:
+        >>> import csplat_tools
+        >>> found = csplat_tools.tradeoff("scene.ply", csplat_tools.Wanted(what=("presets",)))  # doctest: +SKIP
+        >>> [(point.name, point.size_bytes, point.psnr) for point in found.front]  # doctest: +SKIP
 
     Raises:
         InputError: there is nothing to sweep, or not one point could be measured.
+        CsplatError: the file is none.
+        OSError: it cannot be read.
     """
+    need_renderer()
+    if isinstance(scene, Setting):
+        setting = scene
+    else:
+        setting = read_setting(scene, cameras=cameras, data=data, background=background, lpips=lpips)
+    wanted = wanted or Wanted()
+    report: Progress = progress or (lambda _stage, _done: None)
+    tell = say or (lambda _line: None)
     with thread_count(wanted.threads):
         measurer = Measurer(setting, wanted.modes, wanted.threads)
         tried = candidates(setting, wanted)
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
         costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        if not quiet:
-            note(f"{len(tried)} files to make and to measure: about {_duration(sum(costs))}")
+        tell(f"{len(tried)} files to make and to measure: about {_duration(sum(costs))}")
         points = list[Point | Failure]()
-        with progress_bar(quiet=quiet) as bar:
-            report: Progress = bar or (lambda _stage, _done: None)
-            for number, candidate in enumerate(tried):
-                report("the sweep", sum(costs[:number]) / sum(costs))
-                points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
-                if not quiet:
-                    note(_line(points[-1], number + 1, len(tried)))
+        for number, candidate in enumerate(tried):
+            report("the sweep", sum(costs[:number]) / sum(costs))
+            points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
+            tell(_line(points[-1], number + 1, len(tried)))
     first = points[0]
     if isinstance(first, Failure) and all(isinstance(one, Failure) for one in points):
         raise InputError(f"no point could be measured; {first.name}: {first.error}")

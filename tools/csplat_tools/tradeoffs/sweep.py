@@ -22,14 +22,12 @@ from csplat_tools.training.finetune import (
     SHAPE_ENTRIES,
     VIEW_SIZE,
     VIEWS,
-    Clock,
-    plan_tuning,
-    tune,
+    choose_and_finetune,
     usually_aside,
 )
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
-from csplat_trainer.tuning import FinetuneOptions, TuningStep
+from csplat_trainer.tuning import FinetuneOptions
 
 __all__ = ["Candidate", "candidates"]
 
@@ -166,15 +164,13 @@ def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progre
     itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
     options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
-    clock = Clock()
-    plan = plan_tuning(setting.source, _tuning_views(setting), encoding, clock, keep=keep, progress=progress)
-
-    def show(now: TuningStep) -> None:
-        progress("tuning", now.iteration / now.iterations)
-
-    tuned = tune(plan, options.scaled(LEARNING_FACTOR[itself]), clock, threads=wanted.threads, show=show)
-    said = {"steps": tuned.log["steps"], "best_step": tuned.log["best_iteration"], "keep": keep, **plan.chosen.said}
-    return TriedFile(tuned.result.data, {"encoding": tuned.result.report.options, "finetune": said}, clock.seconds)
+    tuned = choose_and_finetune(
+        setting.source, _tuning_views(setting), encoding, options.scaled(LEARNING_FACTOR[itself]), keep=keep,
+        progress=progress,
+    )  # fmt: skip
+    made = tuned.made
+    said = {"steps": made.log["steps"], "best_step": made.log["best_iteration"], "keep": keep, **tuned.chosen.said}
+    return TriedFile(made.data, {"encoding": made.result.report.options, "finetune": said}, tuned.seconds)
 
 
 def _tuning_views(setting: Setting) -> ViewSet:

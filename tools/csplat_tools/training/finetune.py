@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Frozen, Origin
+from csplat.encoder import EncodeOptions, Origin
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
@@ -23,7 +22,7 @@ from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.views import ViewSet
 from csplat_trainer.outputs import Outputs
-from csplat_trainer.tuning import FinetuneOptions, TuningStep, Views, finetune
+from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep
 
 __all__ = [
     "BYTE_COST",
@@ -31,12 +30,9 @@ __all__ = [
     "SHAPE_ENTRIES",
     "VIEWS",
     "VIEW_SIZE",
-    "Clock",
-    "Tuned",
-    "TuningPlan",
-    "plan_tuning",
+    "TunedChoice",
+    "choose_and_finetune",
     "run_finetuning",
-    "tune",
     "usually_aside",
 ]
 
@@ -66,20 +62,6 @@ def usually_aside(count: int, *, cameras: str | None, data: object | None) -> in
     if data is not None:
         return 0
     return min(_MOST_ASIDE, count // _RENDERS_ASIDE) if cameras is None else None
-
-
-@dataclass
-class Clock:
-    """Seconds by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time what happens inside."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
 
 
 def run_finetuning(
@@ -118,148 +100,78 @@ def run_finetuning(
         CsplatError: an option or a file cannot be used.
         OSError: a file cannot be read or written.
     """
-    clock, threads = Clock(), encoding.threads
+    threads = encoding.threads
     with thread_count(threads):
         prepare_renderer(quiet=quiet, gradients=True)
-        with progress_bar(quiet=quiet) as progress:
-            plan = plan_tuning(
-                source, views, encoding, clock, keep=keep, prune_unseen=prune_unseen, importance=importance,
-                progress=progress,
+        with progress_bar(quiet=quiet) as progress, step_progress("tuning", _state, quiet=quiet) as show:
+            tuned = choose_and_finetune(
+                source, views, encoding, options, files=files, keep=keep, prune_unseen=prune_unseen,
+                importance=importance, progress=progress, on_step=show,
             )  # fmt: skip
-        with step_progress("tuning", _state, quiet=quiet) as show:
-            tuned = tune(plan, options, clock, files, threads=threads, show=show)
-        result = tuned.result
-        write_bytes(output, result.data)
+        made, clock = tuned.made, Clock(tuned.seconds)
+        write_bytes(output, made.data)
         if source_index is not None:
-            write_array(source_index, result.source_index)
+            write_array(source_index, made.result.source_index)
         with clock.stage("judging"):
-            models = {"source": source, "before tuning": decode(plan.plain.data), "file": tuned.decoded}
+            models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
             judged = judge_models(source, models, views, lpips, threads)
-    report = as_report(source, plan.plain, result, judged, tuned.log, clock.seconds, plan.chosen.said)
-    return {**report, "log": tuned.log}
+    report = as_report(source, made.plain, made.result, judged, made.log, clock.seconds, tuned.chosen.said)
+    return {**report, "log": made.log}
 
 
 @dataclass(frozen=True, eq=False)
-class TuningPlan:
-    """All that is decided before values move.
+class TunedChoice:
+    """A tuned file of some of a scene's splats.
 
     Attributes:
-        views: that teach, and that decide while values move.
-        chosen: the splats that the file will hold.
-        frozen: the encoder's decisions.
-        plain: the file of the same decisions without tuning.
+        chosen: the splats. made: the file.
+        seconds: by stage.
     """
 
-    views: Views
     chosen: Chosen
-    frozen: Frozen
-    plain: EncodeResult
+    made: Finetuned
+    seconds: dict[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Tuned:
-    """A tuned file.
-
-    Attributes:
-        result: of the encoder. decoded: what a decoder sees of it, which is what was tuned, bit for bit.
-        log: of the tuning.
-    """
-
-    result: EncodeResult
-    decoded: SplatModel
-    log: dict[str, Any]
-
-
-def plan_tuning(
+def choose_and_finetune(
     source: SplatModel,
     views: ViewSet,
     encoding: EncodeOptions,
-    clock: Clock,
+    options: FinetuneOptions,
     *,
+    files: Outputs | None = None,
     keep: float | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
     progress: Progress | None = None,
-) -> TuningPlan:
-    """Choose the splats of the file, and freeze the encoder's decisions.
+    on_step: Callable[[TuningStep], None] | None = None,
+) -> TunedChoice:
+    """Choose the splats of the file, and have them tuned.
 
     Args:
         source: the scene.
         views: what the file is to look like.
         encoding: of the encoder.
-        clock: is told the seconds of `choosing` and `encoding`.
+        options: of the tuning.
+        files: checkpoints.
         keep, prune_unseen, importance: as for `choose_splats`.
-        progress: is told the stages.
+        progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
-        CsplatError: as `choose_splats` and the encoder.
+        CsplatError: as `choose_splats` and `csplat_trainer.finetune`.
     """
+    clock = Clock()
     with clock.stage("choosing"):
         looked = training_views(source, views, encoding.threads)
         chosen = choose_splats(
             source, views, keep=keep, prune_unseen=prune_unseen, importance=importance, threads=encoding.threads,
             progress=progress,
         )  # fmt: skip
-    with clock.stage("encoding"):
-        draft = Draft.of(
-            chosen.model, encoding, importance=chosen.importance, origin=Origin(len(source), chosen.rows),
-            graded=False, progress=progress,
-        )  # fmt: skip
-        frozen = draft.frozen(source, progress)
-        plain = frozen.coded(frozen.start()).write()
-    return TuningPlan(looked, chosen, frozen, plain)
-
-
-def tune(
-    plan: TuningPlan,
-    options: FinetuneOptions,
-    clock: Clock,
-    files: Outputs | None = None,
-    *,
-    threads: int | None = None,
-    show: Callable[[TuningStep], None] | None = None,
-) -> Tuned:
-    """Move the values until pictures look right, and encode them.
-
-    Args:
-        plan: by `plan_tuning`.
-        options: of the tuning.
-        clock: is told the seconds of `tuning` and `encoding`.
-        files: checkpoints.
-        threads: how many; `None` for all.
-        show: is told where the run stands.
-
-    Raises:
-        CsplatError: as `finetune`.
-        RuntimeError: the file is not what was tuned: a fault of csplat.
-    """
-    frozen, files = plan.frozen, files or Outputs()
-    with clock.stage("tuning"):
-        tuned = finetune(
-            frozen, plan.views, options, progress=show, checkpoint=files.checkpoint,
-            checkpoint_every=files.checkpoint_every, resume=files.resume, threads=threads,
-        )  # fmt: skip
-    with clock.stage("encoding"):
-        said = {
-            "simplified": {},  # `simplified_from` says it, where splats were taken away
-            "views": len(plan.views.train),
-            "steps": tuned.log["best_iteration"],
-            **plan.chosen.said,
-        }
-        result = frozen.coded(tuned.held).write({"finetuned": said})
-        decoded = decode(result.data)
-    _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
-    return Tuned(result, decoded, tuned.log)
-
-
-def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """Raise a `RuntimeError` unless what was tuned is what was written, bit for bit: no file would be better."""
-    places = np.empty(int(source_index.max()) + 1, np.int64)
-    places[source_index] = np.arange(len(source_index))
-    rows = places[result.source_index]
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        if not np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]):
-            raise RuntimeError(f"the file holds other {name} than were tuned: a fault of csplat, please report it")
+    made = csplat_trainer.finetune(
+        chosen.model, looked, encoding, options, importance=chosen.importance, source=source,
+        origin=Origin(len(source), chosen.rows), said=chosen.said, outputs=files, progress=progress, on_step=on_step,
+    )  # fmt: skip
+    return TunedChoice(chosen, made, {**clock.seconds, **made.seconds})
 
 
 def _state(now: TuningStep) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import csplat_trainer
 from csplat.errors import InputError, counted
 from csplat.training import TrainedOn
 from csplat_render.jit import thread_count
@@ -16,7 +17,6 @@ from csplat_tools.files.streams import write_model
 from csplat_tools.views import DataOptions
 from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import load
-from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.perceptual import PerceptualLoss
@@ -65,7 +65,7 @@ def run_training(
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
         with step_progress("training", _state, quiet=quiet) as show:
-            result = train(pictures, options, show, files)
+            result = csplat_trainer.train(pictures, options, outputs=files, on_step=show)
     write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data.path).name)

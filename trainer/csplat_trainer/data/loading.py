@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ _AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with it
 
 
 def load(
-    path: str | Path,
+    path: str | os.PathLike[str],
     size: tuple[int, int] | None = None,
     *,
     images: str | None = None,

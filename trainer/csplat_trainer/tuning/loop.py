@@ -1,4 +1,4 @@
-"""`finetune`: move the values of a frozen scene until its file looks like the pictures."""
+"""`tune`: move the values of a frozen scene until its file looks like the pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from csplat_trainer.tuning.rate import Costs
 from csplat_trainer.tuning.state import TunedScene
 from csplat_trainer.tuning.views import View, Views
 
-__all__ = ["FinetuneResult", "TuningStep", "finetune"]
+__all__ = ["FinetuneResult", "TuningStep", "tune"]
 
 F32 = NDArray[np.float32]
 
@@ -67,7 +67,7 @@ class FinetuneResult:
     log: dict[str, Any]
 
 
-def finetune(
+def tune(
     frozen: Frozen,
     views: Views,
     options: FinetuneOptions | None = None,

@@ -138,7 +138,7 @@ def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
         if now.iteration % every == 0:
             tell(f"{ply.stem}: {now.iteration}/{now.iterations}, {now.splat_count} splats, {now.seconds:.0f} s")
 
-    result = train(replace(data, test=[]), options, show)
+    result = train(replace(data, test=[]), options, on_step=show)
     log = result.log
     training: Training = {
         "options": asdict(options), "seconds": log["seconds"], "splats": len(result.model), "views": len(data.train),

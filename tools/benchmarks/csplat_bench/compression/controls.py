@@ -14,7 +14,7 @@ from csplat.model import SplatModel
 from csplat_bench.common.measuring import timed
 from csplat_bench.compression.rows import Control
 from csplat_bench.compression.runs import Bench
-from csplat_trainer.tuning import finetune
+from csplat_trainer.tuning import tune
 
 __all__ = ["Unquantised", "control", "eight_bits"]
 
@@ -47,7 +47,7 @@ def control(bench: Bench) -> Control:
     options = EncodeOptions(preset="fast", sh_coding="scalar", threads=bench.threads)
     frozen = bench.frozen(chosen.model, chosen.rows, options, chosen.importance)
     tuning = replace(bench.tuning, byte_cost=0.0, patience=0)
-    run, timing = timed(finetune, Unquantised.freeing(frozen), bench.views, tuning, threads=bench.threads)
+    run, timing = timed(tune, Unquantised.freeing(frozen), bench.views, tuning, threads=bench.threads)
     held = run.held
     trained = replace(
         frozen.draft.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,

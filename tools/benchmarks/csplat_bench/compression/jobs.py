@@ -14,7 +14,7 @@ from csplat_bench.compression.controls import control, eight_bits
 from csplat_bench.compression.rows import Facts, Row
 from csplat_bench.compression.runs import Bench
 from csplat_trainer.sensitivity import measure_sensitivity
-from csplat_trainer.tuning import FinetuneOptions, finetune
+from csplat_trainer.tuning import FinetuneOptions, tune
 
 __all__ = ["KINDS", "Lists", "facts_of", "find_jobs", "variants", "warm"]
 
@@ -101,5 +101,5 @@ def warm(bench: Bench) -> None:
     some = bench.source.select(slice(0, 500))
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
     frozen = Draft.of(some, options, graded=False).frozen()
-    finetune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
+    tune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
     measure_sensitivity(some, bench.looks.teaches[:1], metric=True)

@@ -25,10 +25,9 @@ from csplat_render.lpips import Lpips
 from csplat_render.removal import measure_removal
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
-from csplat_tools.training.finetune import Clock
 from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
-from csplat_trainer.tuning import FinetuneOptions, Views, finetune
+from csplat_trainer.tuning import Clock, FinetuneOptions, Views, tune
 
 __all__ = ["Bench", "Tuned"]
 
@@ -144,7 +143,7 @@ class Bench:
             frozen = self.frozen(chosen.model, chosen.rows, encoding, chosen.importance, stages)
         plain = frozen.coded(frozen.start()).write()  # not a part of the work: what it would have been without
         with clock.stage("tuning"):
-            run = finetune(frozen, views, self.tuning, threads=self.threads)
+            run = tune(frozen, views, self.tuning, threads=self.threads)
         with clock.stage("encoding"):
             result = frozen.coded(run.held).write()
         return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})

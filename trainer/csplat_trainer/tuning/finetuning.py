@@ -1,0 +1,175 @@
+"""`finetune`: a scene and pictures in, a tuned file out. The encoder decides once, values move, then they are coded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Importance, Origin
+from csplat.model import SplatModel, check_model
+from csplat.training import TrainedOn
+from csplat_render.cameras import relative_to
+from csplat_trainer.data import DataSet
+from csplat_trainer.outputs import Outputs
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.tuning.loop import TuningStep, tune
+from csplat_trainer.tuning.options import FinetuneOptions
+from csplat_trainer.tuning.views import View, Views, split_views
+
+__all__ = ["Clock", "Finetuned", "finetune"]
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Finetuned:
+    """A tuned file.
+
+    Attributes:
+        result: of the encoder.
+        decoded: what a decoder sees of it, which is what was tuned, bit for bit.
+        plain: the file of the same decisions without tuning.
+        log: JSON-compatible: options, losses, looks at the views, times.
+        seconds: of `encoding` and `tuning`.
+    """
+
+    result: EncodeResult
+    decoded: SplatModel
+    plain: EncodeResult
+    log: dict[str, Any]
+    seconds: dict[str, float]
+
+    @property
+    def data(self) -> bytes:
+        """The file."""
+        return self.result.data
+
+
+@dataclass
+class Clock:
+    """Seconds by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what happens inside."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
+
+
+def finetune(
+    model: SplatModel,
+    views: Views | DataSet,
+    encoding: EncodeOptions | None = None,
+    options: FinetuneOptions | None = None,
+    *,
+    importance: NDArray[Any] | Importance | None = None,
+    source: SplatModel | None = None,
+    origin: Origin | None = None,
+    said: Mapping[str, Any] | None = None,
+    outputs: Outputs | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    on_step: Callable[[TuningStep], None] | None = None,
+) -> Finetuned:
+    """Encode a scene, and move what the file holds until a decoder's pictures look right; `csplat finetune` calls it.
+
+    The same scene, views and options give the same bytes on the same machine, at any number of threads.
+
+    Args:
+        model: the splats that the file will hold.
+        views: what it is to look like: photographs, or renders of the scene itself (`renders_of`). Of a data set those
+            that it trains on, in front of what the scene says was behind it.
+        encoding: of the encoder; its threads hold for all.
+        options: of the tuning.
+        importance: how much splats matter, as for the encoder; `None`: measured in the views that teach.
+        source: the scene that the splats were chosen of, where they are not all, and `origin` which of it they are.
+        origin: as of the encoder.
+        said: what the file is to say of its tuning, beside the steps and the number of views.
+        outputs: checkpoints.
+        progress: is told the stage and the share of it that is done, 0 to 1.
+        on_step: is told where the tuning stands, every `log_every` steps.
+
+    Example:
+        >>> import csplat, csplat_trainer
+        >>> photographs = csplat_trainer.load("capture")  # doctest: +SKIP
+        >>> found = csplat_trainer.finetune(csplat.read_ply("scene.ply"), photographs)  # doctest: +SKIP
+        >>> len(found.data) < len(found.plain.data)  # doctest: +SKIP
+        True
+
+    Raises:
+        InputError: no view shows a splat, an option does not suit the scene, or a checkpoint is of another run.
+        RuntimeError: the file is not what was tuned: a fault of csplat.
+    """
+    check_model("finetune", model)
+    clock, encoding, options = Clock(), encoding or EncodeOptions(), options or FinetuneOptions()
+    if isinstance(views, DataSet):
+        views = _views_of(views, model)
+    if importance is None:
+        importance = _measured(model, views, encoding, progress)
+    with clock.stage("encoding"):
+        draft = Draft.of(model, encoding, importance=importance, origin=origin, graded=False, progress=progress)
+        frozen = draft.frozen(source or model, progress)
+        plain = frozen.coded(frozen.start()).write()
+
+    def show(now: TuningStep) -> None:
+        if progress is not None:
+            progress("tuning", now.iteration / now.iterations)
+        if on_step is not None:
+            on_step(now)
+
+    files = outputs or Outputs()
+    with clock.stage("tuning"):
+        tuned = tune(
+            frozen, views, options, progress=show, checkpoint=files.checkpoint,
+            checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
+        )  # fmt: skip
+    with clock.stage("encoding"):
+        facts = {
+            "simplified": {},  # `simplified_from` says it, where splats were taken away
+            "views": len(views.train),
+            "steps": tuned.log["best_iteration"],
+            **(said or {}),
+        }
+        result = frozen.coded(tuned.held).write({"finetuned": facts})
+        decoded = decode(result.data)
+    _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
+    return Finetuned(result, decoded, plain, tuned.log, clock.seconds)
+
+
+def _views_of(data: DataSet, model: SplatModel) -> Views:
+    """The photographs of a data set that teach, in front of what the scene says was behind it."""
+    trained = TrainedOn.of(model.metadata)
+    behind = data.background if trained is None else trained.background
+    looks = [View(relative_to(model.origin, one.camera), one) for one in data.train]
+    return split_views(looks, np.array(behind, np.float32))
+
+
+def _measured(
+    model: SplatModel, views: Views, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
+) -> Importance:
+    """How much the views that teach depend on each splat."""
+    cameras = [one.camera for one in views.train]
+    found = measure_sensitivity(
+        model, cameras, background=views.background, metric=True, threads=encoding.threads, progress=progress
+    )
+    return StoredSensitivity.of(model, found).importance()
+
+
+def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
+    """Raise a `RuntimeError` unless what was tuned is what was written, bit for bit: no file would be better."""
+    places = np.empty(int(source_index.max()) + 1, np.int64)
+    places[source_index] = np.arange(len(source_index))
+    rows = places[result.source_index]
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        if not np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]):
+            raise RuntimeError(f"the file holds other {name} than were tuned: a fault of csplat, please report it")
