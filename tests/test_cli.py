@@ -536,7 +536,7 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
-        (("encode", "scene.ply", "out.ply"), "csplat simplify scene.ply out.ply"),
+        (("encode", "scene.ply", "out.ply"), "csplat encode scene.ply out.csplat"),
         (("encode", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
         (("encode", "scene.ply", "page.html"), "csplat export-html scene.ply page.html"),
         (("encode", "scene.ply", "out.spz"), "csplat encode scene.ply out.csplat"),

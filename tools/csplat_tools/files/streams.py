@@ -49,7 +49,6 @@ _PLY_MAGICS = (b"ply\n", b"ply\r")
 
 #: By the endings of input and output, `*` for any, the command that makes one of the other.
 _MAKERS = {
-    (".ply", ".ply"): "simplify",
     (".csplat", ".ply"): "decode",
     (".ply", ".csplat"): "encode",
     ("*", ".html"): "export-html",
