@@ -347,7 +347,7 @@ def test_labels_of_a_plot_do_not_overlap(count):
     marks = [(float(x), float(30.0 + 8.0 * np.log(x) + y)) for x, y in zip(sizes, rng.normal(0, 2, count), strict=True)]
     axes.plot(*zip(*marks, strict=True), "o")
     names = [f"attributes {number} dB" for number in range(count)]
-    numbered = label_marks(axes, marks, names, [str(number) for number in range(count)], marks[:5])
+    numbered = label_marks(axes, marks, names, [str(number) for number in range(count)], [marks[:5]])
     assert (count == 30) == numbered
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

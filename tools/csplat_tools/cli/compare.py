@@ -29,6 +29,15 @@ _PAIRING = {
     "order": "pairs by their order",
     "search": "pairs found within the stated errors",
 }
+_WORDS = {
+    "psnr": "of the squared error over all views; at 30 dB people see a difference, at 40 they hardly do",
+    "psnr_mean": "mean of the views' own",
+    "psnr_worst": "of the view that came out worst",
+    "psnr_covered": "of the pixels alone that show more than the background",
+    "ssim": "likeness of structure, 1 at best",
+    "lpips": "distance as a trained network sees it, 0 at best",
+    "cover": "share of the pixels that show more than the background",
+}
 
 
 @command(needs={"split": ("data",), "amplify": ("pictures",)})
@@ -118,20 +127,18 @@ def _attributes(attributes: AttributeErrors) -> str:
 
 def _quality(compared: Comparison) -> str:
     quality = compared.quality
-    rows = [
-        ("psnr", f"{quality.psnr:.2f} dB"),
-        ("psnr_mean", f"{quality.psnr_mean:.2f} dB"),
-        ("psnr_worst", f"{quality.psnr_worst:.2f} dB"),
-    ]
-    if quality.psnr_covered is not None:
-        rows.append(("psnr_covered", f"{quality.psnr_covered:.2f} dB"))
-    if quality.ssim is not None:
-        rows.append(("ssim", f"{quality.ssim:.5f}"))
-    if quality.lpips is not None:
-        rows.append(("lpips", f"{quality.lpips:.5f}"))
-    if quality.cover is not None:
-        rows.append(("cover", f"{100.0 * quality.cover:.1f} %"))
-    lines = [format_table(("pictures", _cameras(compared)), rows)]
+    values = {
+        "psnr": f"{quality.psnr:.2f} dB",
+        "psnr_mean": f"{quality.psnr_mean:.2f} dB",
+        "psnr_worst": f"{quality.psnr_worst:.2f} dB",
+        "psnr_covered": None if quality.psnr_covered is None else f"{quality.psnr_covered:.2f} dB",
+        "ssim": None if quality.ssim is None else f"{quality.ssim:.5f}",
+        "lpips": None if quality.lpips is None else f"{quality.lpips:.5f}",
+        "cover": None if quality.cover is None else f"{100.0 * quality.cover:.1f} %",
+    }
+    rows = [(name, text) for name, text in values.items() if text is not None]
+    head, *others = format_table(("pictures", _cameras(compared)), rows).splitlines()
+    lines = [head, *(f"{line}  {_WORDS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)
     if compared.a.model.antialiased != compared.b.model.antialiased:
         lines.append(f"only {'A' if compared.a.model.antialiased else 'B'} is antialiased, and was rendered so")

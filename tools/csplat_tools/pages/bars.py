@@ -30,7 +30,7 @@ _GAP = 10
 STANDALONE = (
     "<style>svg{color:#1d2126}.ground{fill:#ffffff}"
     "@media (prefers-color-scheme:dark){svg{color:#e4e8ed}.ground{fill:#14171b}}</style>"
-    '<rect class="ground" width="100%" height="100%" fill="#ffffff"/>'
+    '<rect class="ground" x="-5%" y="-5%" width="110%" height="110%" fill="#ffffff"/>'
 )
 
 
@@ -68,7 +68,9 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
         top += _ROW
     ground = "" if inline else STANDALONE
     mark = "" if inline else ' font-family="sans-serif" color="#1d2126"'
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {top}" role="img" font-size="{_SIZE}"'
+    air = 0 if inline else _GAP
+    box = f"{-air} {-air} {_WIDTH + 2 * air} {top + 2 * air}"
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-size="{_SIZE}"'
     return f'{head} fill="currentColor"{mark}>{ground}{"".join(parts)}</svg>'
 
 

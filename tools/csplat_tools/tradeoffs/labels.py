@@ -64,7 +64,11 @@ class _Placed:
 
 
 def label_marks(
-    axes: Axes, marks: Sequence[Point], names: Sequence[str], numbers: Sequence[str], line: Sequence[Point] = ()
+    axes: Axes,
+    marks: Sequence[Point],
+    names: Sequence[str],
+    numbers: Sequence[str],
+    lines: Sequence[Sequence[Point]] = (),
 ) -> bool:
     """Write beside each mark what it is.
 
@@ -73,7 +77,7 @@ def label_marks(
         marks: in data coordinates.
         names: of the marks; an empty one stays without a label.
         numbers: instead of the names, where these do not fit.
-        line: corners of a line of the plot, which labels rather leave free.
+        lines: corners of lines of the plot, which labels rather leave free.
 
     Returns:
         Whether there are numbers.
@@ -90,12 +94,11 @@ def label_marks(
 
     frame = axes.get_window_extent()
     room = _Box(scale * frame.x0, scale * frame.y0, scale * frame.x1, scale * frame.y1)
-    at, corners = in_points(marks), in_points(line)
-    lines = list(pairwise(corners))
-    found = _placed(at, names, room, lines)
+    at, parts = in_points(marks), [part for line in lines for part in pairwise(in_points(line))]
+    found = _placed(at, names, room, parts)
     texts = names if found is not None else numbers
     if found is None:
-        found = _placed(at, numbers, room, lines, forced=True)
+        found = _placed(at, numbers, room, parts, forced=True)
     assert found is not None
     for (x, y), text, one in zip(at, texts, found, strict=True):
         if one is not None:

@@ -14,7 +14,7 @@ from csplat_tools.tradeoffs.svg import INK, drawn, hover
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
+    from matplotlib.figure import Figure
 
 __all__ = ["PLOTS", "draw_plot"]
 
@@ -39,7 +39,7 @@ _NAMES = {
 }
 _FEW, _MANY, _TICKS = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0), 15  # ticks in each decade, and in all
 _LARGE = 1_000_000  # bytes of a file, from which on they are counted in MB
-_KEY_COLUMNS = 4  # of numbers and names, below a plot that stands alone
+_KEY_COLUMNS, _KEY_LINE = 4, 0.16  # of numbers and names, below a plot that stands alone; height in inches
 
 Value = Callable[[Point], "float | None"]
 
@@ -127,21 +127,15 @@ def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
 
     def draw(figure: Figure) -> None:
         axes, (unit, divisor) = figure.add_subplot(), _unit(tradeoff)
-        for number, point in enumerate(points):
+        lines = [[(one.size_bytes / divisor, one.quality.psnr) for one in point.partial] for point in points]
+        for number, (point, line) in enumerate(zip(points, lines, strict=True)):
             colour, marker = styles[number % len(styles)]
-            sizes, scores = (
-                [one.size_bytes / divisor for one in point.partial],
-                [one.quality.psnr for one in point.partial],
-            )
-            axes.plot(sizes, scores, marker=marker, color=colour, label=point.name)
-            for one, x, y in zip(point.partial, sizes, scores, strict=True):
-                axes.annotate(
-                    f"SH {one.sh_degree}", (x, y), (7, -3), textcoords="offset points", fontsize="x-small",
-                    color=colour,
-                )  # fmt: skip
+            axes.plot(*zip(*line, strict=True), marker=marker, color=colour, label=point.name)
         axes.set(xlabel=f"{unit} fetched", ylabel="PSNR against the source, dB")
         axes.margins(0.08)
-        axes.legend(loc="lower right", fontsize="small")
+        figure.legend(loc="outside upper left", ncols=len(points), fontsize="small")
+        names = [f"SH {one.sh_degree}" for point in points for one in point.partial]
+        label_marks(axes, [mark for line in lines for mark in line], names, names, lines)
 
     return drawn(draw, (_WIDE, _HIGH), name, inline=inline)
 
@@ -167,6 +161,8 @@ def _scatter(
     line: Sequence[tuple[float, float]] = (),
 ) -> None:
     """A mark for each file, and beside it the file's name, or its number in the table where names do not fit."""
+    from matplotlib.figure import Figure
+
     points, marks = tradeoff.measured, list[tuple[float, float]]()
     named = set[str]()
     for one in points:
@@ -182,19 +178,20 @@ def _scatter(
     handles, labels = axes.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda at: [*_NAMES.values(), labels[at]].index(labels[at]))
     figure = axes.get_figure()
-    assert figure is not None
+    assert isinstance(figure, Figure)
     figure.legend(
         [handles[at] for at in order], [labels[at] for at in order], loc="outside upper left", ncols=4, fontsize="small"
     )
     numbers = [str(number) for number in range(1, len(points) + 1)]
-    if label_marks(axes, marks, [one.name for one in points], numbers, line) and not inline:
+    if label_marks(axes, marks, [one.name for one in points], numbers, [line]) and not inline:
         _write_key(figure, [f"{number} {one.name}" for number, one in zip(numbers, points, strict=True)])
 
 
-def _write_key(figure: FigureBase, lines: Sequence[str]) -> None:
-    """What numbers stand for, below a plot that no table is beside of."""
+def _write_key(figure: Figure, lines: Sequence[str]) -> None:
+    """What numbers stand for, below a plot that no table is beside of; the plot keeps its height."""
     from matplotlib.lines import Line2D
 
+    figure.set_figheight(figure.get_figheight() + _KEY_LINE * (1 - len(lines) // -_KEY_COLUMNS))
     nothing = [Line2D([], [], linestyle="none") for _ in lines]
     figure.legend(
         nothing, lines, loc="outside lower left", ncols=_KEY_COLUMNS, fontsize="x-small", handlelength=0,
