@@ -30,14 +30,14 @@ F64 = NDArray[np.float64]
 
 ELEVATION = 20.0  # degrees above the horizon, of an object
 _MARGIN = 0.08  # of half a picture, around an object
-_POINTS = 40_000
+_POINTS = 16_000
 _SHOWN = 0.999  # of the points of an object lie inside of each picture: the rest is haze
 _CELL = 0.1  # extents; what has a gap of a cell and more around it is another part
 _CELLS = 36  # each way from the centre
 _PART = 0.02  # of the surface: parts that have less are floaters
 _BODY = 0.5  # of the surface: what has no parts that hold so much is all shown
 _TURNS = 24  # directions that are tried
-_HEIGHTS = np.linspace(-0.3, 0.3, 7)  # of what is looked at, of an object's height above its middle
+_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # of what is looked at, of an object's height above its middle
 
 _ARC_POINTS = 12_000
 _ARC_ELEVATIONS = (5.0, 20.0, 40.0)
