@@ -61,6 +61,11 @@ def test_links_between_files_become_links_between_pages(site):
     assert expected == site.rewritten(text, "codec/EMBEDDING.md")
 
 
+def test_what_only_github_takes_is_mended(site):
+    text = "Words:\n- one\n- two\n<!-- begin -->\n```python spec-test\n- x\n```\n"
+    assert "Words:\n\n- one\n- two\n```python\n- x\n```\n" == site.for_python_markdown(text)
+
+
 def test_the_navigation_names_every_page(site):
     named = re.findall(r": ([\w-]+\.md)$", (DOCS / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
     assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)

@@ -23,7 +23,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = "tools/docs/guide"
 CONFIGURATION = ROOT / "tools" / "docs" / "mkdocs.yml"
-COLLECTED = ROOT / "out" / "docs"  # as the configuration says
+COLLECTED, SITE = ROOT / "out" / "docs", ROOT / "out" / "site"  # as the configuration says
 
 #: Pages that are files of the repository.
 SOURCES = {
@@ -43,10 +43,12 @@ SOURCES = {
     "changelog.md": "CHANGELOG.md",
 }
 #: Packages whose `__all__` is the Python interface.
-PACKAGES = ("csplat", "csplat_tools", "csplat_render")
+PACKAGES = ("csplat", "csplat_tools", "csplat_render", "csplat_trainer")
 _DOCSTRING_ALONE = "{members: false, show_root_heading: false, show_root_toc_entry: false}"
 _PICTURES = {".svg", ".png", ".webp"}
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+_COMMENT = re.compile(r"^<!--.*?-->\n", re.MULTILINE)
+_WORDS = re.compile(r"^(`{3,}\w+) .+$", re.MULTILINE)
 _FENCE = re.compile(r"^\s*(`{3,}|~{3,})")
 _ITEM = re.compile(r"^(?:[-*]|\d+\.) ")
 _COLUMNS = "80"
@@ -119,7 +121,7 @@ def collect(folder: Path) -> None:
     pictures: set[str] = set()
     for page, source in pages().items():
         text = rewritten((ROOT / source).read_text("utf-8"), source, pictures.add)
-        (folder / page).write_text(with_room_for_lists(text), "utf-8")
+        (folder / page).write_text(for_python_markdown(text), "utf-8")
     for path in pictures:
         shutil.copy(ROOT / path, folder / "pictures")
     (folder / "commands.md").write_text(commands(), "utf-8")
@@ -143,9 +145,13 @@ def python() -> str:
     """The reference of the Python interface: directives for mkdocstrings, which reads the docstrings."""
     parts = ["# Python\n"]
     for package in PACKAGES:
-        names = [name for name in import_module(package).__all__ if name.isidentifier() and not name.isupper()]
+        module = import_module(package)
         parts += [f"## {package}\n\n::: {package}\n    options: {_DOCSTRING_ALONE}\n"]
-        parts += [f"::: {package}.{name}\n" for name in names if not name.startswith("_")]
+        for name in sorted(getattr(module, "__all__", ()), key=lambda name: (name[0].isupper(), name)):
+            one = getattr(module, name)
+            if callable(one) and hasattr(one, "__qualname__"):
+                options = f"{{heading: {package}.{name}, toc_label: {name}}}"
+                parts += [f"::: {one.__module__}.{one.__qualname__}\n    options: {options}\n"]
     return "\n".join(parts)
 
 
@@ -163,8 +169,13 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "COLUMNS": _COLUMNS, "NO_COLOR": "1", "TERM": "dumb", "PYTHONIOENCODING": "utf-8"}
 
 
-def with_room_for_lists(text: str) -> str:
-    """Put an empty line before each list: Python-Markdown wants one, GitHub does not."""
+def for_python_markdown(text: str) -> str:
+    """Mend what GitHub takes and Python-Markdown does not.
+
+    A comment would have what follows it taken for HTML, a block of code may name its language alone, a list wants an
+    empty line before it.
+    """
+    text = _WORDS.sub(r"\1", _COMMENT.sub("", text))
     lines: list[str] = []
     fence = ""
     for line in text.split("\n"):
@@ -182,7 +193,22 @@ def main() -> int:
     """Collect the pages, run the generator; a warning of its is an error."""
     collect(COLLECTED)
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-f", str(CONFIGURATION)]
-    return subprocess.run(words, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, check=False).returncode
+    status = subprocess.run(words, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, check=False).returncode
+    lost = [page for page in pages() if not status and _is_cut(page)]
+    for page in lost:
+        print(f"{page}: headings, tables or blocks of code are missing")
+    return status or bool(lost)
+
+
+def _is_cut(page: str) -> bool:
+    """Whether the generator lost some of a page: Python-Markdown does not see all that GitHub sees."""
+    text = (COLLECTED / page).read_text("utf-8")
+    html = (SITE / page).with_suffix(".html").read_text("utf-8").partition("md-content__inner")[2]
+    blocks = len(re.findall(r"(?ms)^(`{3,}).*?^\1$", text))
+    prose = re.sub(r"(?ms)^(`{3,}).*?^\1$", "", text)
+    headings, tables = (len(re.findall(one, prose, re.MULTILINE)) for one in (r"^#{1,6} ", r"^\|[ :|-]+\|$"))
+    found = len(re.findall(r"<h[1-6] id=", html)), html.count("<table>"), html.count("<pre>")
+    return found != (headings, tables, blocks)
 
 
 if __name__ == "__main__":
