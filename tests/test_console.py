@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from csplat_tools.files import console
-from csplat_tools.files.console import Display, format_seconds, note, progress_bar, say, step_progress
+from csplat_tools.files.console import Display, format_range, format_seconds, note, progress_bar, say, step_progress
 
 
 class Clock:
@@ -73,6 +73,22 @@ def test_a_stage_may_have_words_of_its_own(clock, capsys, monkeypatch):
     assert ["training step 40, 3 s left; 0:10 so far"] == lines(display, clock, capsys, 11)
 
 
+def test_long_runs_say_soon_how_long_they_take(clock, capsys):
+    def step(iteration):
+        return type("Step", (), {"iteration": iteration, "iterations": 5000})()
+
+    with step_progress("training", lambda _: "", clock=clock) as show:
+        for iteration in (1000, 1100, 1200):  # one that goes on
+            show(step(iteration))
+            clock.now += 4.0
+    assert "training takes about 2 to 5 minutes from here\n" == capsys.readouterr().err
+    with step_progress("training", lambda _: "", clock=clock) as show:
+        for iteration in (4600, 4800):
+            show(step(iteration))
+            clock.now += 4.0
+    assert "" == capsys.readouterr().err
+
+
 def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("COLUMNS", "120")
@@ -117,3 +133,6 @@ def test_the_quiet_and_the_inner_ones_show_nothing_of_their_own():
 
 def test_durations_are_short():
     assert ["0 s", "99 s", "2 minutes"] == [format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
+    assert ["20 to 50 s", "1 to 2 minutes", "2 to 5 minutes"] == [
+        format_range(*between) for between in ((20.0, 50.0), (30.0, 110.0), (120.0, 290.0))
+    ]

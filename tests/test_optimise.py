@@ -502,8 +502,29 @@ def test_the_file_says_what_it_stands_for(at_30):
     assert 900 == decode_scene(at_30.result.data).stated_errors.source_count
 
 
-def test_keeping_all_is_expected_to_be_sooner(scene):
-    target, options = Target(psnr=30.0), EncodeOptions()
-    quick, slow = (expected_seconds(scene, options, target, keep_all=keep) for keep in (True, False))
-    assert quick < slow
-    assert quick == expected_seconds(scene, EncodeOptions(preset="fast"), target, keep_all=False)
+def test_time_is_foretold_by_pictures_and_less_where_all_stay(scene, monkeypatch):
+    monkeypatch.setattr("csplat_tools.optimise.optimiser.picture_seconds", lambda *_, **__: 0.1)
+    target, options, views = Target(psnr=30.0), EncodeOptions(), find_view_set(scene)
+    quick, slow = (expected_seconds(scene, options, target, views, keep_all=keep) for keep in (True, False))
+    assert quick[0] < 52.0 < quick[1] < slow[0] < 340.0 < slow[1]
+    assert quick == expected_seconds(scene, EncodeOptions(preset="fast"), target, views, keep_all=False)
+
+
+def test_seconds_of_a_picture_are_measured(scene, monkeypatch):
+    from csplat_tools.views import timing
+
+    cameras, drawn, now = comparison_cameras(scene), [], [0.0]
+
+    def renderer(*_, **__):
+        def draw(camera):
+            drawn.append(camera.W)
+            now[0] += camera.W * camera.H / 1e6
+
+        return draw
+
+    monkeypatch.setattr(timing, "renderer", renderer)
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    assert pytest.approx(0.3072) == timing.picture_seconds(scene, cameras)
+    assert [640, 640, 640] == drawn  # the first one is not counted
+    assert pytest.approx(0.3072) == timing.picture_seconds(scene, cameras, mode="exact")
+    assert [80] == drawn[3:]

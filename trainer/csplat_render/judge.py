@@ -83,6 +83,7 @@ class Judge:
         *,
         mode: Mode = "standard",
         threads: int | None = None,
+        progress: Callable[[str, float], None] | None = None,
     ) -> Judge:
         """Judge by what the source looks like.
 
@@ -90,11 +91,18 @@ class Judge:
             source: the scene that others are compared with.
             cameras: where to stand, relative to the source's origin.
             background, mode, threads: see above.
+            progress: is told how much of it is drawn.
         """
         draw = renderer(source, background, mode=mode, threads=threads)
         looks: list[Look | Callable[[], Look]] = [partial(_rendered, draw, camera) for camera in cameras]
         if sum(12 * camera.W * camera.H for camera in cameras) <= _KEPT_BYTES:
-            looks = [_rendered(draw, camera) for camera in cameras]
+            looks = []
+            for camera in cameras:
+                if progress is not None:
+                    progress("drawing the source", len(looks) / len(cameras))
+                looks.append(_rendered(draw, camera))
+            if progress is not None:
+                progress("drawing the source", 1.0)
         return cls(cameras, looks, background, mode, threads, source.origin)
 
     def look(self, number: int) -> Look:

@@ -19,7 +19,7 @@ from csplat_tools.cli.options import Group, Importance, Output, SourceIndex, com
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
-from csplat_tools.files.console import Progress, format_bytes, format_table, note
+from csplat_tools.files.console import Progress, format_bytes, format_range, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import check_name
@@ -213,9 +213,10 @@ def _reach(
         from csplat_tools.optimise.optimiser import expected_seconds
 
         around = views.find(model, out, **virtual.given())
-        seconds = expected_seconds(model, encoding, target, keep_all=goal.keep_all)
-        if seconds > _SECONDS_WORTH_SAYING:
-            out.remark(_forecast(seconds, may_keep_all=not goal.keep_all and goal.keep is None))
+        if not out.quiet and len(model) and around.judges:
+            seconds = expected_seconds(model, encoding, target, around, keep_all=goal.keep_all)
+            if seconds[1] > _SECONDS_WORTH_SAYING:
+                out.remark(_forecast(seconds, may_keep_all=not goal.keep_all and goal.keep is None))
     made = csplat_tools.encode_to(
         model, psnr=target.psnr, size=target.size_bytes, loss=target.max_loss, keep=target.keep,
         errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
@@ -224,11 +225,10 @@ def _reach(
     return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
 
 
-def _forecast(seconds: float, *, may_keep_all: bool) -> str:
+def _forecast(seconds: tuple[float, float], *, may_keep_all: bool) -> str:
     """One line: how long it takes, and how to have it sooner."""
-    about = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} minutes"
     sooner = "--keep-all takes a sixth of that, a preset seconds" if may_keep_all else "a preset takes seconds"
-    return f"this takes about {about} on two cores; {sooner}"
+    return f"this takes about {format_range(*seconds)} here; {sooner}"
 
 
 def _stated(encoded: Encoded) -> list[str]:

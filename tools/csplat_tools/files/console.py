@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ __all__ = [
     "Progress",
     "finite",
     "format_bytes",
+    "format_range",
     "format_seconds",
     "format_table",
     "note",
@@ -38,6 +38,9 @@ _PATIENCE = 2.0  # seconds for which a terminal shows nothing
 _EVERY = 10.0  # seconds from one line to the next where there is no terminal
 _LOOK = 0.2  # seconds from one look at the clock to the next
 _ENOUGH = (0.03, 1.0)  # share and seconds of a stage from which the rest of it is judged
+_TOLD = 2  # reports of steps from which the others are judged,
+_SPREAD = (0.8, 2.0)  # how much less and more they may take: a scene that grows takes longer,
+_WORTH_SAYING = 10.0  # and seconds of them that are foretold
 _STAGES = 2  # that are shown at a time: those that were told last
 _WORKING = "working"  # where no stage is known
 _MINUTES_FROM = 100.0  # seconds
@@ -91,16 +94,31 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
 
 
 @contextmanager
-def step_progress(name: str, tell: Callable[[S], str], *, quiet: bool = False) -> Iterator[Callable[[S], None] | None]:
-    """Show the steps of a long run as `progress_bar` does, in words of its own.
+def step_progress(
+    name: str, tell: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[[S], None] | None]:
+    """Show the steps of a long run as `progress_bar` does, in words of its own, and soon how long all of them take.
 
     Args:
         name: of what is done.
         tell: says in a line where a run stands, and what is left.
         quiet: show nothing.
+        clock: seconds.
     """
+    told: list[tuple[float, int]] = []
+
+    def show(now: S) -> None:
+        told.append((clock(), now.iteration))
+        if len(told) == _TOLD:  # the first steps, which load and compile, say nothing of the others
+            (begun, first), (seconds, last) = told[0], told[-1]
+            left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
+            if left > _WORTH_SAYING:
+                note(f"{name} takes about {format_range(_SPREAD[0] * left, _SPREAD[1] * left)} from here")
+        if display is not None:
+            display.tell(name, now.iteration / now.iterations, tell(now))
+
     with _displayed(quiet=quiet) as display:
-        yield None if display is None else partial(_tell_step, display, name, tell)
+        yield None if display is None else show
 
 
 @dataclass
@@ -211,6 +229,13 @@ def format_seconds(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
 
 
+def format_range(least: float, most: float) -> str:
+    """Format what lies between two durations: `20 to 50 s`, `2 to 5 minutes`."""
+    if most < _MINUTES_FROM:
+        return f"{least:.0f} to {most:.0f} s"
+    return f"{max(1.0, least / 60.0):.0f} to {most / 60.0:.0f} minutes"
+
+
 _displays: list[Display] = []  # the one that is shown: there is one standard error
 
 
@@ -238,10 +263,6 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
         ended.set()
         thread.join()
         display.close()
-
-
-def _tell_step(display: Display, name: str, tell: Callable[[S], str], now: S) -> None:
-    display.tell(name, now.iteration / now.iterations, tell(now))
 
 
 def _words(stage: _Stage, now: float) -> str:

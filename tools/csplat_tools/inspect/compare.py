@@ -147,7 +147,7 @@ def compare(
         prepare()
     judges = None if by_photographs is None else _Both(by_photographs, distance)
     viewers += [] if judges is None else [judges]
-    judge = views.judge(source.model, mode=mode, background=background)
+    judge = views.judge(source.model, mode=mode, background=background, progress=progress)
     quality = judge.scores(other.model, lpips=distance, on_view=_all_of(viewers), progress=progress)
     return Comparison(
         source, other, errors, quality, judge.look(0).ignored, views.name,

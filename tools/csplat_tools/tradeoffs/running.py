@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from csplat.errors import CsplatError, InputError
+from csplat.errors import CsplatError, InputError, counted
 from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import Progress, format_bytes
+from csplat_tools.files.console import Progress, format_bytes, format_range
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
@@ -25,6 +25,7 @@ __all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
 # Seconds by kind of point, on two cores: for each million splats, and for each second that eight
 # pictures of the source take; for an estimate that a person decides by, no more.
+_SPREAD = (0.6, 1.7)  # how much less and more all of them may take
 _COSTS = {
     "presets": (12.0, 15.0),
     "precision": (12.0, 6.0),
@@ -157,7 +158,8 @@ def tradeoff(
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
         costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        tell(f"{len(tried)} files to make and to measure: about {_duration(sum(costs))}")
+        about = format_range(_SPREAD[0] * sum(costs), _SPREAD[1] * sum(costs))
+        tell(f"{counted(len(tried), 'file')} to make and to measure: about {about} here")
         points = list[Point | Failure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
@@ -193,7 +195,3 @@ def _line(point: Point | Failure, number: int, count: int) -> str:
         return f"{number}/{count} {point.name}: {point.error}"
     size, seconds = format_bytes(point.size_bytes), f"{point.encode_seconds:.1f} s"
     return f"{number}/{count} {point.name}: {size}, {point.psnr:.2f} dB, {seconds}"
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} minutes"

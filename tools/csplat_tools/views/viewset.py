@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -83,6 +83,7 @@ class ViewSet:
         background: Colour | None = None,
         mode: Mode = "standard",
         threads: int | None = None,
+        progress: Callable[[str, float], None] | None = None,
     ) -> Judge:
         """What judges by renders of the source.
 
@@ -90,12 +91,13 @@ class ViewSet:
             source: the scene.
             background: another one than is said above.
             mode, threads: of the renderer.
+            progress: is told how much of the source is drawn.
 
         Raises:
             InputError: no view judges.
         """
         colour = background or self.judging_background
-        return Judge.of_source(source, self.judges, colour, mode=mode, threads=threads)
+        return Judge.of_source(source, self.judges, colour, mode=mode, threads=threads, progress=progress)
 
     def decider(self, source: SplatModel, *, threads: int | None = None) -> Judge:
         """What decides by renders of the source.

@@ -1,0 +1,39 @@
+"""How long pictures of a scene take on this machine, now: what long work is foretold by."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from csplat.model import SplatModel
+from csplat_render import Camera, Mode
+from csplat_render.cameras import resized
+from csplat_render.judge import renderer
+
+__all__ = ["picture_seconds"]
+
+_SAMPLES = 2  # cameras that are tried
+_SMALLER = 8  # times on each side, where a whole picture takes a minute: seconds grow with its pixels
+
+
+def picture_seconds(
+    source: SplatModel, cameras: Sequence[Camera], *, mode: Mode = "standard", threads: int | None = None
+) -> float:
+    """Seconds that a picture takes, by some that are made and thrown away.
+
+    Args:
+        source: the scene.
+        cameras: one at least.
+        mode, threads: of the renderer.
+    """
+    draw = renderer(source, (0.0, 0.0, 0.0), mode=mode, threads=threads)
+    tried, times = cameras[:: max(1, len(cameras) // _SAMPLES)][:_SAMPLES], 1
+    if mode == "exact":
+        times = _SMALLER**2
+        tried = [resized(one, max(1, one.W // _SMALLER), max(1, one.H // _SMALLER)) for one in tried[:1]]
+    else:
+        draw(tried[0])  # buffers are made, kernels loaded
+    start = time.perf_counter()
+    for camera in tried:
+        draw(camera)
+    return times * (time.perf_counter() - start) / len(tried)
