@@ -109,7 +109,7 @@ def _pictures(tradeoff: Tradeoff) -> str:
             blocks.append(f"{head}\n{picture_row(point.hardest, point.name)}")
     virtual = tradeoff.setting.views.name == VIRTUAL
     text = f"The presets, and files of the dashed line. {PICTURES}" + (
-        " The views are other ones than those that judge: chosen because they show the scene well." if virtual else ""
+        " The views are chosen because they show the scene well; they need not be those that judge." if virtual else ""
     )
     return f"<h2>The hardest places</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
 

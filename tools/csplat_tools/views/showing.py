@@ -21,7 +21,7 @@ __all__ = ["showing_cameras"]
 
 _COUNT, _SIZE = 6, (640, 480)
 _TRIED, _POINTS, _SEED = 64, 40_000, 0
-_GOOD_DETAIL = 0.65  # of the best view's
+_GOOD_DETAIL = 0.8  # of the best view's
 _HIDING = 0.4  # extents; what is nearer only hides
 
 
