@@ -42,7 +42,7 @@ spec: $(VENV)/.dev ## write constants and tables from the registry
 sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, train; some minutes
 	$(BIN)/python tools/sample/make_sample.py
 
-docs: $(VENV)/.dev ## the documentation, as a site in out/site
+docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[docs]'
 	$(BIN)/python tools/docs/make_site.py
 

@@ -4,7 +4,6 @@ import itertools
 import json
 import re
 import shlex
-import sys
 import tomllib
 from pathlib import Path
 
@@ -149,7 +148,6 @@ def test_the_commands_of_the_tutorial_run_one_after_the_other(tmp_path, monkeypa
     assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "back.ply"} == {
         path.name for path in tmp_path.iterdir()
     }
-    sys.modules.pop("make_sample")
 
 
 def smaller(words, numbers):
