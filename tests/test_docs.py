@@ -90,6 +90,16 @@ def test_the_encoder_still_writes_files_of_the_sizes_that_the_readme_states(samp
         assert size == pytest.approx(MEASURED["presets"][name]["bytes"], rel=0.02)
 
 
+def test_a_package_index_shows_nothing_that_only_a_checkout_has():
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
+    text = README
+    for one in hook["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(one["pattern"], one["replacement"], text)
+    assert text.startswith("# csplat\n")
+    assert not re.search(r"\]\((?!https?:)", text)
+    assert len(text) > 0.7 * len(README)
+
+
 def test_all_files_that_name_the_version_name_the_same():
     assert csplat.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
     assert csplat.__version__ == json.loads((ROOT / "codec" / "js" / "package.json").read_text("utf-8"))["version"]

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import csplat
+from csplat.encoder.options import PresetName
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.plots import new_figure, save_svg
@@ -43,9 +44,9 @@ FOLDER = Path(__file__).resolve().parent
 SAMPLE = FOLDER.parent / "csplat_tools" / "data" / "sample.ply"
 PICTURES = FOLDER / "pictures"
 MEASURED = FOLDER / "measured.json"
-SHOWN = "balanced"  # the file beside the source
+SHOWN: PresetName = "balanced"  # the file beside the source
 
-_PRESETS = ("fast", "balanced", "small")
+_PRESETS: tuple[PresetName, ...] = ("fast", "balanced", "small")
 _WHOLE = (30, 34, 38, 42, 46, 50)  # dB wanted, every splat kept
 _FEWER = (30, 34, 38)  # dB wanted, splats removed and the others fitted
 _RUNS = 5
