@@ -158,6 +158,39 @@ def test_files_of_the_other_kind_are_typed_errors(files):
                 call(form(wrong))
 
 
+def test_a_ply_that_is_to_be_decoded_is_called_what_it_is(files):
+    with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read_ply reads"):
+        csplat.decode(files[1])
+
+
+def test_what_wants_an_extra_says_so_and_what_does_not_works_without(files):
+    code = f"""
+import sys
+sys.modules["numba"] = None
+import csplat, csplat_render, csplat_tools, csplat_trainer
+from csplat_render.virtual import virtual_cameras
+path = {str(files[1])!r}
+model = csplat.read_ply(path)
+csplat_tools.encode_to(path, errors={{"means": 0.01}})
+for call in (
+    lambda: csplat_tools.encode_to(path, psnr=40.0),
+    lambda: csplat_tools.simplify(path, keep=0.5),
+    lambda: csplat_tools.compare(path, path),
+    lambda: csplat_tools.tradeoff(path),
+    lambda: csplat_trainer.train(path),
+    lambda: csplat_trainer.finetune(model, None),
+    lambda: csplat_render.render(model, virtual_cameras(model, 1, 8, 8)[0]),
+):
+    try:
+        call()
+    except csplat.InputError as error:
+        assert "this needs numba: pip install 'csplat[render]'" == str(error), error
+    else:
+        raise SystemExit("nothing was said")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 # targets
 
 
@@ -182,6 +215,8 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
         ({"psnr": 40.0, "size": 1000}, "one of them"),
         ({"size": "5 parsecs"}, "wanted bytes"),
         ({"errors": {"colour": 1.0}}, "no measure"),
+        ({"errors": {"means": "2mm"}}, "means is '2mm', wanted a number"),
+        ({"psnr": "40"}, "psnr is '40', wanted a number"),
     ],
 )
 def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, says):

@@ -25,7 +25,8 @@ from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
 from csplat_tools.optimise import optimiser
-from csplat_tools.optimise.optimiser import encode_to, expected_seconds
+from csplat_tools.optimise.optimiser import expected_seconds
+from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance

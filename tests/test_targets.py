@@ -13,7 +13,7 @@ from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_tools.optimise.bounds import meet_bounds
-from csplat_tools.optimise.optimiser import encode_to
+from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")

@@ -66,14 +66,22 @@ def lazy_exports(package: str, module_of: Mapping[str, str]) -> Callable[[str], 
 
     Args:
         package: its name.
-        module_of: by name, the module that has it.
+        module_of: by name, the module that has it. One that wants a package of an extra, which is not installed, is an
+            `InputError` that says how to get it.
     """
 
     def get(name: str) -> object:
         module = module_of.get(name)
         if module is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value: object = getattr(import_module(module), name)
+        try:
+            value: object = getattr(import_module(module), name)
+        except ModuleNotFoundError as error:
+            if (error.name or "csplat").startswith("csplat"):
+                raise
+            from csplat.errors import missing
+
+            raise missing(error) from None
         setattr(sys.modules[package], name, value)  # the next access does not come here again
         return value
 

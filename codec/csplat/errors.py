@@ -12,7 +12,7 @@ Every error has a `code`, a short constant string that programs may compare.
 
 from __future__ import annotations
 
-__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError", "counted"]
+__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError", "counted", "missing"]
 
 
 class CsplatError(Exception):
@@ -146,6 +146,17 @@ def counted(count: int, one: str, many: str | None = None) -> str:
         many: that for others; `None`: the same with an s.
     """
     return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def missing(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
+    """One line for a package that a plain install leaves out.
+
+    Args:
+        error: of its import.
+        package: its name, where that is not the module's.
+        extra: what brings it.
+    """
+    return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 
 
 def _join(detail: str, found: object, wanted: object) -> str:

@@ -68,7 +68,7 @@ def _parts(file: Any) -> Iterator[memoryview]:
             return
         while data := file.read(_PART_SIZE):
             yield memoryview(data)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:  # the latter of text that does not decode
         raise InputError(
             f"a {type(file).__name__} is no file, wanted a path, a binary file or bytes: {error}"
         ) from None

@@ -98,7 +98,9 @@ class SplatModel:
     means_double: F64 | None = None
 
     def __post_init__(self) -> None:
-        n = len(self.means) if getattr(self.means, "ndim", 0) else 0
+        if not isinstance(self.means, np.ndarray):
+            _check_array("means", self.means, ("N", 3))
+        n = len(self.means) if self.means.ndim else 0
         if self.shN is _NO_SH:
             object.__setattr__(self, "shN", np.zeros((n, 0, 3), np.float32))
         _check_array("means", self.means, (n, 3))

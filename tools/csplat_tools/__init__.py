@@ -19,7 +19,7 @@ from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 if TYPE_CHECKING:
     from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
     from csplat_tools.inspect.compare import Comparison, compare
-    from csplat_tools.optimise.optimiser import encode_to
+    from csplat_tools.optimise.reaching import encode_to
     from csplat_tools.optimise.report import Optimised
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
     from csplat_tools.tradeoffs.options import Wanted
@@ -61,7 +61,7 @@ _MODULE_OF = {
     "ViewSet": "csplat_tools.views",
     "Wanted": "csplat_tools.tradeoffs.options",
     "compare": "csplat_tools.inspect.compare",
-    "encode_to": "csplat_tools.optimise.optimiser",
+    "encode_to": "csplat_tools.optimise.reaching",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.files.scenes",
     "simplify": "csplat_tools.optimise.simplify",

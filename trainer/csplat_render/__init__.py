@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from csplat.errors import missing
 from csplat_render.camera import Camera
 from csplat_render.conventions import Mode
 
@@ -52,12 +53,15 @@ def render(
         (48, 64, 3)
 
     Raises:
-        InputError: shapes do not fit together, or an option is not one of these.
+        InputError: shapes do not fit together, or an option is not one of these; or numba is not installed.
         LimitError: too many splats are too large: `rasterise.MAX_INTERSECTIONS`.
     """
     # numba takes a second to import: those who want cameras alone do not wait for it.
-    from csplat_render.rasterise import Rasteriser
-    from csplat_render.twin import render_exact
+    try:
+        from csplat_render.rasterise import Rasteriser
+        from csplat_render.twin import render_exact
+    except ModuleNotFoundError as error:
+        raise missing(error) from None
 
     if antialiased is None:
         antialiased = bool(getattr(model, "antialiased", False))

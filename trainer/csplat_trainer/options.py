@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE
@@ -13,11 +14,16 @@ __all__ = ["BACKGROUNDS", "DEVICES", "INITS", "LOSSES", "STRATEGIES", "TrainOpti
 #: How splats come and go: `mcmc` grows to the cap and moves dead splats, with noise and
 #: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and
 #: prunes; `none` keeps what it began with.
-STRATEGIES = ("mcmc", "fixed", "gradient", "none")
-LOSSES = ("inria", "study", "l1")
-INITS = ("auto", "points", "hull", "box")
-BACKGROUNDS = ("auto", "black", "white", "random")
-DEVICES = ("cpu", "cuda")
+Strategy = Literal["mcmc", "fixed", "gradient", "none"]
+Loss = Literal["inria", "study", "l1"]
+Init = Literal["auto", "points", "hull", "box"]
+Background = Literal["auto", "black", "white", "random"]
+Device = Literal["cpu", "cuda"]
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+LOSSES: tuple[Loss, ...] = get_args(Loss)
+INITS: tuple[Init, ...] = get_args(Init)
+BACKGROUNDS: tuple[Background, ...] = get_args(Background)
+DEVICES: tuple[Device, ...] = get_args(Device)
 
 
 @dataclass(frozen=True)
@@ -75,13 +81,13 @@ class TrainOptions:
     sh_degree: int = 3
     iterations: int = 7_000
     seed: int = 0
-    device: str = "cpu"
-    strategy: str = "mcmc"
-    init: str = "auto"
+    device: Device = "cpu"
+    strategy: Strategy = "mcmc"
+    init: Init = "auto"
     initial_splats: int = 0
-    background: str = "auto"
+    background: Background = "auto"
     antialiased: bool = False
-    loss: str = "inria"
+    loss: Loss = "inria"
     lpips_weight: float = 0.0
     lr_means: float = 3.2e-4
     lr_means_final: float = 3.2e-6
@@ -106,7 +112,7 @@ class TrainOptions:
     log_every: int = 100
 
     def __post_init__(self) -> None:
-        if self.device == "mps":
+        if str(self.device) == "mps":
             raise InputError("device mps is not supported: --device cpu runs on the same machine")
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:

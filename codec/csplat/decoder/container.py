@@ -136,7 +136,8 @@ def read_file_header(view: memoryview) -> _spec.Header:
     header = _spec.unpack_header(view)
     places = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
-        raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
+        detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else ""
+        raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     version = (header.version_major, header.version_minor)
     if version != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
         raise UnsupportedError(

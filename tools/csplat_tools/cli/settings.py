@@ -12,8 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
-from csplat.errors import InputError
-from csplat_tools.files.extras import missing
+from csplat.errors import InputError, missing
 
 __all__ = ["Settings", "describe_settings", "read_settings"]
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from importlib import import_module
 
-from csplat.errors import InputError
+from csplat.errors import missing
 from csplat_tools.files.console import note, progress_bar
 
 __all__ = [
-    "missing",
     "need_film",
     "need_photographs",
     "need_pictures",
@@ -132,11 +131,6 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
         import_module(module)
     except ModuleNotFoundError as error:
         raise missing(error, package, extra=extra) from None
-
-
-def missing(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
-    """One line for a package that is not installed."""
-    return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 
 
 def _wait_frugally() -> None:

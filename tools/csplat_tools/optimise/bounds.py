@@ -14,7 +14,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress
 
-__all__ = ["Bounded", "meet_bounds"]
+__all__ = ["Bounded", "Weights", "meet_bounds"]
+
+#: How much splats matter, as for the encoder.
+Weights = NDArray[Any] | Importance
 
 _TRIES = 12
 _NEAR = 0.9  # of a bound that is good enough; below it a coarser step is tried
@@ -48,7 +51,7 @@ def meet_bounds(
     encoding: EncodeOptions,
     bounds: Mapping[str, float],
     *,
-    importance: NDArray[Any] | Importance | None = None,
+    importance: Weights | None = None,
     progress: Progress | None = None,
 ) -> Bounded:
     """Find steps with which no splat errs by more than is allowed.

@@ -1,4 +1,4 @@
-"""`encode_to`: the smallest file at a PSNR or a loss, the best one within a size, by every move that files have.
+"""`optimise`: the smallest file at a PSNR or a loss, the best one within a size, by every move that files have.
 
 Moves are the precision, from which all steps follow; what is kept of SH and how it is coded; grades; how many splats
 stay, the others being fitted to what the source looks like. Every kind of file is brought near the goal by a few tries
@@ -8,41 +8,34 @@ whether they are better. Nothing is tried that is not expected to pay.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Importance
+from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
 from csplat_tools.files.console import Progress
-from csplat_tools.files.extras import need_renderer
-from csplat_tools.files.scenes import SceneLike, load_model
-from csplat_tools.optimise.bounds import Bounded, meet_bounds
+from csplat_tools.optimise.bounds import Weights
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.goals import goal_of
 from csplat_tools.optimise.moves import Moves
 from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.report import Optimised, Report
+from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.reporting import reported
 from csplat_tools.optimise.sensitivity import measured_for
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.solving import Solver
-from csplat_tools.optimise.target import Target, parse_size_bytes
+from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, Whole
-from csplat_tools.views import VIRTUAL, ViewSet, find_view_set, with_deciders
+from csplat_tools.views import VIRTUAL, ViewSet, with_deciders
 from csplat_tools.views.timing import picture_seconds
 
-__all__ = ["encode_to", "expected_seconds"]
+__all__ = ["check", "expected_seconds", "optimise"]
 
-Weights = NDArray[Any] | Importance
 #: What a target costs, in pictures of 640x480, without and with removal: 380 to 690 and 2,800 to 3,900 of plane3,
 #: donut, lego60k and fox120k. And how much less and more it may be.
 _PICTURES = (520.0, 3400.0)
@@ -53,81 +46,7 @@ _INSIDE = (
 )
 
 
-def encode_to(
-    scene: SceneLike,
-    *,
-    psnr: float | None = None,
-    size: int | str | None = None,
-    loss: float | None = None,
-    keep: float | None = None,
-    errors: Mapping[str, float] | None = None,
-    views: ViewSet | None = None,
-    options: EncodeOptions | None = None,
-    keep_all: bool = False,
-    importance: Weights | None = None,
-    simplifying: SimplifyOptions | None = None,
-    progress: Callable[[str, float], None] | None = None,
-) -> Optimised:
-    """Encode a scene so that its file keeps to a target: what `csplat encode` calls where one is given.
-
-    One of `psnr`, `size`, `loss` and `keep` is wanted, or `errors`, alone or beside one of the first two. All but
-    `errors` alone render pictures, which takes minutes, and want the packages of the render extra.
-
-    Args:
-        scene: a model, or a file of either kind.
-        psnr: dB of the file's renders against the source's, at least, pooled over the views that judge; the smallest
-            such file is looked for.
-        size: bytes at most, or text as "5MB"; the best picture within them is looked for.
-        loss: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such file.
-        keep: share of the splats that stay, above 0, at most 1, at the precision of the preset.
-        errors: the largest error of any splat, by measure: `means` in scene units, `covariance` relative,
-            `opacities`, `sh0`, `sh1`, `sh2`, `sh3`.
-        views: teach, decide and judge; `None`: virtual ones around the scene (`find_view_set`).
-        options: knobs that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
-        keep_all: every splat stays as it is: a sixth of the time.
-        importance: how much splats matter, as for the encoder.
-        simplifying: how splats are removed and fitted; its background is that of the views.
-        progress: is told the stage and the share of it that is done, 0 to 1.
-
-    Returns:
-        The file's bytes (`data`), what the encoder says of it (`result`), and how it was found (`report`).
-
-    Example:
-        >>> import csplat, csplat_tools
-        >>> found = csplat_tools.encode_to(
-        ...     "scene.ply", errors={"means": 0.001}, options=csplat.EncodeOptions(preset="fast")
-        ... )
-        >>> found.report.reached["means"] <= 0.001
-        True
-        >>> csplat.decode(found.data)
-        SplatModel(1000 splats, sh_degree=3)
-
-    Raises:
-        InputError: there are no splats, a knob is set that the target has to choose, or it is out of reach.
-        CsplatError: the file is none.
-        OSError: it cannot be read.
-    """
-    start = time.perf_counter()
-    target = Target(psnr, parse_size_bytes(size) if isinstance(size, str) else size, loss, keep, dict(errors or {}))
-    source, encoding = load_model(scene).model, options or EncodeOptions()
-    if target.is_rendered:
-        need_renderer()
-        _check(source, target, encoding, keep_all=keep_all)
-    files = 0
-    if target.max_error:
-        bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
-        if not target.is_rendered:
-            return _bounded(source, target, bounded, start)
-        files, encoding = bounded.encodes, bounded.encoding
-    found, report = _found(
-        source, target, views or find_view_set(source), encoding, keep_all=keep_all, importance=importance,
-        simplifying=simplifying, progress=progress,
-    )  # fmt: skip
-    seconds = round(time.perf_counter() - start, 3)
-    return Optimised(found.result, replace(report, encodes=files + report.encodes, seconds=seconds))
-
-
-def _found(
+def optimise(
     source: SplatModel,
     target: Target,
     views: ViewSet,
@@ -138,7 +57,17 @@ def _found(
     simplifying: SimplifyOptions | None,
     progress: Progress | None,
 ) -> tuple[Trial, Report]:
-    """Look for the file by its pictures; see `encode_to`. Seconds are not in the report yet."""
+    """Look for the file by its pictures. The report does not know the seconds yet.
+
+    Args:
+        source: the scene.
+        target: what is asked for, and not largest errors alone.
+        views: teach, decide and judge; no view does two of these.
+        encoding, keep_all, importance, simplifying, progress: as for `encode_to`.
+
+    Raises:
+        InputError: it is out of reach, no splat shows, or a loss is asked for without photographs.
+    """
     views = with_deciders(views)
     judge = views.judge(source, threads=encoding.threads)
     if views.name != VIRTUAL and _is_empty(judge):
@@ -178,21 +107,6 @@ def _found(
     return found, report
 
 
-def _bounded(source: SplatModel, target: Target, bounded: Bounded, start: float) -> Optimised:
-    """The file that keeps to largest errors and to nothing else; nothing is rendered."""
-    result = bounded.result
-    report = Report(
-        goal=target.as_json(),
-        size_bytes=len(result.data),
-        splats=result.report.splat_count,
-        splats_before=len(source),
-        encodes=bounded.encodes,
-        seconds=round(time.perf_counter() - start, 3),
-        reached={name: result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
-    )
-    return Optimised(result, report)
-
-
 def expected_seconds(
     source: SplatModel, encoding: EncodeOptions, target: Target, views: ViewSet, *, keep_all: bool
 ) -> tuple[float, float]:
@@ -211,7 +125,12 @@ def _all_stay(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> boo
     return target.keep is None and blocked
 
 
-def _check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_all: bool) -> None:
+def check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_all: bool) -> None:
+    """Refuse what no search can meet.
+
+    Raises:
+        InputError: there are no splats, or two things that exclude each other are asked for.
+    """
     if not len(source):
         raise InputError("a scene without splats has no size or quality to choose")
     if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:

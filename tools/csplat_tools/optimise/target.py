@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 from csplat._spec import MEASURE_NAMES
@@ -44,6 +45,9 @@ class Target:
     max_error: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name, value in {**{name: getattr(self, name) for name in _ASKED}, **self.max_error}.items():
+            if value is not None and not isinstance(value, Real):
+                raise InputError(f"{name} is {value!r}, wanted a number")
         given = [words for name, words in _ASKED.items() if getattr(self, name) is not None]
         if not given and not self.max_error:
             raise InputError("no target, wanted a size, a PSNR, a loss, a share of the splats or largest errors")

@@ -10,7 +10,7 @@ from typing import Any
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress, format_bytes
-from csplat_tools.optimise.optimiser import encode_to
+from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoffs.commands import encode_command, finetune_command, reduction_command, target_command
 from csplat_tools.tradeoffs.options import Wanted

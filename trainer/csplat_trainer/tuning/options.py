@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from csplat.errors import InputError
-from csplat_trainer.options import LOSSES
+from csplat_trainer.options import LOSSES, Loss
 
 __all__ = ["FinetuneOptions"]
 
@@ -41,7 +41,7 @@ class FinetuneOptions:
 
     iterations: int = 1_000
     seed: int = 0
-    loss: str = "inria"
+    loss: Loss = "inria"
     lr_means: float = 0.2
     lr_quats: float = 8e-3
     lr_scales: float = 2e-2

@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -33,7 +33,7 @@ from csplat_bench.datasets.runs import Settings, run_scene
 from csplat_bench.datasets.tables import means_table, notes, scenes_table
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.options import Device, TrainOptions
 
 
 def main(
@@ -58,7 +58,7 @@ def main(
     """Find the scenes, run them one after the other, print the tables."""
     try:
         training = TrainOptions(
-            iterations=iterations, max_splats=max_splats, sh_degree=sh_degree, seed=seed, device=device
+            iterations=iterations, max_splats=max_splats, sh_degree=sh_degree, seed=seed, device=cast(Device, device)
         )
     except InputError as error:
         raise WrongWords(str(error)) from None

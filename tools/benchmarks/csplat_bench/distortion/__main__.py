@@ -54,7 +54,7 @@ from csplat_bench.distortion.plot import plot as draw
 from csplat_bench.distortion.tables import tables
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.optimise.optimiser import encode_to
+from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
 from csplat_tools.views import BLACK, find_view_set
 

@@ -29,7 +29,7 @@ from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes
 from csplat_render.judge import Judge
 from csplat_tools.files.scenes import without_bands
-from csplat_tools.optimise.optimiser import encode_to
+from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.tradeoffs.measuring import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras
 
