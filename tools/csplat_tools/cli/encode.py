@@ -137,6 +137,11 @@ def encode(
     its splats lie from the source. A target chooses everything itself, also
     which splats go: that takes minutes.
 
+    --preset, of 60,000 splats of SH degree 3, 14.9 MB, on one core:
+      fast      719 kB, 42.9 dB, 0.4 s: to look at soon, and to try things
+      balanced  645 kB, 42.7 dB, 4 s: to keep and to publish
+      small     529 kB, 38.6 dB, 4 s: where bytes count more than precision
+
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
