@@ -13,6 +13,7 @@ from csplat.errors import InputError
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
+from csplat_render import jit
 from csplat_render.jit import ParallelKernel, available_threads, kernel, lane_run, parallel_kernel, thread_count
 
 
@@ -137,3 +138,16 @@ os._exit(0 if seen.all() else 3)
     environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     run = subprocess.run([sys.executable, "-c", script], env=environment, timeout=120, check=False)
     assert run.returncode == 0
+
+
+def test_compiling_is_told_once_and_running_what_is_compiled_is_not():
+    told = []
+    plain = jit.numba.njit(lambda x: x + 1)
+    with jit.on_compiling(lambda: told.append(1)):
+        assert (2, 2.5) == (plain(1), plain(1.5))  # two types, two compilations
+    assert [1] == told
+    with jit.on_compiling(lambda: told.append(2)):
+        plain(3)
+    assert [1] == told
+    assert jit.is_cached(plain)
+    assert not jit.is_cached(jit.numba.njit(lambda x: x + 2))

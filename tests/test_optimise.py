@@ -338,7 +338,7 @@ def test_no_view_that_judges_decides_or_teaches(crowded, photographed, monkeypat
         taught.append(views)
         return removal(source, views, *rest, **more)
 
-    monkeypatch.setattr(optimiser, "Trials", lambda *parts: made.append(Trials(*parts)) or made[-1])
+    monkeypatch.setattr(optimiser, "Trials", lambda *parts, **named: made.append(Trials(*parts, **named)) or made[-1])
     monkeypatch.setattr(optimiser, "Removal", remove)
     within(crowded, views, **({"loss": 1.0} if kind == "photographs" else {"psnr": 30.0}))
     trials = made[0]

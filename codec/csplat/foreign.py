@@ -57,7 +57,7 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
             f"{path.name} is not a PLY; its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that"
             f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
         )
-    raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}")
+    raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}; wanted one of Gaussian splats")
 
 
 def refuse_known(path: Path, head: bytes) -> None:

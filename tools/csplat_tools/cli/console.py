@@ -39,6 +39,7 @@ _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
     errno.EACCES: "you are not allowed to",
+    errno.EISDIR: "name a file",
     errno.ENOSPC: "no half of a file was left; make room, or name another place",
     errno.EFBIG: "no half of a file was left; name another place",
     errno.EDQUOT: "no half of a file was left; make room, or name another place",

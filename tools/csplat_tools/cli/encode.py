@@ -191,7 +191,10 @@ def encode(
     for line in encoded.result.report.notes:
         note(line)
     out.remark(*encoded.made.lines, *_stated(encoded))
-    psnr = None if out.quiet else _psnr(encoded, encoding.threads)
+    with out.bar() as progress:
+        if progress is not None:
+            progress("eight small renders", 0.0)
+        psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())

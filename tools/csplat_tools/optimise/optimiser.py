@@ -86,7 +86,7 @@ def optimise(
             raise InputError("a largest loss wants photographs (--data): it is lost against them")
         photographs = views.photograph_decider(threads=encoding.threads)
     decider = views.decider(source, threads=encoding.threads)
-    trials, sensitivity_views = Trials(encoding, judge, decider, photographs), 0
+    trials, sensitivity_views = Trials(encoding, judge, decider, photographs, progress=progress), 0
     if removal is not None and removal.left is not None:
         found = Moves.kept(trials, removal, removal.left)
     else:

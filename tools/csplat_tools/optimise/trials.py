@@ -216,6 +216,7 @@ class Trials:
         decider: in the views that decide: by them files are compared.
         photographs: those that decide, where a loss against photographs is the target.
         made: every file, in order.
+        progress: is told which file is made.
     """
 
     encoding: EncodeOptions
@@ -223,6 +224,7 @@ class Trials:
     decider: Judge
     photographs: Judge | None = None
     made: list[Trial] = field(default_factory=list)
+    progress: Progress | None = None
 
     @property
     def renders(self) -> int:
@@ -252,6 +254,8 @@ class Trials:
             alike = trial.part is part and trial.options == options and trial.coding.graded == coding.graded
             if alike and trial.is_careful == careful:
                 return trial
+        tell, stage = self.progress or (lambda _stage, _done: None), f"file {len(self.made) + 1}"
+        tell(stage, 0.0)
         coded = part.coded(options, graded=coding.graded, quick=quick)
         result = coded.write(part.said(None))
         model = decode(result.data)
@@ -260,6 +264,7 @@ class Trials:
         trial = Trial(part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr)
         said = part.said(trial)
         self.made.append(trial if said is None else trial.told(coded.write(said)))
+        tell(stage, 1.0)
         return self.made[-1]
 
     def of(self, part: Part, coding: Coding, *, careful: bool = False) -> list[Trial]:
