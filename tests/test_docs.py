@@ -155,7 +155,7 @@ def test_the_commands_of_the_tutorial_run_one_after_the_other(tmp_path, monkeypa
         words = smaller(line, {"--iterations": "6", "--max-splats": "50"})
         result = CliRunner().invoke(app, [*words[1:], "--quiet"])
         assert 0 == result.exit_code, (words, result.output, result.exception)
-    assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "back.ply"} == {
+    assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "about.html", "back.ply"} == {
         path.name for path in tmp_path.iterdir()
     }
 
