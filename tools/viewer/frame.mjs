@@ -46,7 +46,7 @@ export function quantiles(values, weights, shares) {
 
 /**
  * @param {Samples} samples
- * @param {Vec3} up an axis of the world or its opposite, for the floor and the ceiling of a room
+ * @param {Vec3} up the axis nearest to it has the floor and the ceiling of a room
  * @returns {Frame} one of extent 1 around 0 where there are no samples
  */
 export function findFrame({ samples, weights }, up) {
@@ -119,7 +119,8 @@ function isRoom(samples, even, up) {
     ),
   );
   const walls = [0, 1, 2].map((axis) => [0, 1].map((side) => wallCover(samples, bounds, axis, side)));
-  const vertical = up.findIndex((value) => Math.abs(value) > 0.5);
+  const sizes = up.map(Math.abs);
+  const vertical = sizes.indexOf(Math.max(...sizes));
   if (Math.min(...walls[vertical]) < WALL_COVER) return false;
   const sides = walls.flatMap((pair, axis) => (axis === vertical ? [] : pair));
   return sides.filter((cover) => cover >= WALL_COVER).length >= 3 && innerShare(samples, even, bounds) < INNER_SHARE;

@@ -60,7 +60,8 @@ export async function withUp(bytes, up) {
   const record = before ? records[directory.indexOf(before)] : new Uint8Array(head.directory_size);
   if (!before) records.push(record);
   putRecord(record, flags, meta, metaAt);
-  if (!isUpright(header.axes, up)) index.fill(0, spec.HEADER_SIZE + AT_INDEX.axes, spec.HEADER_SIZE + AT_INDEX.axes + 3);
+  const axesAt = spec.HEADER_SIZE + AT_INDEX.axes;
+  if (!isUpright(header.axes, up)) index.fill(spec.DIRECTION_UNSPECIFIED, axesAt, axesAt + 3);
   view.setUint16(spec.HEADER_SIZE + AT_INDEX.directory_count, count, true);
   view.setUint32(AT_HEADER.index_size, indexSize, true);
   view.setBigUint64(AT_HEADER.file_size, BigInt(at), true);

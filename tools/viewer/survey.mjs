@@ -60,11 +60,21 @@ export function detail({ samples, weights }, standsFor, { viewmat: m, fx, fy, cx
   const before = new Float32Array(COLUMNS * ROWS);
   let sum = 0;
   for (const i of order.subarray(0, inside).sort((a, b) => depths[a] - depths[b])) {
-    const area = (weights[i] * fx * fy) / depths[i] ** 2; // in cells; a splat is seldom spread over many
+    const area = (weights[i] * fx * fy) / depths[i] ** 2; // in cells
     const size = (640 / COLUMNS) * Math.sqrt(area);
-    const hidden = Math.exp(-before[cells[i]]);
-    before[cells[i]] += area * standsFor;
-    if (depths[i] >= nearest) sum += (hidden - Math.exp(-before[cells[i]])) * (FINE / Math.max(size, FINE));
+    const fine = depths[i] >= nearest ? FINE / Math.max(size, FINE) : 0;
+    // a large splat hides what lies behind all the cells that it is spread over: a wall may be a few of them
+    const side = Math.max(1, Math.round(Math.sqrt(area)));
+    const top = Math.floor(cells[i] / COLUMNS) - (side >> 1);
+    const left = (cells[i] % COLUMNS) - (side >> 1);
+    for (let y = Math.max(0, top); y < Math.min(ROWS, top + side); y++) {
+      for (let x = Math.max(0, left); x < Math.min(COLUMNS, left + side); x++) {
+        const cell = y * COLUMNS + x;
+        const hidden = Math.exp(-before[cell]);
+        before[cell] += (area * standsFor) / side ** 2;
+        sum += (hidden - Math.exp(-before[cell])) * fine;
+      }
+    }
   }
   return sum / (COLUMNS * ROWS);
 }

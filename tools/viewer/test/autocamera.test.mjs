@@ -13,7 +13,8 @@ import {
 } from '../autocamera.mjs';
 import { evened, findFrame, quantiles } from '../frame.mjs';
 import { Rig, pivotOf } from '../rig.mjs';
-import { pick } from '../survey.mjs';
+import { emptyPose } from '../sceneview.mjs';
+import { ROUGH, detail, pick } from '../survey.mjs';
 import { dot, length, lookAlong, sub } from '../vectors.mjs';
 
 const UP = [0, -1, 0];
@@ -123,7 +124,7 @@ test('a flat, round object is no room', () => {
 
 test('surroundings are seen from near their middle', () => {
   const next = numbers(5);
-  const middle = ball(3000, [0, 0, 0], 1, next);
+  const middle = [0.3, 0.6, 1].flatMap((radius) => ball(1000, [0, 0, 0], radius, next));
   const background = Array.from({ length: 1500 }, () => direction(next).map((value) => (30 + 30 * next()) * value));
   const samples = scene([...middle, ...background], 0.01);
   samples.weights.fill(2, 3000); // far splats are large
@@ -132,6 +133,18 @@ test('surroundings are seen from near their middle', () => {
   assert.ok(length(pose.eye) < 4 * frame.extent, `stands at ${pose.eye}`);
   assert.ok(length(pivotOf(pose)) < 0.2 * frame.extent, 'looks at the middle');
   assert.ok(seen({ samples: samples.samples.subarray(0, 9000) }, pose, frame.extent).share > 0.3);
+});
+
+test('a wall of a few large splats hides what lies behind it', () => {
+  const things = ball(2000, [0, 0, 0], 0.5);
+  const wall = [-1, 0, 1].flatMap((x) => [-1, 0, 1].map((y) => [x, y, 1.5]));
+  const samples = scene([...things, ...wall], 1e-4);
+  samples.weights.fill(4, things.length);
+  const from = (z) => {
+    const pose = { ...emptyPose(), eye: [0, 0, z], basis: lookAlong([0, 0, -z], UP) };
+    return detail(samples, 1, new Rig(pose, 1).camera(ROUGH.width, ROUGH.height), 0);
+  };
+  assert.ok(from(3) < 0.5 * from(-3), `${from(3)} of ${from(-3)}`);
 });
 
 test('a closed room is seen from inside', () => {
