@@ -543,6 +543,7 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
         (("decode", "scene.csplat", "out.csplat"), "csplat decode scene.csplat out.ply"),
         (("decode", "scene.ply", "out.csplat"), "csplat encode scene.ply out.csplat"),
         (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
+        (("render", "scene.ply", "out.ply", "--orbit", "2"), "csplat render scene.ply out.webp"),
         (("lint", "scene.ply", "--fix", "out.csplat"), "csplat encode scene.ply out.csplat"),
     ],
 )

@@ -16,6 +16,7 @@ from csplat_tools.cli.view_options import SplitWord, Upright, Views, check_split
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
+from csplat_tools.files.streams import check_name
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
 from csplat_tools.views import BLACK
@@ -93,6 +94,7 @@ def render(
     colour, chosen = views.colour or BLACK, parse_mode(mode)
     shots = views.photographs()
     out.check(output if film else None, inputs=(source, views.cameras))
+    check_name(output, ".webp", "render", source)
     need_renderer()
     model = upright.upright().applied(load_model(source).model)
     if sh_degree is not None:
