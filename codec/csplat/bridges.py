@@ -1,3 +1,5 @@
+# torch may be absent:
+# pyright: reportMissingImports=false
 """To and from what trainers hold: a dict of arrays or tensors under gsplat's names.
 
 | name | `form="parameters"`, as in training and checkpoints | `form="activated"`, as `gsplat.rasterization` wants it |

@@ -79,16 +79,16 @@ def encode_to(
     start = time.perf_counter()
     target = Target(psnr, parse_size_bytes(size) if isinstance(size, str) else size, loss, keep, dict(errors or {}))
     source, encoding = load_model(scene).model, options or EncodeOptions()
-    if target.is_rendered:
-        need_renderer()
-        from csplat_tools.optimise.optimiser import check, optimise
+    if not target.is_rendered:
+        bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
+        return _bounded(source, target, bounded, start)
+    need_renderer()
+    from csplat_tools.optimise.optimiser import check, optimise
 
-        check(source, target, encoding, keep_all=keep_all)
+    check(source, target, encoding, keep_all=keep_all)
     files = 0
     if target.max_error:
         bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
-        if not target.is_rendered:
-            return _bounded(source, target, bounded, start)
         files, encoding = bounded.encodes, bounded.encoding
     found, report = optimise(
         source, target, views or find_view_set(source), encoding, keep_all=keep_all, importance=importance,
