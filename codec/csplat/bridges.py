@@ -41,15 +41,17 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
     """Make a model of a dict under gsplat's names.
 
     Args:
-        splats: arrays, or tensors of torch on any device, with or without gradients; see the table above. A
-            checkpoint of gsplat's trainer will do: its member `splats` is taken. `shN` may be left out.
-        form: "parameters", as they are trained; or "activated", as `gsplat.rasterization` takes them.
+        splats: arrays, or tensors of torch on any device, with or without gradients: `means` [N, 3], `quats` [N, 4]
+            w x y z of any length, `scales` [N, 3], `opacities` [N], `sh0` [N, 1, 3], `shN` [N, K, 3], which may be
+            left out. A checkpoint of gsplat's trainer will do: its member `splats` is taken.
+        form: "parameters", as they are trained: scales are natural logarithms, opacities logits; or "activated", as
+            `gsplat.rasterization` takes them: standard deviations in scene units, alpha.
 
     Returns:
         The scene: float32, rotations at unit length. The arrays are copies. What no array says is as by default: of a
         scene that was trained so, `dataclasses.replace(model, antialiased=True)` says it.
 
-    Example:
+    Examples:
         >>> import csplat, numpy as np
         >>> splats = {
         ...     "means": np.zeros((2, 3)), "quats": np.ones((2, 4)), "scales": np.log(np.full((2, 3), 0.01)),
@@ -93,7 +95,7 @@ def to_gsplat(model: SplatModel, *, form: Form = ..., device: str) -> dict[str, 
 def to_gsplat(
     model: SplatModel, *, form: Form = "parameters", device: str | None = None
 ) -> dict[str, F32] | dict[str, Tensor]:
-    """Give a model as a dict under gsplat's names; see the table above.
+    """Give a model as a dict under gsplat's names.
 
     To render with gsplat: `s = to_gsplat(model, form="activated", device="cuda")`, and then
     `rasterization(s["means"], s["quats"], s["scales"], s["opacities"], torch.cat([s["sh0"], s["shN"]], 1), viewmats,
@@ -101,14 +103,15 @@ def to_gsplat(
 
     Args:
         model: the scene.
-        form: "parameters", as they are trained: logarithms and logits; or "activated", as `gsplat.rasterization`
-            takes them.
+        form: "parameters", as they are trained: scales are natural logarithms, opacities logits; or "activated", as
+            `gsplat.rasterization` takes them: standard deviations in scene units, alpha.
         device: "cpu", "cuda", ...: tensors of torch there. `None`: NumPy arrays.
 
     Returns:
-        `means`, `quats`, `scales`, `opacities`, `sh0`, `shN`: float32, copies. Alpha of 0 and 1 have finite logits.
+        `means` [N, 3], `quats` [N, 4] w x y z, `scales` [N, 3], `opacities` [N], `sh0` [N, 1, 3], `shN` [N, K, 3]:
+        float32, copies. Alpha of 0 and 1 have finite logits.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> splats = csplat.to_gsplat(csplat.decode("scene.csplat"), form="activated")
         >>> splats["sh0"].shape, splats["shN"].shape, bool(splats["scales"].min() > 0.0)

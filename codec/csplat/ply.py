@@ -61,7 +61,7 @@ def read_ply(
         keep_extra: keep columns that splats do not have in `SplatModel.extra`.
         report: findings are appended to this list, repairs among them.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> model = csplat.read_ply("scene.ply")
         >>> model

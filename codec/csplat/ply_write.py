@@ -42,7 +42,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         absolute: write x, y and z as doubles with the origin added, for programs that take
             doubles. By default they are floats relative to the origin, which a comment names.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> model = csplat.read_ply("scene.ply")
         >>> csplat.write_ply("half.ply", model.select(slice(0, None, 2)))

@@ -44,7 +44,7 @@ def render(
     Returns:
         `rgb` [H, W, 3] float32, not clipped; `alpha` [H, W]; `depth` [H, W], scene units; and more.
 
-    Example:
+    Examples:
         >>> import csplat, csplat_render
         >>> from csplat_render.paths import orbit_cameras
         >>> model = csplat.read_ply("scene.ply")

@@ -71,7 +71,7 @@ def train(
     Returns:
         The scene, the log, and scores on the pictures that were held out.
 
-    Example:
+    Examples:
         >>> import csplat, csplat_trainer
         >>> found = csplat_trainer.train("capture", csplat_trainer.TrainOptions(max_splats=5000))  # doctest: +SKIP
         >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP

@@ -119,7 +119,7 @@ def decode(
     Returns:
         The splats. What is returned of a part equals the same part of a whole decode.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> model = csplat.decode("scene.csplat")
         >>> model

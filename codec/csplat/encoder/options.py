@@ -60,7 +60,7 @@ class EncodeOptions:
         seed: of the k-means.
         threads: how many to use; `None` takes all cores. The bytes do not depend on it.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> csplat.EncodeOptions(preset="small", sh_degree=2).preset
         'small'

@@ -29,7 +29,7 @@ def encode(
     Returns:
         The bytes of a `.csplat` file. Same model, options and library versions: same bytes, at any thread count.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> from pathlib import Path
         >>> data = csplat.encode(csplat.read_ply("scene.ply"), csplat.EncodeOptions(preset="fast"))
@@ -57,7 +57,7 @@ def encode_with_report(
         model, options, importance, origin, progress: as of `Draft.of`.
         said: as of `Coded.write`.
 
-    Example:
+    Examples:
         >>> import csplat
         >>> result = csplat.encode_with_report(csplat.read_ply("scene.ply"))
         >>> most, rms = result.report.errors["opacities"]  # of any splat, and over all, as the file states them

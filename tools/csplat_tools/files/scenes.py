@@ -63,7 +63,7 @@ def load_model(scene: SceneLike) -> LoadedModel:
         scene: the file: a path, an open binary file, or bytes; as a path `-` is standard input. What is a model, or
             loaded already, stays as it is.
 
-    Example:
+    Examples:
         >>> import csplat_tools
         >>> scene = csplat_tools.load_model("scene.csplat")
         >>> scene.model, len(scene.header.tiles), scene.size_bytes < 20_000

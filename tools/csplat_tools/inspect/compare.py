@@ -118,7 +118,7 @@ def compare(
         prepare: is called when all that is named has been read and checked, before the first picture.
         progress: is told the stage and the share of it that is done, 0 to 1.
 
-    Example:
+    Examples:
         >>> import csplat_tools
         >>> found = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
         >>> found.ratio, found.quality.psnr, found.attributes.errors["means"]  # doctest: +SKIP

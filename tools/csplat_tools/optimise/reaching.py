@@ -61,7 +61,7 @@ def encode_to(
     Returns:
         The file's bytes (`data`), what the encoder says of it (`result`), and how it was found (`report`).
 
-    Example:
+    Examples:
         >>> import csplat, csplat_tools
         >>> found = csplat_tools.encode_to(
         ...     "scene.ply", errors={"means": 0.001}, options=csplat.EncodeOptions(preset="fast")

@@ -134,7 +134,7 @@ def tradeoff(
     Returns:
         All points, measured or failed; those on the front; and all as JSON (`as_json`).
 
-    Example:
+    Examples:
         >>> import csplat_tools
         >>> found = csplat_tools.tradeoff("scene.ply", csplat_tools.Wanted(what=("presets",)))  # doctest: +SKIP
         >>> [(point.name, point.size_bytes, point.psnr) for point in found.front]  # doctest: +SKIP

@@ -99,7 +99,7 @@ def finetune(
         progress: is told the stage and the share of it that is done, 0 to 1.
         on_step: is told where the tuning stands, every `log_every` steps.
 
-    Example:
+    Examples:
         >>> import csplat, csplat_trainer
         >>> photographs = csplat_trainer.load("capture")  # doctest: +SKIP
         >>> found = csplat_trainer.finetune(csplat.read_ply("scene.ply"), photographs)  # doctest: +SKIP

@@ -155,7 +155,7 @@ def simplify(
     Returns:
         The smaller scene; its splats are in the source's order.
 
-    Example:
+    Examples:
         >>> import csplat_tools
         >>> half = csplat_tools.simplify("scene.ply", keep=0.5)  # doctest: +SKIP
         >>> len(half.model), half.report["psnr"]  # doctest: +SKIP
