@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import csplat
-from csplat.encoder.options import PresetName
+from csplat.encoder import PresetName
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.plots import new_figure, save_svg
