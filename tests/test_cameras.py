@@ -7,7 +7,7 @@ import pytest
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera
-from csplat_render.cameras import direction, intrinsics, load_cameras, look_at, orbit, save_cameras
+from csplat_render.cameras import central_camera, direction, intrinsics, load_cameras, look_at, orbit, save_cameras
 
 K = intrinsics(640, 480, 60.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -107,3 +107,11 @@ def test_an_orbit_turns_evenly_at_one_distance():
     assert all(isinstance(camera, Camera) and camera.near == 0.05 for camera in cameras)
     with pytest.raises(InputError, match="orbit"):
         orbit(centre, 4.0, UP, 0, K, 640, 480)
+
+
+def test_the_central_camera_stands_and_looks_as_most_do():
+    K = intrinsics(64, 48, 50.0)
+    row = [look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), K, 64, 48) for x in (-2, -1, 0, 1, 2)]
+    aside = look_at((0, 0, 0), (5, 0, 0), (0, -1, 0), K, 64, 48)
+    assert row[2] is central_camera([aside, *row])
+    assert row[0] is central_camera(row[:1])

@@ -333,6 +333,24 @@ def test_refuses_a_training_that_it_cannot_read(tmp_path, said, reason):
         read_ply(tmp_path / "a.ply")
 
 
+def test_a_first_view_goes_through_files(tmp_path, make_model):
+    view = {"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4, "image": "ä b.png"}
+    write_ply(tmp_path / "a.ply", make_model(metadata={"view": view}))
+    model = read_ply(tmp_path / "a.ply")
+    assert {"view": view} == model.metadata == decode(encode(model)).metadata
+    for unsound in ("from above", {"near": np.inf}, {"K": np.eye(3)}):
+        write_ply(tmp_path / "b.ply", make_model(metadata={"view": unsound}))
+        assert {} == read_ply(tmp_path / "b.ply").metadata
+
+
+@pytest.mark.parametrize("said", ["", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 100_000])
+def test_refuses_a_first_view_that_it_cannot_read(tmp_path, said):
+    names = columns_of(0)
+    write_rows(tmp_path / "a.ply", names, random_rows(names), comments=[f"csplat view {said}"])
+    with pytest.raises(InputError, match=r"csplat view.*cannot be understood"):
+        read_ply(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("comment", ["csplat origin 1 2", "csplat origin a b c", "csplat absolute_origin 1 2 inf"])
 def test_refuses_an_origin_it_cannot_read(tmp_path, comment):
     names = columns_of(0)

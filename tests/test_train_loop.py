@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 from csplat import read_ply, write_ply
 from csplat.errors import InputError
 from csplat.training import TrainedOn
+from csplat_render.camera import Camera
 from csplat_render.cameras import intrinsics, orbit
 from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
@@ -131,6 +133,16 @@ def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
         train(data, TrainOptions(**QUICK, init="hull"))
     with pytest.raises(InputError, match="no points"):
         train(data, TrainOptions(**QUICK, init="points"))
+
+
+def test_surroundings_are_shown_first_as_a_photograph_showed_them(make_data, make_model, monkeypatch):
+    data, options = make_data(make_model), TrainOptions(**{**QUICK, "iterations": 1})
+    assert "view" not in train(data, options).model.metadata  # an object
+    monkeypatch.setattr("csplat_trainer.loop.scene_frame", lambda _: SimpleNamespace(kind="surrounding"))
+    view = Camera.from_json(train(data, options).model.metadata["view"])
+    taken = [one.camera for one in data.train]
+    assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
+    assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
 
 
 def test_points_are_where_splats_start(make_data, make_model):

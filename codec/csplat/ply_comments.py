@@ -10,7 +10,7 @@ from typing import Any
 
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.training import TRAINING, TrainedOn
+from csplat.training import TRAINING, VIEW, TrainedOn
 from csplat.upright import UP, unit_up, up_of
 
 __all__ = ["SceneFacts", "format_comments", "parse_comments"]
@@ -27,7 +27,7 @@ class SceneFacts:
         origin: `None` where no comment names one.
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`.
+        metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`; `view`.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -52,6 +52,8 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
         words = comment.split()
         if words[:2] == [_PREFIX, TRAINING]:
             facts.metadata[TRAINING] = _training(comment).as_json()
+        elif words[:2] == [_PREFIX, VIEW]:
+            facts.metadata[VIEW] = _view(comment)
         elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
             others.append(comment)
     if others:
@@ -87,6 +89,9 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
     licence = model.metadata.get("licence")
     if isinstance(licence, str):
         lines.append(f"{_PREFIX} licence {' '.join(licence.split())}")
+    view = model.metadata.get(VIEW)
+    if isinstance(view, dict) and _is_json(view):
+        lines.append(f"{_PREFIX} {VIEW} {json.dumps(view)}")
     trained = TrainedOn.of(model.metadata)
     if trained is not None:
         lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")  # ASCII, whatever names hold
@@ -124,16 +129,41 @@ def _up(values: Sequence[str]) -> list[float]:
 
 
 def _training(comment: str) -> TrainedOn:
-    """Its object in JSON, which may hold spaces that count."""
+    said = _json(comment)
     try:
-        return TrainedOn.from_json(json.loads("".join(comment.split(None, 2)[2:])))
-    except RecursionError:
-        reason = "too many brackets"
-    except ValueError:
-        reason = "not JSON"
+        return TrainedOn.from_json(said)
     except InputError as error:
-        reason = str(error)
-    raise InputError(f"the header comment {comment[:_SHOWN]!r} cannot be understood: {reason}")
+        raise _misunderstood(comment, str(error)) from None
+
+
+def _view(comment: str) -> dict[str, Any]:
+    """A camera, which only those look into who show the scene."""
+    said = _json(comment)
+    if not isinstance(said, dict) or not _is_json(said):
+        raise _misunderstood(comment, "wanted an object of finite numbers")
+    return said
+
+
+def _is_json(said: object) -> bool:
+    try:
+        json.dumps(said, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
+
+
+def _json(comment: str) -> object:
+    """What follows two words, which may hold spaces that count."""
+    try:
+        return json.loads("".join(comment.split(None, 2)[2:]))
+    except RecursionError:
+        raise _misunderstood(comment, "too many brackets") from None
+    except ValueError:
+        raise _misunderstood(comment, "not JSON") from None
+
+
+def _misunderstood(comment: str, reason: str) -> InputError:
+    return InputError(f"the header comment {comment[:_SHOWN]!r} cannot be understood: {reason}")
 
 
 def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:

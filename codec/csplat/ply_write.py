@@ -34,7 +34,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
     """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
 
     Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow
-    the others; cameras and metadata but comments, licence and training are not written.
+    the others; cameras, and metadata but comments, licence, training, up and view, are not written.
 
     Args:
         file: its path, which it takes when it is complete, replacing an older one; or an open binary file.

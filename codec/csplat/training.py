@@ -1,4 +1,7 @@
-"""What a scene was trained on, as far as later pictures of it depend on that (spec 5.4)."""
+"""What a scene was trained on, as far as later pictures of it depend on that (spec 5.4).
+
+Its training may leave one of its cameras, too, under `VIEW`: from there a viewer shows the scene first.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,11 @@ from typing import Any
 
 from csplat.errors import InputError
 
-__all__ = ["TRAINING", "TrainedOn"]
+__all__ = ["TRAINING", "VIEW", "TrainedOn"]
 
-#: The key of the metadata under which it stands.
+#: The keys of the metadata under which they stand.
 TRAINING = "training"
+VIEW = "view"
 
 _MAX_COUNT = 2**31 - 1
 _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}

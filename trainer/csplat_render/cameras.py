@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat_render.camera import DEFAULT_NEAR, Camera
 
-__all__ = ["intrinsics", "load_cameras", "look_at", "orbit", "relative_to", "resized", "save_cameras"]
+__all__ = ["central_camera", "intrinsics", "load_cameras", "look_at", "orbit", "relative_to", "resized", "save_cameras"]
 
 F64 = NDArray[np.float64]
 
@@ -53,6 +53,23 @@ def load_cameras(path: str | Path) -> list[Camera]:
         except InputError as error:
             raise InputError(f"{path}, camera {number}: {error}") from error
     return cameras
+
+
+def central_camera(cameras: Sequence[Camera]) -> Camera:
+    """The camera that stands and looks most as all do: of a set, the one to begin with.
+
+    Distances count as shares of the mean distance from the middle, directions as chords of the unit sphere.
+
+    Args:
+        cameras: one at least.
+    """
+    places = np.stack([camera.position for camera in cameras])
+    ahead = np.stack([camera.viewmat[2, :3] for camera in cameras])
+    middle = places.mean(axis=0)
+    spread = float(np.mean(np.sqrt(np.sum((places - middle) ** 2, axis=1))))
+    apart = np.sqrt(np.sum((places[:, None] - places[None]) ** 2, axis=2)) / max(spread, 1e-300)
+    turned = np.sqrt(np.sum((ahead[:, None] - ahead[None]) ** 2, axis=2))
+    return cameras[int(np.argmin(np.sum(apart + turned, axis=1)))]
 
 
 def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:

@@ -6,7 +6,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 import csplat
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training import TRAINING
+from csplat.training import TRAINING, VIEW
 from csplat.upright import with_up
+from csplat_render.camera import Camera
+from csplat_render.cameras import central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
+from csplat_render.virtual import scene_frame
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
@@ -273,6 +276,8 @@ class _Run:
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
         said = {TRAINING: self._data.trained_on(self._behind).as_json()}
+        if scene_frame(model).kind == "surrounding":  # an object shows itself, from any side
+            said[VIEW] = _first_view([picture.camera for picture in self._data.train])
         model = replace(model, metadata=said)
         return with_up(model, self._data.up, self._data.coordinate_system)
 
@@ -289,6 +294,16 @@ class _Run:
             "metrics": metrics,
             **self._log,
         }
+
+
+def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """A camera of CAMS (spec 5.4), to seven digits."""
+    camera = central_camera(cameras)
+    matrices = {
+        name: [[float(f"{value:.7g}") for value in row] for row in matrix.tolist()]
+        for name, matrix in (("K", camera.K), ("viewmat", camera.viewmat))
+    }
+    return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}")}
 
 
 def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:

@@ -52,6 +52,7 @@ _SCENE = {
     "unit": "length of one unit of the scene",
     "origin": "what positions are relative to",
     "tiles": "parts that decode on their own",
+    "first view": "where a viewer shows the scene from at first",
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from csplat.training import TRAINING, TrainedOn
+from csplat.training import TRAINING, VIEW, TrainedOn
 from csplat.upright import UP, up_of
 from csplat_tools.files.console import format_bytes
 from csplat_tools.inspect.info import AttributeFacts, FileFacts
@@ -40,6 +40,9 @@ def scene_words(facts: FileFacts) -> dict[str, str]:
     trained = TrainedOn.of(facts.metadata or {})
     if trained is not None:
         words["trained on"] = str(trained)
+    view = (facts.metadata or {}).get(VIEW)
+    if view is not None:
+        words["first view"] = "a camera of the metadata"
     return words
 
 
@@ -50,6 +53,7 @@ def other_metadata(facts: FileFacts) -> dict[str, object]:
         del metadata[TRAINING]
     if up_of(metadata) is not None:
         del metadata[UP]
+    metadata.pop(VIEW, None)
     return metadata
 
 
