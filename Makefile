@@ -47,6 +47,7 @@ docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(BIN)/python tools/docs/make_site.py
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
+	$(BIN)/pytest -m benchmark
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).rendering

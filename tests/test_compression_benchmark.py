@@ -93,6 +93,7 @@ def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(sourc
     assert np.array_equal(moved, start.means)
 
 
+@pytest.mark.benchmark
 def test_the_control_learns(source):
     wanted = renders_of(source, cameras(10), BLACK, None)
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
@@ -161,6 +162,7 @@ def run(capture, out, *words):
     return command(main, list(map(str, (*words, *extra, *knobs, "--iterations", 40, "--threads", 1, "--out", out))))
 
 
+@pytest.mark.benchmark
 def test_everything_is_measured_and_printed(capture, tmp_path, capsys):
     lists = ("--sizes", 16, "--escapes", 0.1, "--bits", 12, "--keep", "0.6,0.5")
     parts = ("main", "control", "others", "sizes", "escapes", "positions", "curve")

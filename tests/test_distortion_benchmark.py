@@ -196,6 +196,7 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
     assert 2 == Kept(path, again=True).measure("kind", "key", call)
 
 
+@pytest.mark.benchmark
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
     """A part of the scene that ships, beside a peer that was judged before."""
     part = tmp_path / "part.ply"

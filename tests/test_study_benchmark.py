@@ -116,6 +116,7 @@ def run(folder, *words):
     return command(study.main, [*words, *quick, "--out", str(folder / "out"), "--plots", str(folder / "plots")])
 
 
+@pytest.mark.benchmark
 def test_everything_is_trained_measured_printed_and_drawn(small, capsys):
     assert 1 == run(small)  # what wants torch is left out, and that is said
     said = capsys.readouterr()

@@ -120,6 +120,7 @@ def run(kept, *words):
     return command(targets.main, ["--scenes", "sample", "--kept", str(kept), *words])
 
 
+@pytest.mark.benchmark
 def test_makes_what_is_missing_and_keeps_each_row(tmp_path, capsys):
     """The scene that ships, by presets alone; then nothing is left to do."""
     run(tmp_path, "--psnr", "", "--build", "before")
