@@ -61,8 +61,8 @@ __all__ = [
 ]
 
 
-def lazy_exports(package: str, module_of: Mapping[str, str]) -> Callable[[str], object]:
-    """Make the `__getattr__` of a package whose names load their modules when first used (PEP 562).
+def lazy_exports(package: str, module_of: Mapping[str, str]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """Make `__getattr__` and `__dir__` of a package whose names load their modules when first used (PEP 562).
 
     Args:
         package: its name.
@@ -85,7 +85,7 @@ def lazy_exports(package: str, module_of: Mapping[str, str]) -> Callable[[str], 
         setattr(sys.modules[package], name, value)  # the next access does not come here again
         return value
 
-    return get
+    return get, lambda: sorted(sys.modules[package].__all__)
 
 
 _MODULE_OF = {
@@ -109,8 +109,4 @@ _MODULE_OF = {
     "to_gsplat": "csplat.bridges",
     "write_ply": "csplat.ply",
 }
-__getattr__ = lazy_exports(__name__, _MODULE_OF)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

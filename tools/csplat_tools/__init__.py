@@ -67,8 +67,4 @@ _MODULE_OF = {
     "simplify": "csplat_tools.optimise.simplify",
     "tradeoff": "csplat_tools.tradeoffs.running",
 }
-__getattr__ = lazy_exports(__name__, _MODULE_OF)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

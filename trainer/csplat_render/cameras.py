@@ -58,18 +58,16 @@ def load_cameras(path: str | Path) -> list[Camera]:
 def central_camera(cameras: Sequence[Camera]) -> Camera:
     """The camera that stands and looks most as all do: of a set, the one to begin with.
 
-    Distances count as shares of the mean distance from the middle, directions as chords of the unit sphere.
+    It is the nearest one to their mean: places count as shares of the mean distance from it, directions as they are.
 
     Args:
         cameras: one at least.
     """
     places = np.stack([camera.position for camera in cameras])
     ahead = np.stack([camera.viewmat[2, :3] for camera in cameras])
-    middle = places.mean(axis=0)
-    spread = float(np.mean(np.sqrt(np.sum((places - middle) ** 2, axis=1))))
-    apart = np.sqrt(np.sum((places[:, None] - places[None]) ** 2, axis=2)) / max(spread, 1e-300)
-    turned = np.sqrt(np.sum((ahead[:, None] - ahead[None]) ** 2, axis=2))
-    return cameras[int(np.argmin(np.sum(apart + turned, axis=1)))]
+    away = np.sqrt(np.sum((places - places.mean(axis=0)) ** 2, axis=1))
+    turned = np.sqrt(np.sum((ahead - ahead.mean(axis=0)) ** 2, axis=1))
+    return cameras[int(np.argmin(away / max(float(away.mean()), 1e-300) + turned))]
 
 
 def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:

@@ -44,11 +44,11 @@ def warm_up(
     Returns:
         Seconds that it took.
     """
-    started, is_compiled = time.perf_counter(), False
+    started, compiles = time.perf_counter(), False
 
     def say() -> None:
-        nonlocal is_compiled
-        is_compiled = True
+        nonlocal compiles
+        compiles = True
         if announce is not None:
             announce("compiling the renderer for this machine: about a minute; the result is kept for the next time")
 
@@ -67,7 +67,7 @@ def warm_up(
         for call in others:
             call()
     seconds = time.perf_counter() - started
-    if announce is not None and is_compiled:
+    if announce is not None and compiles:
         announce(f"the renderer is compiled, in {seconds:.0f} s")
     return seconds
 

@@ -45,8 +45,4 @@ _MODULE_OF = {
     "load": "csplat_trainer.data",
     "train": "csplat_trainer.loop",
 }
-__getattr__ = lazy_exports(__name__, _MODULE_OF)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -13,7 +13,7 @@ import numpy as np
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.cloud import detail, sample_cloud
-from csplat_render.virtual import far_apart, scene_frame
+from csplat_render.virtual import HIDING, far_apart, scene_frame
 from csplat_tools.views.placing import camera_sequence
 from csplat_tools.views.viewset import VIRTUAL, ViewSet
 
@@ -22,7 +22,6 @@ __all__ = ["showing_cameras"]
 _COUNT, _SIZE = 6, (640, 480)
 _TRIED, _POINTS, _SEED = 64, 40_000, 0
 _GOOD_DETAIL = 0.8  # of the best view's
-_HIDING = 0.4  # extents; what is nearer only hides
 
 
 def showing_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
@@ -39,7 +38,7 @@ def showing_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     if views.name != VIRTUAL or not len(source):
         return views.judges
     cameras = [*views.judges, *camera_sequence(source, _TRIED, _SIZE, seed=_SEED)]
-    cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), _HIDING * scene_frame(source).extent
+    cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
     details = np.array([detail(cloud, camera, nearest) for camera in cameras])
     good = np.flatnonzero(details >= _GOOD_DETAIL * details.max())
     positions = np.stack([cameras[i].position for i in good])
