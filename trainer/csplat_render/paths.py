@@ -1,8 +1,9 @@
 """Paths of a camera for a film, closed, so that a film that repeats does not jump.
 
-An *object* is circled about the direction that is up, from as far away as shows all of it. Inside *surroundings* a
-circle would lead through walls: where cameras are known, a path leads along them and looks as they do; else it is the
-longest arc, of several distances and heights, from which fine splats are to be seen, there and back.
+An *object* is circled about the direction that is up, or seems to be (`standing`), from as far away as shows all of it.
+Inside *surroundings* a circle would lead through walls: where cameras are known, a path leads along them and looks as
+they do; else it is the longest arc, of several distances and heights, from which fine splats are to be seen, there and
+back.
 
 These cameras judge nothing: `virtual.virtual_cameras` are those of `psnr`.
 """
@@ -21,6 +22,7 @@ from csplat.upright import up_of
 from csplat_render.camera import Camera
 from csplat_render.cameras import direction, intrinsics, look_at, orbit
 from csplat_render.cloud import Cloud, detail, sample_cloud
+from csplat_render.standing import standing
 from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
 
 __all__ = ["orbit_cameras"]
@@ -74,7 +76,7 @@ def orbit_cameras(
     """
     if count < 1:
         raise InputError(f"an orbit of {count} cameras, wanted at least 1")
-    frame, K = scene_frame(model), intrinsics(width, height, FIELD_OF_VIEW)
+    frame, K = scene_frame(standing(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
         along = [Camera.from_json(one) for one in model.cameras or ()]
     if along:

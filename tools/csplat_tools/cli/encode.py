@@ -14,6 +14,7 @@ from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
+from csplat_render.standing import seeming_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.options import Group, Importance, Output, SourceIndex, command
 from csplat_tools.cli.parsing import parse_decibels
@@ -196,6 +197,8 @@ def encode(
             progress("eight small renders", 0.0)
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
+    if not out.quiet and len(encoded.source) <= _SPLATS_LOOKED_AT:
+        facts.seeming(seeming_up(encoded.source), out)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 

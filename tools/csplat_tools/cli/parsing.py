@@ -15,7 +15,7 @@ from csplat.upright import Direction, unit_up
 if TYPE_CHECKING:
     from csplat_render import Mode
 
-__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_mode", "parse_size", "parse_up"]
+__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_mode", "parse_size", "parse_up", "up_word"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -64,6 +64,12 @@ def parse_up(text: str) -> Direction:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
         raise typer.BadParameter(f"up is {text!r}, wanted x, -x, y, -y, z, -z, or three numbers as 0,-1,0.1") from None
+
+
+def up_word(axis: Direction) -> str:
+    """An axis, or its opposite, as `parse_up` takes it."""
+    at = next(k for k, value in enumerate(axis) if value)
+    return ("-" if axis[at] < 0.0 else "") + "xyz"[at]
 
 
 def parse_axes(text: str) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from csplat.errors import counted
+from csplat_render.standing import seeming_up
 from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_mode, parse_size
 from csplat_tools.cli.view_options import SplitWord, Upright, Views, check_split
@@ -100,6 +101,8 @@ def render(
     if sh_degree is not None:
         model = without_bands(model, sh_degree)
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=check_split(split))
+    if orbit is not None:
+        upright.seeming(seeming_up(model), out)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
     with out.bar() as progress:
         rendered = write(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 
 from csplat.model import SplatModel
+from csplat.upright import Direction
 from csplat_tools.cli.options import Group, Output
-from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up
+from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up, up_word
 from csplat_tools.files.convert import SceneOverrides
 
 if TYPE_CHECKING:
@@ -44,6 +45,21 @@ class Upright(Group):
         """What the scene is told."""
         up = None if self.up is None else parse_up(self.up)
         return SceneOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
+
+    def seeming(self, axis: Direction | None, output: Output) -> Direction | None:
+        """What is up where neither the user nor the scene says it; the user hears of it.
+
+        Args:
+            axis: what `seeming_up` finds.
+            output: whether remarks are wanted.
+        """
+        if axis is None or (self.up, self.axes) != (None, None):
+            return None
+        word = up_word(axis)
+        output.remark(
+            f"the scene does not say which way is up; {word} seems to be (encode --up {word} writes it into the file)"
+        )
+        return axis
 
 
 @dataclass(frozen=True)

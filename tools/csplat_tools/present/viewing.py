@@ -9,16 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
-from csplat.decoder import SceneHeader, read_header
+from csplat.decoder import SceneHeader, decode, read_header
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
-from csplat.errors import FormatError
+from csplat.errors import CsplatError, FormatError
 from csplat.lint import Finding
+from csplat.model import UNSPECIFIED
+from csplat.upright import Direction
 from csplat_render.cameras import load_cameras
+from csplat_render.standing import seeming_up
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import SceneOverrides, read_source
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 
-__all__ = ["ViewScene", "open_scene", "view_wishes"]
+__all__ = ["ViewScene", "open_scene", "up_wish", "view_wishes"]
+
+
+_NONE = SceneOverrides()
+_SPLATS_LOOKED_AT = 2_000_000  # of a file that need not be decoded otherwise
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,7 @@ class ViewScene:
         content: where the file lies, or its bytes.
         size_bytes: of the file.
         header: what it says of itself.
+        seems_up: which way seems to be up where the scene does not say it.
         findings: what lint noticed in the PLY.
         encoded_from: size of the PLY in bytes; 0 for a file that was one already.
     """
@@ -38,6 +46,7 @@ class ViewScene:
     content: Path | bytes
     size_bytes: int
     header: SceneHeader
+    seems_up: Direction | None = None
     findings: tuple[Finding, ...] = ()
     encoded_from: int = 0
 
@@ -67,7 +76,7 @@ def open_scene(path: str, *, preset: PresetName, progress: Progress | None = Non
         yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
 
 
-def view_wishes(camera: str | None, facts: SceneOverrides | None = None) -> dict[str, str]:
+def view_wishes(camera: str | None, facts: SceneOverrides = _NONE) -> dict[str, str]:
     """Put options into words that the page understands.
 
     Args:
@@ -85,11 +94,16 @@ def view_wishes(camera: str | None, facts: SceneOverrides | None = None) -> dict
     if camera is not None:
         entries = [one.to_json() for one in load_cameras(camera)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
-    if facts is not None and facts.coordinate_system is not None:
+    if facts.coordinate_system is not None:
         wishes["axes"] = facts.coordinate_system
-    if facts is not None and facts.up is not None:
-        wishes["up"] = ",".join(f"{value:g}" for value in facts.up)
+    if facts.up is not None:
+        wishes["up"] = up_wish(facts.up)
     return wishes
+
+
+def up_wish(up: Direction) -> str:
+    """A direction as the page understands it."""
+    return ",".join(f"{value:g}" for value in up)
 
 
 def _checked(path: Path, stem: str) -> ViewScene:
@@ -102,10 +116,20 @@ def _checked(path: Path, stem: str) -> ViewScene:
             else (ERROR_TRAILING, header.file_size, "HDR-6", "bytes follow the end of the file")
         )
         raise FormatError(code, at, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
-    return ViewScene(f"{stem}.csplat", path, size, header)
+    return ViewScene(f"{stem}.csplat", path, size, header, _seems_up(path, header))
+
+
+def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
+    if header.splat_count > _SPLATS_LOOKED_AT or header.coordinate_system != UNSPECIFIED:
+        return None
+    try:
+        return seeming_up(decode(path, sh_degree=0))
+    except CsplatError:
+        return None  # the page shows what is whole, and says what is wrong
 
 
 def _encoded(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewScene:
     source = read_source(str(path), progress=progress)
     data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
-    return ViewScene(f"{stem}.csplat", data, len(data), read_header(data), source.findings, source.size_bytes)
+    header, up = read_header(data), seeming_up(source.model)
+    return ViewScene(f"{stem}.csplat", data, len(data), header, up, source.findings, source.size_bytes)

@@ -1,7 +1,8 @@
 """Views for pictures that people look at: what is shown there is what somebody would go and look at.
 
 The views of `psnr` are spread all around a scene, whatever is there: of an indoor capture some look at the back of what
-no photograph shows, or at a wall from nearby. That is fair to files, but a picture of it tells nobody anything.
+no photograph shows, or at a wall from nearby; a scene that does not say which way is up may lie on its side. That is
+fair to files, but a picture of it tells nobody anything.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.cloud import detail, sample_cloud
+from csplat_render.standing import standing
 from csplat_render.virtual import HIDING, far_apart, scene_frame
 from csplat_tools.views.placing import camera_sequence
 from csplat_tools.views.viewset import VIRTUAL, ViewSet
@@ -37,7 +39,9 @@ def showing_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     """
     if views.name != VIRTUAL or not len(source):
         return views.judges
-    cameras = [*views.judges, *camera_sequence(source, _TRIED, _SIZE, seed=_SEED)]
+    told = standing(source)
+    own = views.judges if told is source else ()  # they would show it lying on its side
+    cameras = [*own, *camera_sequence(told, _TRIED, _SIZE, seed=_SEED)]
     cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
     details = np.array([detail(cloud, camera, nearest) for camera in cameras])
     good = np.flatnonzero(details >= _GOOD_DETAIL * details.max())
