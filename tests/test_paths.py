@@ -111,6 +111,20 @@ def test_surroundings_that_carry_cameras_are_travelled_along_them():
         assert (a.viewmat == b.viewmat).all()
 
 
+def test_a_film_sways_around_the_view_that_a_scene_is_shown_from_first():
+    first = look_at([2.4, -0.8, 0.3], [0, 0, 0], [0, -1, 0], K, 64, 48)
+    known = {**vars(niche()), "metadata": {"view": first.to_json(), "up": [0, -1, 0]}}
+    cameras = orbit_cameras(SplatModel(**known), 24, 64, 48)
+    places = np.stack([camera.position for camera in cameras])
+    assert np.allclose(places.mean(axis=0), first.position, atol=0.25)
+    assert np.allclose(np.linalg.norm(places, axis=1), np.linalg.norm(first.position), atol=0.01)
+    assert 0.4 < np.ptp(places[:, 2]) < 3.0  # aside
+    assert 0.05 < np.ptp(places[:, 1]) < 0.5 * np.ptp(places[:, 2])  # up and down
+    assert all(camera.viewmat[2, :3] @ -camera.position > 0.99 * np.linalg.norm(camera.position) for camera in cameras)
+    unread = SplatModel(**{**known, "metadata": {"view": {"K": 1}, "up": [0, -1, 0]}})
+    assert len(orbit_cameras(unread, 24, 64, 48)) == 24  # the arc of a scene that says nothing
+
+
 def test_one_camera_that_is_known_makes_a_film_that_stands_still():
     (known,) = ring(1)
     for camera in orbit_cameras(niche(), 3, 64, 48, along=[known]):

@@ -1,9 +1,9 @@
 """Paths of a camera for a film, closed, so that a film that repeats does not jump.
 
 An *object* is circled about the direction that is up, or seems to be (`standing`), from as far away as shows all of it.
-Inside *surroundings* a circle would lead through walls: where cameras are known, a path leads along them and looks as
-they do; else it is the longest arc, of several distances and heights, from which fine splats are to be seen, there and
-back.
+Inside *surroundings* a circle would lead through walls. Where cameras are known, a path leads along them and looks as
+they do; where the scene says from where it is shown first, it sways around that place; else it is the longest arc, of
+several distances and heights, from which fine splats are to be seen, there and back.
 
 These cameras judge nothing: `virtual.virtual_cameras` are those of `psnr`.
 """
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.training import VIEW
 from csplat.upright import up_of
 from csplat_render.camera import Camera
 from csplat_render.cameras import direction, intrinsics, look_at, orbit
@@ -46,6 +47,10 @@ _ARC_ELEVATIONS = (5.0, 20.0, 40.0)
 _ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
 _GOOD = 0.85  # of the detail of the best view: below, an arc had better end
 _ARC_MIN = 10.0  # degrees each way
+
+_SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees each way, around a view that is known
+_FLATTENED = 0.3  # of a swing: so far it goes up and down
+_NEAREST_MIDDLE = 0.3  # extents: what is looked at is no nearer to a view
 
 _REACH = 0.35  # of the longer half-axis of the ellipse: how far cameras have a say about a place of the path
 _EASE = 0.04  # of the path: over so much of it directions are smoothed
@@ -90,7 +95,11 @@ def orbit_cameras(
         body = _body(sample_cloud(model, _POINTS, rng), frame)
         centre, distance = _whole(body, frame, elevation, K, width, height)
         return orbit(centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
-    angles, elevation, distance = _arc(sample_cloud(model, _ARC_POINTS, rng), frame, count)
+    cloud = sample_cloud(model, _ARC_POINTS, rng)
+    first = _first_view(model)
+    if first is not None:
+        return _sway(cloud, first, frame, count, K, width, height)
+    angles, elevation, distance = _arc(cloud, frame, count)
     return [_towards(frame, float(angle), elevation, distance, K, width, height) for angle in angles]
 
 
@@ -155,6 +164,36 @@ def _whole(body: F64, frame: Frame, elevation: float, K: F64, width: int, height
     distance, (x, y, z) = best
     centre = frame.centre + x * first + y * second + z * up
     return centre, distance if math.isfinite(distance) and distance > frame.near else frame.extent
+
+
+def _first_view(model: SplatModel) -> Camera | None:
+    """From where a scene is shown first, if it says so in a way that is understood."""
+    try:
+        return Camera.from_json(model.metadata[VIEW]) if VIEW in model.metadata else None
+    except InputError:
+        return None
+
+
+def _sway(cloud: Cloud, first: Camera, frame: Frame, count: int, K: F64, width: int, height: int) -> list[Camera]:
+    """Cameras on an ellipse around a known one, as wide as they see what it sees: the middle of the scene stays put."""
+    ahead, eye = first.viewmat[2, :3], first.position
+    depth = max(float(np.sum((frame.centre - eye) * ahead)), frame.extent * _NEAREST_MIDDLE)
+    middle, side, near = eye + depth * ahead, first.viewmat[0, :3], min(frame.near, first.near)
+
+    def at(width_degrees: float, turn: float) -> Camera:
+        aside = math.radians(width_degrees) * math.sin(turn)
+        above = math.radians(width_degrees) * _FLATTENED * math.cos(turn)
+        way = -ahead + math.tan(aside) * side + math.tan(above) * frame.up
+        way = way / float(np.sqrt(np.sum(way**2)))
+        return look_at(middle + depth * way, middle, frame.up, K, width, height, near)
+
+    turns = 2.0 * math.pi * np.arange(count) / count
+    nearest = HIDING * depth
+    good = _GOOD * detail(cloud, at(0.0, 0.0), nearest)
+    for swing in _SWINGS:
+        if min(detail(cloud, at(swing, turn), nearest) for turn in np.linspace(0.0, 2.0 * math.pi, 8)) >= good:
+            break
+    return [at(swing, float(turn)) for turn in turns]
 
 
 def _arc(cloud: Cloud, frame: Frame, count: int) -> tuple[F64, float, float]:
