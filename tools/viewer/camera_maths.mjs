@@ -19,6 +19,9 @@ const FOV_MARGIN = 0.3;
 /** How far a splat of alpha 1 reaches at ALPHA_MIN, in standard deviations. */
 export const REACH_MAX = Math.sqrt(2 * Math.log(1 / ALPHA_MIN));
 
+/** Of a canvas that has not been given a camera: nothing is drawn but the background. */
+export const NO_CAMERA = { viewmat: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], fx: 1, fy: 1, cx: 0, cy: 0 };
+
 /**
  * A camera with the size of its picture, everything checked and copied.
  *

@@ -6,17 +6,16 @@
 //   engine.setCamera({ viewmat, fx: 700, fy: 700, cx: 400, cy: 300 });
 //   await engine.open('scene.csplat');
 
-import { viewOf } from './camera_maths.mjs';
+import { NO_CAMERA, viewOf } from './camera_maths.mjs';
 import { EngineError, E_CONTEXT, E_INPUT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
 import { Frames } from './frames.mjs';
 import { Opening } from './opening.mjs';
 import { createRenderer } from './renderer.mjs';
-import { emptyStats, expandedBytes } from './statistics.mjs';
+import { emptyStats } from './statistics.mjs';
 
 export { EngineError };
 
 /**
- * @typedef {import('./renderer.mjs').Renderer} Renderer
  * @typedef {import('./types.d.ts').Camera} Camera
  * @typedef {import('./types.d.ts').Engine} Engine
  * @typedef {import('./types.d.ts').EngineOptions} EngineOptions
@@ -24,9 +23,6 @@ export { EngineError };
  * @typedef {import('./worker.mjs').Reply} Reply
  * @typedef {import('./worker.mjs').Request} Request
  */
-
-/** Of a canvas that has not been given a camera: nothing is drawn but the background. */
-const NO_CAMERA = { viewmat: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], fx: 1, fy: 1, cx: 0, cy: 0 };
 
 /**
  * Make an engine that draws on a canvas.
@@ -43,23 +39,18 @@ export async function createEngine(canvas, options = {}) {
   return new SplatEngine(canvas, renderer, options);
 }
 
-function defaultWorker() {
-  return new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' });
-}
-
 /** @implements {Engine} */
 class SplatEngine {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {Renderer} renderer
+   * @param {import('./renderer.mjs').Renderer} renderer
    * @param {EngineOptions} options
    */
   constructor(canvas, renderer, options) {
     this.canvas = canvas;
     this.renderer = renderer;
     this.options = options;
-    this.background = options.background ?? [0, 0, 0];
-    this.shDegreeAsked = Infinity;
+    this.look = { background: options.background ?? [0, 0, 0], shDegree: Infinity };
     /** @type {Camera | null} */
     this.camera = null;
     /** @type {View | null} */
@@ -75,7 +66,8 @@ class SplatEngine {
       () => this.drawFrame(),
       (frameMs, fps) => this.frameDrawn(frameMs, fps),
     );
-    this.worker = (options.workerFactory ?? defaultWorker)();
+    this.worker =
+      options.workerFactory?.() ?? new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' });
     this.worker.onmessage = ({ data }) => this.take(data);
     this.worker.onerror = ({ message }) => {
       const what = message ?? 'it did not start';
@@ -100,20 +92,19 @@ class SplatEngine {
     this.replaced('another scene was opened before everything was decoded');
     const isAddress = typeof source === 'string' || source instanceof URL;
     const from = isAddress ? new URL(source, document.baseURI).href : source; // the worker has another base
-    return new Promise((/** @type {(value: void) => void} */ resolve, reject) => this.begin(from, resolve, reject));
+    return new Promise((/** @type {(value: void) => void} */ resolve, reject) => this.begin(from, { resolve, reject }));
   }
 
   /**
    * Have a scene read.
    *
    * @param {string | Blob | ArrayBuffer} source
-   * @param {() => void} resolve
-   * @param {(error: EngineError) => void} reject
+   * @param {import('./opening.mjs').Settle} settle
    */
-  begin(source, resolve, reject) {
-    this.opening = new Opening(source, ++this.sceneCount, resolve, reject);
+  begin(source, settle) {
     this.stats = emptyStats(this.renderer.capabilities);
-    const { opening } = this;
+    const opening = new Opening(source, ++this.sceneCount, this.stats, this.options, settle);
+    this.opening = opening;
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening === opening) this.tell({ type: 'open', scene: opening.scene, source: readable });
     };
@@ -149,13 +140,13 @@ class SplatEngine {
 
   /** @param {[number, number, number]} background */
   setBackground(background) {
-    this.background = background;
+    this.look.background = background;
     this.requestFrame();
   }
 
   /** @param {number} degree */
   setShDegree(degree) {
-    this.shDegreeAsked = degree;
+    this.look.shDegree = degree;
     this.requestFrame();
   }
 
@@ -246,67 +237,18 @@ class SplatEngine {
 
   /** @param {Reply} reply */
   take(reply) {
-    const { opening, renderer } = this;
+    const { opening } = this;
     if (opening === null || reply.scene !== opening.scene || opening.error) return;
-    if (reply.type === 'header') this.takeHeader(opening, reply);
-    else if (reply.type === 'progress') this.takeProgress(reply);
-    else if (reply.type === 'geometry') this.takeGeometry(opening, reply);
-    else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
-    else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
-    else if (reply.type === 'order') this.takeOrder(opening, reply);
-    else if (reply.type === 'error') this.fail(new EngineError(reply.error));
-    else {
-      renderer.complete();
-      opening.finish();
-    }
-    if (reply.type === 'header' || reply.type === 'band' || reply.type === 'order' || reply.type === 'done') {
-      this.requestFrame();
-    }
-    this.wake();
-  }
-
-  /**
-   * @param {Opening} opening
-   * @param {Reply & {type: 'header'}} reply
-   */
-  takeHeader(opening, { header, description }) {
     try {
-      opening.takeHeader(header, this.renderer);
+      opening.take(reply, this.renderer);
     } catch (error) {
       if (!(error instanceof EngineError)) throw error;
       this.tell({ type: 'stop' });
-      return this.fail(error);
+      this.fail(error);
     }
-    const { splatCount, fileSize } = header;
-    Object.assign(this.stats, { splatCount, fileSize, expandedBytesPerSplat: expandedBytes(header.shDegree) });
-    this.options.onHeader?.(header, description);
-  }
-
-  /** @param {Reply & {type: 'progress'}} reply */
-  takeProgress({ progress, decodeMs }) {
-    Object.assign(this.stats, { received: progress.received, decodeMs });
-    this.options.onProgress?.(progress);
-  }
-
-  /**
-   * @param {Opening} opening
-   * @param {Reply & {type: 'geometry'}} reply
-   */
-  takeGeometry(opening, reply) {
-    opening.takeGeometry(reply, this.renderer);
-    this.stats.splatsResident = opening.splatsHere;
-    if (opening.isWhole) this.stats.firstPictureBytes = this.stats.received;
-  }
-
-  /**
-   * @param {Opening} opening
-   * @param {Reply & {type: 'order'}} reply
-   */
-  takeOrder(opening, { id, tiles, order, count, cullMs, sortMs }) {
-    this.renderer.setOrder(order, count);
-    opening.order = { id, tiles };
-    Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
-    this.worker.postMessage({ type: 'recycle', order }, [order.buffer]);
+    if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
+    if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
+    this.wake();
   }
 
   /** @param {EngineError} error */
@@ -317,9 +259,8 @@ class SplatEngine {
   }
 
   drawNow() {
-    const { renderer, canvas, background } = this;
-    const view = this.view ?? viewOf(NO_CAMERA, canvas.width, canvas.height);
-    renderer.draw(view, { background, shDegree: this.shDegreeAsked });
+    const { width, height } = this.canvas;
+    this.renderer.draw(this.view ?? viewOf(NO_CAMERA, width, height), this.look);
   }
 
   drawFrame() {
@@ -336,7 +277,7 @@ class SplatEngine {
     const { attributes, order, work } = this.renderer.bytes;
     Object.assign(stats, { frameMs, fps, gpuBytes: attributes + order, workBytes: work });
     stats.gpuBytesPerSplat = stats.splatsResident ? attributes / stats.splatsResident : 0;
-    stats.shDegree = Math.min(this.shDegreeAsked, opening?.header?.shDegree ?? 0);
+    stats.shDegree = Math.min(this.look.shDegree, opening?.header?.shDegree ?? 0);
     if (opening?.isOrderWhole && stats.firstPictureMs === 0) stats.firstPictureMs = performance.now() - opening.begun;
     this.options.onFrame?.(stats);
   }
@@ -353,7 +294,7 @@ class SplatEngine {
     if (renderer === null) return;
     this.renderer = renderer;
     const { opening } = this;
-    if (opening && !opening.error) this.begin(opening.source, opening.resolve, opening.reject);
+    if (opening && !opening.error) this.begin(opening.source, opening.settle);
     this.requestFrame();
   }
 }

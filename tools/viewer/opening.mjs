@@ -1,27 +1,33 @@
-// One call of the engine's `open`: what has come of it so far.
+// One call of the engine's `open`: takes what the worker sends of a scene, and knows what has come of it so far.
 
 import { coarseBounds, fineBounds } from './bounds.mjs';
 import { EngineError, E_LIMIT } from './engine_error.mjs';
+import { expandedBytes } from './statistics.mjs';
 
 /**
  * @typedef {import('./renderer.mjs').Renderer} Renderer
  * @typedef {import('./types.d.ts').Bounds} Bounds
  * @typedef {import('./types.d.ts').Header} Header
  * @typedef {import('./worker.mjs').Reply} Reply
+ *
+ * Of the promise that `open` gave.
+ * @typedef {{resolve: () => void, reject: (error: EngineError) => void}} Settle
  */
 
 export class Opening {
   /**
    * @param {string | Blob | ArrayBuffer} source
    * @param {number} scene number by which the worker's messages are told from those for earlier scenes
-   * @param {() => void} resolve of the promise that `open` gave
-   * @param {(error: EngineError) => void} reject
+   * @param {import('./types.d.ts').Stats} stats of this scene; changed in place
+   * @param {Pick<import('./types.d.ts').EngineOptions, 'onHeader' | 'onProgress'>} hooks
+   * @param {Settle} settle
    */
-  constructor(source, scene, resolve, reject) {
+  constructor(source, scene, stats, hooks, settle) {
     this.source = source;
     this.scene = scene;
-    this.resolve = resolve;
-    this.reject = reject;
+    this.stats = stats;
+    this.hooks = hooks;
+    this.settle = settle;
     /** Milliseconds. */
     this.begun = performance.now();
     /** @type {EngineError | null} */
@@ -33,18 +39,12 @@ export class Opening {
     /** Whether everything is decoded. */
     this.isDone = false;
     this.tilesHere = 0;
-    this.splatsHere = 0;
     /** The last sort: for which camera and how many tiles. */
     this.order = { id: 0, tiles: 0 };
     /** @type {number[]} samples of splats */
     this.points = [];
     /** @type {number[]} */
     this.weights = [];
-  }
-
-  /** Whether layer 0 of all tiles is here. */
-  get isWhole() {
-    return this.header !== null && this.tilesHere === this.header.tiles.length;
   }
 
   /**
@@ -62,15 +62,43 @@ export class Opening {
   }
 
   /**
-   * @param {Header} header
+   * @param {Reply} reply
+   * @param {Renderer} renderer
+   * @throws {EngineError} the worker's, or E_LIMIT for a scene that the GPU cannot hold
+   */
+  take(reply, renderer) {
+    if (reply.type === 'header') this.#takeHeader(reply, renderer);
+    else if (reply.type === 'progress') this.#takeProgress(reply);
+    else if (reply.type === 'geometry') this.#takeGeometry(reply, renderer);
+    else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
+    else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
+    else if (reply.type === 'order') this.#takeOrder(reply, renderer);
+    else if (reply.type === 'error') throw new EngineError(reply.error);
+    else {
+      renderer.complete();
+      this.isDone = true;
+      this.settle.resolve();
+    }
+  }
+
+  /** @param {EngineError} error */
+  fail(error) {
+    if (this.error || this.isDone) return;
+    this.error = error;
+    this.settle.reject(error);
+  }
+
+  /**
+   * @param {Reply & {type: 'header'}} reply
    * @param {Renderer} renderer
    */
-  takeHeader(header, renderer) {
+  #takeHeader({ header, description }, renderer) {
+    const { splatCount, fileSize, shDegree, tiles } = header;
     const [opacities, , quats] = header.attributes;
     try {
       renderer.allocate({
-        tiles: header.tiles,
-        shDegree: header.shDegree,
+        tiles,
+        shDegree,
         antialiased: header.antialiased,
         opacityLevels: opacities.levels,
         opacitySquare: opacities.mapping === 'square',
@@ -81,36 +109,45 @@ export class Opening {
       throw error;
     }
     this.header = header;
-    this.bounds = header.tiles.length ? coarseBounds(header) : this.boundsOfSamples(header);
+    this.bounds = tiles.length ? coarseBounds(header) : this.#boundsOfSamples(header);
+    Object.assign(this.stats, { splatCount, fileSize, expandedBytesPerSplat: expandedBytes(shDegree) });
+    this.hooks.onHeader?.(header, description);
+  }
+
+  /** @param {Reply & {type: 'progress'}} reply */
+  #takeProgress({ progress, decodeMs }) {
+    Object.assign(this.stats, { received: progress.received, decodeMs });
+    this.hooks.onProgress?.(progress);
   }
 
   /**
    * @param {Reply & {type: 'geometry'}} reply
    * @param {Renderer} renderer
    */
-  takeGeometry({ tile, texels, samples }, renderer) {
+  #takeGeometry({ tile, texels, samples }, renderer) {
+    const { stats } = this;
     renderer.uploadGeometry(tile, texels);
-    this.splatsHere += texels.count;
+    stats.splatsResident += texels.count;
     this.tilesHere++;
     for (const value of samples.points) this.points.push(value);
     for (const weight of samples.weights) this.weights.push(weight);
-    if (this.header && this.isWhole) this.bounds = this.boundsOfSamples(this.header);
+    if (this.header === null || this.tilesHere < this.header.tiles.length) return;
+    this.bounds = this.#boundsOfSamples(this.header);
+    stats.firstPictureBytes = stats.received;
+  }
+
+  /**
+   * @param {Reply & {type: 'order'}} reply
+   * @param {Renderer} renderer
+   */
+  #takeOrder({ id, tiles, order, count, cullMs, sortMs }, renderer) {
+    renderer.setOrder(order, count);
+    this.order = { id, tiles };
+    Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
   }
 
   /** @param {Header} header */
-  boundsOfSamples(header) {
+  #boundsOfSamples(header) {
     return fineBounds(header, Float32Array.from(this.points), Float32Array.from(this.weights));
-  }
-
-  /** @param {EngineError} error */
-  fail(error) {
-    if (this.error || this.isDone) return;
-    this.error = error;
-    this.reject(error);
-  }
-
-  finish() {
-    this.isDone = true;
-    this.resolve();
   }
 }
