@@ -47,6 +47,11 @@ export class Opening {
     this.weights = [];
   }
 
+  /** Whether layer 0 of all tiles is here. */
+  get isWhole() {
+    return this.header !== null && this.tilesHere === this.header.tiles.length;
+  }
+
   /**
    * Whether everything is decoded and sorted.
    *
@@ -117,6 +122,7 @@ export class Opening {
   /** @param {Reply & {type: 'progress'}} reply */
   #takeProgress({ progress, decodeMs }) {
     Object.assign(this.stats, { received: progress.received, decodeMs });
+    if (this.isWhole) this.stats.firstPictureBytes ||= progress.received;
     this.hooks.onProgress?.(progress);
   }
 
@@ -125,15 +131,12 @@ export class Opening {
    * @param {Renderer} renderer
    */
   #takeGeometry({ tile, texels, samples }, renderer) {
-    const { stats } = this;
     renderer.uploadGeometry(tile, texels);
-    stats.splatsResident += texels.count;
+    this.stats.splatsResident += texels.count;
     this.tilesHere++;
     for (const value of samples.points) this.points.push(value);
     for (const weight of samples.weights) this.weights.push(weight);
-    if (this.header === null || this.tilesHere < this.header.tiles.length) return;
-    this.bounds = this.#boundsOfSamples(this.header);
-    stats.firstPictureBytes = stats.received;
+    if (this.header && this.isWhole) this.bounds = this.#boundsOfSamples(this.header);
   }
 
   /**
