@@ -374,6 +374,19 @@ def test_the_background_and_a_bare_page(small, site, make_model):
         assert page.locator(name).is_hidden()
 
 
+def test_a_scene_stands_in_front_of_what_it_was_trained_on(small, site, make_model):
+    training = {"background": [1, 1, 0.4], "near": 0.2}
+    clear = encode(make_model(1, 0, opacities=np.zeros(1, np.float32), metadata={"training": training}))
+    behind = []
+    load(small, site, clear, "&size=20x10")
+    for _ in range(5):
+        behind.append(picture(small.page)[0, 0, :3].tolist())
+        small.page.keyboard.press("b")
+    assert [[255, 255, 102], [0, 0, 0], [128, 128, 128], [255, 255, 255], [255, 255, 102]] == behind
+    load(small, site, clear, "&size=20x10&background=0000ff")
+    assert [0, 0, 255] == picture(small.page)[0, 0, :3].tolist()
+
+
 def test_nonsense_in_the_address_is_reported(small, site, make_model):
     load(small, site, encode(make_model(10, 0)), "&size=big&axes=RRR")
     said = small.page.inner_text("#toast")

@@ -53,7 +53,7 @@ document.documentElement.classList.toggle('bare', !wishes.ui);
 
 /** @type {Engine | null} */
 let engine = null;
-let background = wishes.background;
+let shade = 0; // which of `backgrounds` is behind the scene
 let turn = 0; // counts scenes, so that what is late for one is not shown for the next
 
 function draw() {
@@ -71,6 +71,7 @@ function draw() {
 async function show(source, name) {
   if (!engine) return;
   const mine = ++turn;
+  shade = 0;
   view.begin();
   overlay.begin(name);
   keep.hide();
@@ -117,11 +118,19 @@ function otherCamera(step) {
   if (name) overlay.toast(name);
 }
 
-function nextBackground() {
-  const at = BACKGROUNDS.findIndex((colour) => colour.every((value, k) => value === background[k]));
-  background = BACKGROUNDS[(at + 1) % BACKGROUNDS.length];
-  engine?.setBackground(background);
-  draw();
+/** What may stand behind the scene: first what the address says, else what it was trained in front of, else black. */
+function backgrounds() {
+  const own = wishes.background ?? view.facts.background ?? BACKGROUNDS[0];
+  return [own, ...BACKGROUNDS.filter((colour) => String(colour) !== String(own))];
+}
+
+/** @param {number} step */
+function otherBackground(step) {
+  const all = backgrounds();
+  shade = (shade + step) % all.length;
+  engine?.setBackground(all[shade]);
+  const colour = `rgb(${all[shade].map((value) => Math.round(255 * value))})`;
+  document.querySelector('meta[name=theme-color]')?.setAttribute('content', colour); // a phone's bars
 }
 
 /** @param {number} degree */
@@ -156,7 +165,7 @@ const ACTIONS = {
   KeyI: () => overlay.toggleStatistics(),
   KeyO: () => overlay.chooseFile(),
   KeyU: turnUpright,
-  KeyB: nextBackground,
+  KeyB: () => otherBackground(1),
   BracketLeft: () => otherCamera(-1),
   BracketRight: () => otherCamera(1),
   Escape: () => {
@@ -201,10 +210,11 @@ async function start() {
   listen();
   try {
     engine = await createEngine(canvas, {
-      background,
+      background: backgrounds()[0],
       workerFactory: page?.workerFactory,
       onHeader: (header, description) => {
         view.read(header, description);
+        otherBackground(0);
         overlay.describe(view.facts.title || overlay.name, view.facts.licence);
         place();
       },

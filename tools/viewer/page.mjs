@@ -10,7 +10,7 @@ import { unitDirection } from './vectors.mjs';
  * @property {import('./vectors.mjs').Vec3 | null} up direction that is up, of length 1, instead of what the file says
  * @property {string | null} axes directions of +x, +y, +z instead of the file's
  * @property {{width: number, height: number} | null} size of the drawing buffer, pixels
- * @property {[number, number, number]} background 0 to 1
+ * @property {[number, number, number] | null} background 0 to 1, instead of what the file says
  * @property {boolean} ui false for the scene alone
  *
  * What `csplat export-html` puts into the page.
@@ -61,7 +61,7 @@ export function readWishes(query) {
       up,
       axes: axes?.[0] ?? null,
       size: size && { width: Number(size[1]), height: Number(size[2]) },
-      background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : [0, 0, 0],
+      background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : null,
       ui: query.get('ui') !== '0',
     },
     complaints,

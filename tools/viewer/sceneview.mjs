@@ -54,6 +54,8 @@ const noFacts = () => {
     cameras: [],
     /** @type {Camera | null} of the metadata */
     start: null,
+    /** @type {Vec3 | null} what the scene was trained in front of: red, green, blue, 0 to 1 */
+    background: null,
     title: '',
     licence: '',
   };
@@ -116,6 +118,7 @@ export class SceneView {
       axes,
       cameras: (cameras ?? []).flatMap(sound),
       start: [metadata?.view].flatMap(sound)[0] ?? null,
+      background: colour(/** @type {any} */ (metadata?.training)?.background),
       title: typeof metadata?.title === 'string' ? metadata.title : '',
       licence: typeof metadata?.licence === 'string' ? metadata.licence : '',
     };
@@ -243,6 +246,15 @@ export class SceneView {
     this.rig.extent = frame.extent;
     return pose;
   }
+}
+
+/**
+ * @param {unknown} value
+ * @returns {Vec3 | null}
+ */
+function colour(value) {
+  const isShare = (/** @type {unknown} */ one) => typeof one === 'number' && one >= 0 && one <= 1;
+  return Array.isArray(value) && value.length === 3 && value.every(isShare) ? /** @type {Vec3} */ (value) : null;
 }
 
 /**

@@ -17,7 +17,7 @@ test('an empty address wishes nothing', () => {
     up: null,
     axes: null,
     size: null,
-    background: [0, 0, 0],
+    background: null,
     ui: true,
   });
 });

@@ -47,6 +47,12 @@ test('who takes its word is offered no other way up', () => {
 });
 
 test('metadata that say nothing sensible are not listened to', () => {
+  const behind = (background) => opened({ metadata: { training: { background } } }).facts.background;
+  assert.deepEqual(behind([1, 0.5, 0]), [1, 0.5, 0]);
+  for (const wrong of ['white', [1, 1], [1, 1, 1, 1], [1, 1, 2], [1, -1, 1], [1, null, 1], ['1', 1, 1]]) {
+    assert.equal(behind(wrong), null);
+  }
+  assert.equal(opened({ metadata: { training: 'white' } }).facts.background, null);
   for (const up of ['z', [0, 1], [0, 0, 0], [0, null, 1], ['0', '0', '1'], [0, 0, 1, 0], { x: 1 }]) {
     assert.deepEqual(opened({ axes: 'RFU', metadata: { up } }).up, [0, 0, 1]);
     assert.ok(!opened({ metadata: { up } }).knowsUp);
