@@ -143,6 +143,7 @@ function shDegree(degree) {
 function turnUpright() {
   if (!engine?.bounds) return;
   const { up, isSaid } = view.turnUpright(engine.bounds, engine.stats.splatCount);
+  element('upright', HTMLElement).hidden = false; // who turns a scene once may want to go on
   if (isSaid) {
     keep.hide();
     overlay.toast(`${upWord(up).replace('-', '−')} is up, as the scene says`);
@@ -177,7 +178,15 @@ const ACTIONS = {
   Digit2: () => shDegree(2),
   Digit3: () => shDegree(3),
 };
-const BUTTONS = { reset: 'KeyR', full: 'KeyF', upright: 'KeyU', previous: 'BracketLeft', next: 'BracketRight' };
+const BUTTONS = {
+  reset: 'KeyR',
+  full: 'KeyF',
+  upright: 'KeyU',
+  previous: 'BracketLeft',
+  next: 'BracketRight',
+  'help-upright': 'KeyU',
+  'help-background': 'KeyB',
+};
 
 function listen() {
   const { classList } = document.documentElement;

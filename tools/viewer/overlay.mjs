@@ -51,7 +51,9 @@ export class Overlay {
     html('error-close').addEventListener('click', () => this.hideError());
     html('details').addEventListener('click', () => this.toggleStatistics());
     html('help').addEventListener('click', () => this.toggleHelp());
-    html('help-close').addEventListener('click', () => this.toggleHelp());
+    for (const id of ['help-close', 'help-upright', 'help-background']) {
+      html(id).addEventListener('click', () => this.toggleHelp());
+    }
     const input = element('file', HTMLInputElement);
     input.addEventListener('change', () => {
       if (input.files?.[0]) hooks.open(input.files[0]);
@@ -138,7 +140,8 @@ export class Overlay {
     const dialog = element('help-dialog', HTMLDialogElement);
     if (dialog.open) return dialog.close();
     dialog.showModal();
-    dialog.scrollTop = 0; // on a small screen the button that has the focus is at the end
+    html('help-close').focus();
+    dialog.scrollTop = 0; // on a small screen that button is at the end
   }
 
   /**
