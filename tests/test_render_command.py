@@ -3,12 +3,13 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from csplat import EncodeOptions, encode, write_ply
+from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.cli.app import app
@@ -94,6 +95,10 @@ def test_a_ball_is_red_in_the_middle_and_the_background_around_it(ply, cameras, 
     assert picture[24, 32, 0] > 240
     assert picture[24, 32, 2] < 10
     assert [0, 0, 255] == picture[0, 0].tolist()
+    trained = replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}})
+    write_ply(ply, trained)
+    call("render", ply, "--cameras", cameras, "-o", tmp_path / "trained")
+    assert [255, 255, 255] == pixels(tmp_path / "trained" / "left.png")[0, 0].tolist()
 
 
 def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):

@@ -20,7 +20,6 @@ from csplat_tools.files.scenes import load_model, without_bands
 from csplat_tools.files.streams import check_name
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
-from csplat_tools.views import BLACK
 
 __all__ = ["render"]
 
@@ -38,7 +37,8 @@ class _Views(Views):
         None
     )
     background: Annotated[
-        str | None, typer.Option(metavar="R,G,B", help="Colour behind the scene, 0 to 1, or black, or white.")
+        str | None,
+        typer.Option(metavar="R,G,B", help="Colour behind the scene, 0 to 1, or black, or white; else as in training."),
     ] = None
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Of the pictures: the cameras' own, or 640x480.")] = (
         None
@@ -92,7 +92,7 @@ def render(
     if film and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
     pixels = None if views.size is None else parse_size(views.size)
-    colour, chosen = views.colour or BLACK, parse_mode(mode)
+    colour, chosen = views.colour, parse_mode(mode)
     shots = views.photographs()
     out.check(output if film else None, inputs=(source, views.cameras))
     check_name(output, ".webp", "render", source)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.training import TrainedOn
 from csplat_render import Camera, Mode, render
 from csplat_render.arrays import RenderResult
 from csplat_render.cameras import load_cameras, resized
@@ -21,7 +22,7 @@ from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
 from csplat_tools.files.streams import check_output, write_array
 from csplat_tools.present.film import check_film, write_film
-from csplat_tools.views import DataOptions, Split, find_view_set
+from csplat_tools.views import BLACK, Colour, DataOptions, Split, find_view_set
 
 __all__ = ["Rendered", "find_cameras", "render_film", "render_folder"]
 
@@ -89,7 +90,7 @@ def render_folder(
     cameras: Sequence[Camera],
     folder: str,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour | None = None,
     mode: Mode = "standard",
     depth: bool = False,
     alpha: bool = False,
@@ -103,7 +104,7 @@ def render_folder(
         model: the scene.
         cameras: where to stand. The pictures take the names of their photographs, or numbers.
         folder: where the files go; it is made if need be.
-        background: red, green, blue, 0..1.
+        background: red, green, blue, 0..1; `None`: what the scene says it was trained in front of, else black.
         mode: `exact`, `standard` or `fast`.
         depth: write NAME.depth.npy too, [H, W] float32: how far along the camera's axis what is seen there lies on
             average, scene units; 0 where nothing is.
@@ -144,7 +145,7 @@ def render_film(
     path: str,
     *,
     fps: float,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour | None = None,
     mode: Mode = "standard",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
@@ -178,7 +179,7 @@ def render_film(
 def _pictures(
     model: SplatModel,
     cameras: Sequence[Camera],
-    background: tuple[float, float, float],
+    background: Colour | None,
     mode: Mode,
     prepare: Callable[[], object] | None,
     progress: Progress | None,
@@ -186,10 +187,12 @@ def _pictures(
     """Render camera after camera; see `render_folder`."""
     if prepare is not None:
         prepare()
+    said = TrainedOn.of(model.metadata)
+    behind = background or (said.background if said else BLACK)
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("rendering", number / len(cameras))
-        yield render(model, camera, background=background, mode=mode)
+        yield render(model, camera, background=behind, mode=mode)
     if progress is not None:
         progress("rendering", 1.0)
 
