@@ -1,6 +1,6 @@
 // The page: an engine, a camera that a person moves, and what stands over the scene.
 //
-// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
+// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // `window.csplatViewer` lets programs drive the page; its `ready` resolves when the scene is drawn for good.
 
 import { Controls } from './controls.mjs';

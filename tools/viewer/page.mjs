@@ -8,6 +8,7 @@ import { unitDirection } from './vectors.mjs';
  * @property {string | null} camera a camera, a list of them, or the address of a file of one or the other
  * @property {number} view which camera of a list, from 0
  * @property {import('./vectors.mjs').Vec3 | null} up direction that is up, of length 1, instead of what the file says
+ * @property {import('./vectors.mjs').Vec3 | null} seems which way seems to be up, if nothing says it
  * @property {string | null} axes directions of +x, +y, +z instead of the file's
  * @property {{width: number, height: number} | null} size of the drawing buffer, pixels
  * @property {[number, number, number] | null} background 0 to 1, instead of what the file says
@@ -48,9 +49,13 @@ export function readWishes(query) {
   };
   const size = match('size', /^([1-9]\d{0,3})x([1-9]\d{0,3})$/, 'width and height as 800x600');
   const colour = match('background', /^([\da-f]{2})([\da-f]{2})([\da-f]{2})$/i, 'a colour as ff8800');
-  const numbers = match('up', UP, THREE);
-  const up = numbers && unitDirection(numbers[0].split(',').map(Number));
-  if (numbers && !up) complaints.push(`up is “${numbers[0]}”, wanted ${THREE}`);
+  /** @param {string} name */
+  const direction = (name) => {
+    const numbers = match(name, UP, THREE);
+    const found = numbers && unitDirection(numbers[0].split(',').map(Number));
+    if (numbers && !found) complaints.push(`${name} is “${numbers[0]}”, wanted ${THREE}`);
+    return found;
+  };
   const axes = match('axes', AXES, 'three letters as RDF');
   const view = match('view', /^\d{1,6}$/, 'a number from 0');
   return {
@@ -58,7 +63,8 @@ export function readWishes(query) {
       scene: query.get('scene'),
       camera: query.get('camera'),
       view: Number(view?.[0] ?? 0),
-      up,
+      up: direction('up'),
+      seems: direction('seems'),
       axes: axes?.[0] ?? null,
       size: size && { width: Number(size[1]), height: Number(size[2]) },
       background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : null,

@@ -65,12 +65,15 @@ export class SceneView {
   /**
    * @param {Rig} rig
    * @param {Controls} controls
-   * @param {{up: Vec3 | null, axes: string | null}} wanted instead of the file's
+   * @param {{up: Vec3 | null, axes: string | null, seems: Vec3 | null}} wanted instead of the file's; `seems`: what is
+   * up in the first scene if nothing says it
    */
   constructor(rig, controls, wanted) {
     this.rig = rig;
     this.controls = controls;
     this.wanted = wanted;
+    /** @type {Vec3 | null} */
+    this.seems = null;
     /** @type {Camera[]} of the address: for whatever scene */
     this.wantedCameras = [];
     this.first = 0;
@@ -86,6 +89,8 @@ export class SceneView {
   /** Forget the scene before. */
   begin() {
     this.facts = noFacts();
+    this.seems = this.wanted.seems;
+    this.wanted = { ...this.wanted, seems: null };
     this.bounds = null;
     this.waits = true;
     this.controls.touched = false;
@@ -122,7 +127,7 @@ export class SceneView {
       title: typeof metadata?.title === 'string' ? metadata.title : '',
       licence: typeof metadata?.licence === 'string' ? metadata.licence : '',
     };
-    this.up = this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U');
+    this.up = this.#firstUp();
     this.shown = this.first;
   }
 
@@ -146,6 +151,10 @@ export class SceneView {
     const { start } = this.facts;
     const known = [...(start ? [start] : []), ...this.cameras];
     return known.length ? upOfCameras(known) : null;
+  }
+
+  #firstUp() {
+    return this.#namedUp() ?? this.seems ?? directionOf(DEFAULT_AXES, 'U');
   }
 
   /**
@@ -197,7 +206,7 @@ export class SceneView {
    * @returns {{up: Vec3, isSaid: boolean}} what is up now, and whether the file says so
    */
   turnUpright(bounds, splatCount) {
-    const all = waysUp(this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U'));
+    const all = waysUp(this.#firstUp());
     this.up = all[(all.findIndex((up) => dot(up, this.up) > SAME) + 1) % all.length];
     const pose = this.#automatic(bounds, splatCount, this.up);
     this.rig.home = pose;

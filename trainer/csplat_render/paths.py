@@ -189,7 +189,7 @@ def _sway(cloud: Cloud, first: Camera, frame: Frame, count: int, K: F64, width: 
 
     turns = 2.0 * math.pi * np.arange(count) / count
     nearest = HIDING * depth
-    good = _GOOD * detail(cloud, at(0.0, 0.0), nearest)
+    good, swing = _GOOD * detail(cloud, at(0.0, 0.0), nearest), 0.0
     for swing in _SWINGS:
         if min(detail(cloud, at(swing, turn), nearest) for turn in np.linspace(0.0, 2.0 * math.pi, 8)) >= good:
             break

@@ -35,9 +35,10 @@ def seeming_up(model: SplatModel) -> Direction | None:
         model: the scene.
 
     Returns:
-        `None` where the scene says itself which way is up, where nothing tells it, and inside surroundings.
+        `None` where the scene or the cameras that it carries say which way is up, where nothing tells it, and inside
+        surroundings.
     """
-    if len(model) == 0 or up_of(model.metadata, model.coordinate_system) is not None:
+    if len(model) == 0 or model.cameras or up_of(model.metadata, model.coordinate_system) is not None:
         return None
     frame = scene_frame(model)
     if frame.kind != "object":

@@ -18,7 +18,7 @@ from csplat_tools.files.console import format_bytes, note
 from csplat_tools.files.streams import check_name, write_bytes
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
-from csplat_tools.present.viewing import ViewScene, open_scene, up_wish, view_wishes
+from csplat_tools.present.viewing import ViewScene, open_scene, seeming_wishes, view_wishes
 
 __all__ = ["export_html", "view"]
 
@@ -57,7 +57,7 @@ def view(
     with ExitStack() as stack:
         with out.bar() as progress:
             scene = stack.enter_context(open_scene(source, preset=name, progress=progress))
-        wishes |= _standing(scene, upright, out)
+        wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.findings([one for one in scene.findings if one.kind == "repair"])
@@ -100,7 +100,7 @@ def export_html(
     with out.bar() as progress, open_scene(source, preset=name, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
-        wishes |= _standing(scene, upright, out)
+        wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
         exported = export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.findings([one for one in scene.findings if one.kind == "repair"])
@@ -111,11 +111,6 @@ def export_html(
     )
     sizes = {"scene_bytes": exported.scene_bytes, "code_bytes": exported.code_bytes}
     out.publish({"splats": scene.header.splat_count, "size_bytes": len(exported.page), **sizes})
-
-
-def _standing(scene: ViewScene, upright: Upright, out: Output) -> dict[str, str]:
-    up = upright.seeming(scene.seems_up, out)
-    return {} if up is None else {"up": up_wish(up)}
 
 
 def _encoded(scene: ViewScene, preset: str) -> list[str]:

@@ -15,7 +15,7 @@ from csplat.model import SplatModel
 from csplat_render.cloud import surface_areas, visible_opacity
 from csplat_render.standing import seeming_up
 from csplat_tools.present.export import export_page
-from csplat_tools.present.viewing import up_wish
+from csplat_tools.present.viewing import seeming_wishes
 
 __all__ = ["MOST_SPLATS", "most_visible", "scene_html"]
 
@@ -40,8 +40,7 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
         InputError: values that no lattice can hold, or the installation is not complete.
     """
     shown = most_visible(model, most_splats)
-    up = seeming_up(shown)
-    wishes = {} if up is None else {"up": up_wish(up)}
+    wishes = seeming_wishes(seeming_up(shown))
     page = export_page(encode(shown, EncodeOptions(preset="fast")), "scene", wishes).page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'

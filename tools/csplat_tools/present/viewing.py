@@ -21,7 +21,7 @@ from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import SceneOverrides, read_source
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 
-__all__ = ["ViewScene", "open_scene", "up_wish", "view_wishes"]
+__all__ = ["ViewScene", "open_scene", "seeming_wishes", "view_wishes"]
 
 
 _NONE = SceneOverrides()
@@ -97,12 +97,16 @@ def view_wishes(camera: str | None, facts: SceneOverrides = _NONE) -> dict[str, 
     if facts.coordinate_system is not None:
         wishes["axes"] = facts.coordinate_system
     if facts.up is not None:
-        wishes["up"] = up_wish(facts.up)
+        wishes["up"] = _words(facts.up)
     return wishes
 
 
-def up_wish(up: Direction) -> str:
-    """A direction as the page understands it."""
+def seeming_wishes(up: Direction | None) -> dict[str, str]:
+    """Parameters of the page for which way seems to be up: it asks for them last."""
+    return {} if up is None else {"seems": _words(up)}
+
+
+def _words(up: Direction) -> str:
     return ",".join(f"{value:g}" for value in up)
 
 

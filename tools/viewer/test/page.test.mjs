@@ -15,6 +15,7 @@ test('an empty address wishes nothing', () => {
     camera: null,
     view: 0,
     up: null,
+    seems: null,
     axes: null,
     size: null,
     background: null,

@@ -22,7 +22,8 @@ const LEVEL = {
 };
 
 function opened({ axes = '', metadata = null, cameras = null }, wanted = {}) {
-  const view = new SceneView(null, { touched: false }, { up: null, axes: null, ...wanted });
+  const view = new SceneView(null, { touched: false }, { up: null, axes: null, seems: null, ...wanted });
+  view.begin();
   view.read({ axes }, { metadata, cameras });
   return view;
 }
@@ -36,6 +37,17 @@ test('a person comes first, then the metadata, the axes, the cameras', () => {
   assert.deepEqual(opened({ ...said, metadata: null }).up, [0, 1, 0]);
   assert.deepEqual(opened({ cameras: [LEVEL] }).up, [0, 0, 1]);
   assert.deepEqual(opened({}).up, [0, -1, 0]);
+});
+
+test('what seems to be up is asked for last, and of the first scene alone', () => {
+  const seems = [0, 0, 1];
+  assert.deepEqual(opened({ axes: 'RUB' }, { seems }).up, [0, 1, 0]);
+  const view = opened({}, { seems });
+  assert.deepEqual(view.up, seems);
+  assert.ok(!view.knowsUp);
+  view.begin();
+  view.read({ axes: '' }, { metadata: null, cameras: null });
+  assert.deepEqual(view.up, [0, -1, 0]);
 });
 
 test('who takes its word is offered no other way up', () => {
