@@ -5,20 +5,22 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, NoReturn, ParamSpec
 
 import typer
 
 from csplat.errors import CsplatError, InputError
 from csplat_tools.files.console import note
 
-__all__ = ["FAILED", "INTERRUPTED", "guarded"]
+__all__ = ["FAILED", "INTERRUPTED", "WrongCommandLine", "guarded", "refuse_command_line"]
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+_WRONG_USE = 2
 
 _AGAIN = "copy or download it again"
 _NEWER = "a newer csplat may know it"
@@ -44,6 +46,10 @@ _OS_ADVICE = {
     errno.EFBIG: "no half of a file was left; name another place",
     errno.EDQUOT: "no half of a file was left; make room, or name another place",
 }
+
+#: What typer raises of a command line. It names one kind alone.
+WrongCommandLine: type[Exception] = typer.BadParameter.__bases__[0]
+_SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in its words
 
 P = ParamSpec("P")
 
@@ -75,6 +81,16 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(INTERRUPTED) from None
 
     return run
+
+
+def refuse_command_line(error: Any) -> NoReturn:
+    """Say what is wrong with a command line in one line, as other errors are told, and end with status 2."""
+    message = " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
+    if message:  # of a command line without a word, help is printed already
+        of = error.ctx.command_path if error.ctx is not None else "csplat"
+        helps = f"`{of} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
+        note(f"error: {of}: {message}; {helps} says what is possible (E_USAGE)")
+    sys.exit(_WRONG_USE)
 
 
 def _fail(message: str) -> None:

@@ -21,7 +21,7 @@ from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import Progress, format_bytes, format_range, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import check_name
 from csplat_tools.inspect.glance import SIZE, glance
 
@@ -176,10 +176,10 @@ def encode(
         goal.read(1.0)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    out.check(output, inputs=(source, importance, views.cameras), named={"--source-index": source_index})
+    out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".csplat", "encode", source)
     if goal.is_rendered:
-        prepare_renderer(quiet=out.quiet, simplify=True)
+        need_renderer()
     reaching: Encoder = partial(_reach, goal, views, virtual, importance, out)
     with out.bar() as progress:
         encoded = encode_file(
@@ -218,6 +218,7 @@ def _reach(
     assert target is not None
     weights = None if importance is None else read_weights(importance, model)
     if target.is_rendered:
+        prepare_renderer(quiet=out.quiet, simplify=True)
         from csplat_tools.optimise.optimiser import expected_seconds
 
         around = views.find(model, out, **virtual.given())

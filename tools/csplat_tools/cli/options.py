@@ -21,10 +21,11 @@ from typer.models import OptionInfo
 
 from csplat.errors import InputError
 from csplat.lint import Finding
+from csplat_render import Mode
 from csplat_tools.cli.console import guarded
 from csplat_tools.cli.settings import Settings, describe_settings, read_settings
 from csplat_tools.files.console import Progress, note, progress_bar, say, say_json
-from csplat_tools.files.streams import STANDARD_STREAM, check_outputs, write_json
+from csplat_tools.files.streams import STANDARD_STREAM, check_name, check_outputs, write_json
 
 __all__ = [
     "Checkpoint",
@@ -32,7 +33,7 @@ __all__ = [
     "Group",
     "Importance",
     "Lpips",
-    "Mode",
+    "ModeWord",
     "Output",
     "Resume",
     "Scene",
@@ -49,7 +50,7 @@ Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choic
 Threads = Annotated[
     int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")
 ]
-Mode = Annotated[str, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
+ModeWord = Annotated[Mode, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
 Lpips = Annotated[
     str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
 ]
@@ -77,6 +78,9 @@ _Set = Annotated[
 _MORE = re.compile(r"\n *---\n")  # in a docstring: what follows is for --help-all
 _HELP_ALL = "help_all"
 _ALIAS = "output_option"  # `-o`, beside the argument
+_ENDINGS = {
+    "--report": ".json", "--page": ".html", "-o": ".html", "--source-index": ".npy", "--checkpoint": ".npz",
+}  # fmt: skip
 _EXCLUDED_MAX = 6  # options that one excludes and that say so themselves
 T = TypeVar("T")
 
@@ -122,12 +126,12 @@ class Output(Group):
         Args:
             outputs: what the command writes, or `-`; `None` for what is not wanted.
             inputs: what it reads: none of them may be written.
-            named: by option, what it writes beside them, which cannot be `-`.
+            named: by option, what it writes beside them, which cannot be `-`, nor be named as something else.
             force: they may be replaced, whatever the user says.
 
         Raises:
-            InputError: one exists, or two are the same.
-            OSError: a folder does not exist.
+            InputError: one exists, two are the same, or one has the name of something else.
+            OSError: an input does not exist, or the folder of an output.
             typer.BadParameter: two of them want standard output, or one that cannot go there.
         """
         files = {"--report": self.report, **(named or {})}
@@ -137,6 +141,9 @@ class Output(Group):
         if self.as_json and STANDARD_STREAM in outputs:
             raise typer.BadParameter("--json and - both want standard output")
         check_outputs((*outputs, *files.values()), force=self.force or force, inputs=inputs)
+        for name, path in files.items():
+            if path is not None and name in _ENDINGS:
+                check_name(path, _ENDINGS[name], name)
 
     def publish(self, result: Any, text: str = "") -> None:
         """Give the result: as JSON into `--report` and with `--json`, else as text.

@@ -11,7 +11,7 @@ from csplat.errors import counted
 from csplat_tools.cli.options import Output, Scene, Seed, Threads, command
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name
 
@@ -48,13 +48,14 @@ def sensitivity(
       csplat sensitivity scene.ply scene.npz --data photographs
       csplat encode scene.ply scene.csplat --importance scene.npz
     """
-    out.check(inputs=(source, views.cameras), named={"OUT.npz": output})
+    out.check(inputs=(source, *views.inputs), named={"OUT.npz": output})
     check_name(output, ".npz", "sensitivity", source)
-    looked_for = views.data is None and views.cameras is None  # virtual ones
-    prepare_renderer(quiet=out.quiet, simplify=looked_for)
+    need_renderer()
     from csplat_tools.optimise.sensitivity import measure_scene
 
     model = load_model(source).model
+    looked_for = views.data is None and views.cameras is None  # virtual ones
+    prepare_renderer(quiet=out.quiet, simplify=looked_for)
     count = {"count": 0} if views.cameras is not None else {}
     around = views.find(model, out, seed=seed, aside=None if views.data is None else 0, **virtual.given() | count)
     with out.bar() as progress:

@@ -14,7 +14,7 @@ from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright, Views, Virtual
 from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name, write_array, write_model
 
@@ -67,7 +67,7 @@ def simplify(
       csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
-    prepare_renderer(quiet=out.quiet, simplify=True)
+    need_renderer()
     import csplat_tools
     from csplat_tools.optimise.simplify import SimplifyOptions
     from csplat_tools.optimise.target import Target
@@ -75,9 +75,10 @@ def simplify(
     loss = None if max_loss is None else parse_decibels(max_loss)
     chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
-    out.check(output, inputs=(source, views.cameras), named={"--source-index": source_index})
+    out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
     model = upright.upright().applied(load_model(source).model)
+    prepare_renderer(quiet=out.quiet, simplify=True)
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])

@@ -97,7 +97,7 @@ def train(
     )  # fmt: skip
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     out.check(
-        output, inputs=(resume, lpips_weights),
+        output, inputs=(source, resume, lpips_weights),
         named={"--plot": plot, "--checkpoint": None if again else checkpoint},
     )  # fmt: skip
     check_name(output, ".ply", "train", source)

@@ -60,8 +60,8 @@ def verify(
 def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
     violations = verified.validation.violations
     if violations:
-        clauses = sorted({one.clause for one in violations})
-        note(f"error: {path}: {counted(len(violations), 'violation')} of {', '.join(clauses)}")
+        clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
+        note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
     if unproved:
         note("error: the stated errors were not looked at")
     for failure in verified.proof.failures if verified.proof is not None else ():
