@@ -12,7 +12,7 @@ from csplat.errors import counted
 from csplat.files import read_array
 from csplat_tools.cli.options import Lpips, ModeWord, Output, command
 from csplat_tools.cli.view_options import SplitWord, Views
-from csplat_tools.files.console import format_range, format_table
+from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import STANDARD_STREAM
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["compare"]
 
-_SECONDS_WORTH_SAYING = 10.0
-_SPREAD = (0.6, 1.7)  # how much less and more it may take
 _PAIRING = {
     "index": "pairs from the source index",
     "order": "pairs by their order",
@@ -83,13 +81,12 @@ def compare(
     rows = None if source_index is None else read_array(source_index)
     source = load_model(a)
     around = views.find(source.model, out, count=0, split=split)
-    if mode == "exact" and around.judges and not out.quiet:
-        from csplat_tools.views.timing import picture_seconds
+    if mode == "exact":
+        from csplat_tools.views.timing import pictures_seconds
 
-        seconds = 2 * len(around.judges) * picture_seconds(source.model, around.judges, mode=mode)
-        if seconds > _SECONDS_WORTH_SAYING:
-            about = format_range(_SPREAD[0] * seconds, _SPREAD[1] * seconds)
-            out.remark(f"the exact mode takes about {about} here; the standard one takes seconds")
+        out.foretell(
+            lambda: 2 * pictures_seconds(source.model, around.judges, mode=mode), "--mode standard takes seconds"
+        )
     with out.bar() as progress:
         compared = csplat_tools.compare(
             source, b, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,

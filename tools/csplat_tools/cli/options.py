@@ -24,7 +24,7 @@ from csplat.lint import Finding
 from csplat_render import Mode
 from csplat_tools.cli.console import guarded
 from csplat_tools.cli.settings import Settings, describe_settings, read_settings
-from csplat_tools.files.console import Progress, note, progress_bar, say, say_json
+from csplat_tools.files.console import WORTH_SAYING, Progress, format_about, note, progress_bar, say, say_json
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, check_outputs, write_json
 
 __all__ = [
@@ -163,6 +163,17 @@ class Output(Group):
         """Tell people on standard error, unless they asked for silence."""
         for line in () if self.quiet else lines:
             note(line)
+
+    def foretell(self, expected: Callable[[], float], sooner: str) -> None:
+        """Tell people how long work takes, if that is long: they may choose otherwise.
+
+        Args:
+            expected: looks how many seconds; not called where nobody is told.
+            sooner: what takes less.
+        """
+        seconds = 0.0 if self.quiet else expected()
+        if seconds > WORTH_SAYING:
+            note(f"this takes about {format_about(seconds)} here; {sooner}")
 
     def findings(self, findings: Sequence[Finding]) -> None:
         """Tell what lint noticed in a PLY that is not usual; what was repaired is told in any case."""

@@ -17,6 +17,8 @@ from csplat_tools.files.streams import check_name
 
 __all__ = ["sensitivity"]
 
+#: What it costs, in pictures of all views.
+_PASSES = 4.4
 _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
 
 
@@ -52,12 +54,17 @@ def sensitivity(
     check_name(output, ".npz", "sensitivity", source)
     need_renderer()
     from csplat_tools.optimise.sensitivity import measure_scene
+    from csplat_tools.views.timing import pictures_seconds
 
     model = load_model(source).model
     looked_for = views.data is None and views.cameras is None  # virtual ones
     prepare_renderer(quiet=out.quiet, simplify=looked_for)
     count = {"count": 0} if views.cameras is not None else {}
     around = views.find(model, out, seed=seed, aside=None if views.data is None else 0, **virtual.given() | count)
+    out.foretell(
+        lambda: _PASSES * pictures_seconds(model, around.teaches or around.judges),
+        "fewer or smaller views take less: --help-all",
+    )
     with out.bar() as progress:
         measured = measure_scene(model, around, matrices=matrices, threads=threads, progress=progress)
     measured.write(output)

@@ -21,6 +21,8 @@ from csplat_tools.files.streams import check_name, write_array, write_model
 __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
+#: What it costs, in pictures of all views that teach: of a share, and of a target, which looks for one.
+_PASSES = (15.0, 55.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 
 
@@ -71,6 +73,8 @@ def simplify(
     import csplat_tools
     from csplat_tools.optimise.simplify import SimplifyOptions
     from csplat_tools.optimise.target import Target
+    from csplat_tools.views import reduced
+    from csplat_tools.views.timing import pictures_seconds
 
     loss = None if max_loss is None else parse_decibels(max_loss)
     chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
@@ -82,6 +86,11 @@ def simplify(
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])
+    passes = _PASSES[keep is None]
+    out.foretell(
+        lambda: passes * pictures_seconds(model, reduced(around.teaches, given["size"])),
+        "fewer or smaller views take less: --help-all",
+    )
     with out.bar() as progress:
         result = csplat_tools.simplify(
             model, keep=keep, psnr=target_psnr, loss=loss, views=around, options=options, progress=progress

@@ -11,7 +11,7 @@ from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import Progress, format_bytes, format_range
+from csplat_tools.files.console import Progress, format_about, format_bytes
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
@@ -25,14 +25,13 @@ __all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
 # Seconds by kind of point, on two cores: for each million splats, and for each second that eight
 # pictures of the source take; for an estimate that a person decides by, no more.
-_SPREAD = (0.6, 1.7)  # how much less and more all of them may take
 _COSTS = {
     "presets": (12.0, 15.0),
     "precision": (12.0, 6.0),
     "strategies": (12.0, 6.0),
     "k-means": (250.0, 6.0),
     "distilled": (40.0, 110.0),
-    "targets": (100.0, 60.0),
+    "targets": (0.0, 425.0),  # 3,400 pictures: `optimiser`
     "simplify": (40.0, 250.0),
     "finetune": (100.0, 500.0),
 }
@@ -158,8 +157,7 @@ def tradeoff(
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
         costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        about = format_range(_SPREAD[0] * sum(costs), _SPREAD[1] * sum(costs))
-        tell(f"{counted(len(tried), 'file')} to make and to measure: about {about} here")
+        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_about(sum(costs))} here")
         points = list[Point | Failure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
