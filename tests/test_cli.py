@@ -496,9 +496,12 @@ def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_f
 
 
 def test_a_full_standard_output_is_one_line(csplat_file):
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run([*PROGRAM, "info", csplat_file], stdout=full, stderr=subprocess.PIPE, check=False)
-    assert (1, b"error: standard output: No space left on device (ENOSPC)\n") == (done.returncode, done.stderr)
+    line = b"error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
+    for words in (("info", csplat_file), ("--version",)):
+        with Path("/dev/full").open("wb") as full:
+            done = subprocess.run([*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, check=False)
+        assert (1, line) == (done.returncode, done.stderr)
+    assert refused("decode", csplat_file, "/dev/full").startswith("error: /dev/full: No space left")
 
 
 # Wrong kinds of files -----------------------------------------------------------------------------
@@ -767,7 +770,7 @@ def test_a_command_imports_itself_alone():
         "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "options", "settings")}
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "groups", "options", "settings")}
     assert {"csplat_tools.cli.info"} == set(done.stderr.split()) - shared
 
 

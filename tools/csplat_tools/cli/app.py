@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
-from csplat_tools.cli.console import WrongCommandLine, refuse_command_line
+from csplat_tools.cli.console import WrongCommandLine, guarded, refuse_command_line
 from csplat_tools.files.console import say
 
 __all__ = ["app"]
@@ -54,9 +54,11 @@ class _Commands(TyperGroup):
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
-            sys.exit(super().main(*args, **{**how, "standalone_mode": False}))
+            sys.exit(guarded(super().main)(*args, **{**how, "standalone_mode": False}))
         except WrongCommandLine as error:
             refuse_command_line(error)
+        except typer.Exit as error:  # help could not be printed
+            sys.exit(error.exit_code)
 
 
 def _imported(name: str) -> Any:

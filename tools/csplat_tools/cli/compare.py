@@ -10,7 +10,8 @@ import typer
 
 from csplat.errors import counted
 from csplat.files import read_array
-from csplat_tools.cli.options import Lpips, ModeWord, Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Lpips, ModeWord, command
 from csplat_tools.cli.view_options import SplitWord, Views
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_renderer, prepare_renderer

@@ -21,7 +21,8 @@ from csplat_conformance.near import EXACT
 from csplat_conformance.report import Report, to_json, to_junit, to_table
 from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Group, Output, chosen, command
+from csplat_tools.cli.groups import Group, Output
+from csplat_tools.cli.options import chosen, command
 from csplat_tools.files.console import Progress, note, say
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes

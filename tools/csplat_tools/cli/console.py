@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, ParamSpec
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import typer
 
@@ -52,18 +52,19 @@ WrongCommandLine: type[Exception] = typer.BadParameter.__bases__[0]
 _SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in its words
 
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
-def guarded(command: Callable[P, None]) -> Callable[P, None]:
+def guarded(command: Callable[P, T]) -> Callable[P, T]:
     """Turn what goes wrong on purpose into one line on standard error and status 1.
 
     Defects of csplat itself still end in a traceback: that is what a report of them needs.
     """
 
     @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
-            command(*args, **kwargs)
+            result = command(*args, **kwargs)
             sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
         except CsplatError as error:
             _fail(_csplat_error(error))
@@ -79,6 +80,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except KeyboardInterrupt:
             note("interrupted")
             raise typer.Exit(INTERRUPTED) from None
+        return result
 
     return run
 
@@ -93,7 +95,7 @@ def refuse_command_line(error: Any) -> NoReturn:
     sys.exit(_WRONG_USE)
 
 
-def _fail(message: str) -> None:
+def _fail(message: str) -> NoReturn:
     note("error: " + " ".join(message.split()))
     raise typer.Exit(FAILED) from None
 
@@ -113,7 +115,7 @@ def _os_error(error: OSError) -> str:
     number = error.errno or 0
     code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
     if error.filename is None:
-        return ("standard output: " if number in _FULL else "") + reason + code
+        return (f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason) + code
     return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
 
 

@@ -15,7 +15,8 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
-from csplat_tools.cli.options import Group, Importance, Output, SourceIndex, command
+from csplat_tools.cli.groups import Group, Output
+from csplat_tools.cli.options import Importance, SourceIndex, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
-from csplat_tools.cli.options import Group, chosen
+from csplat_tools.cli.groups import Group
+from csplat_tools.cli.options import chosen
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import SceneOverrides

@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
+from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import (
     Checkpoint,
     CheckpointEvery,
     Importance,
     Lpips,
-    Output,
     Resume,
     SourceIndex,
     chosen,

@@ -10,7 +10,8 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.ply import lint_ply, read_ply
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, ply_path, write_model

@@ -10,7 +10,8 @@ from typing import Annotated, ClassVar
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.options import ModeWord, Output, Scene, ShDegree, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import ModeWord, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.view_options import SplitWord, Upright, Views
 from csplat_tools.files.console import note

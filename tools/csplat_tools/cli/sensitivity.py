@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.options import Output, Scene, Seed, Threads, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, Seed, Threads, command
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_renderer, prepare_renderer

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.options import Output, Scene, Seed, SourceIndex, Threads, chosen, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, Seed, SourceIndex, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright, Views, Virtual

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.options import Lpips, Output, Threads, chosen, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Lpips, Threads, chosen, command
 from csplat_tools.cli.view_options import Views
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_pictures, need_plots, need_renderer, prepare_renderer

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Output, Resume, Seed, Threads, chosen, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright

@@ -9,7 +9,8 @@ import typer
 from csplat.errors import CsplatError, counted
 from csplat_conformance.stated import MeasureProof, Proof
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table, note
 from csplat_tools.inspect.verify import Verified, verify_file
 

@@ -12,7 +12,8 @@ import typer
 from csplat.decoder import decode_scene
 from csplat.errors import counted
 from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.options import Output, Scene, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, note
 from csplat_tools.files.streams import check_name, write_bytes

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 import typer
 
 from csplat.model import SplatModel
-from csplat_tools.cli.options import Group, Output
+from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up
 from csplat_tools.files.convert import SceneOverrides
 from csplat_tools.views import DataOptions, Split, ViewSet, find_view_set
