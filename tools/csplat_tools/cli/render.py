@@ -95,7 +95,8 @@ def render(
     colour = views.colour or BLACK
     shots = views.photographs()
     out.check(output if film else None, inputs=(source, *views.inputs))
-    check_name(output, ".webp", "render", source)
+    if not film:
+        check_name(output, ".webp", "render", source)
     need_renderer()
     model = upright.upright().applied(load_model(source).model)
     if sh_degree is not None:
