@@ -250,8 +250,9 @@ def test_knobs_reach_the_encoder(tmp_path, ply):
 )
 def test_wrong_options_are_usage_errors(tmp_path, ply, words):
     target = [] if "-" in words else [tmp_path / "out.csplat"]
-    result = invoke("encode", ply, *target, *words)
-    assert result.exit_code == 2
+    line = refused("encode", ply, *target, *words, status=2)
+    assert line.startswith("error: csplat encode: ")
+    assert line.endswith("; `csplat encode --help` says what is possible (E_USAGE)\n")
     assert not (tmp_path / "out.csplat").exists()
 
 
@@ -495,9 +496,12 @@ def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_f
 
 
 def test_a_full_standard_output_is_one_line(csplat_file):
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run([*PROGRAM, "info", csplat_file], stdout=full, stderr=subprocess.PIPE, check=False)
-    assert (1, b"error: standard output: No space left on device (ENOSPC)\n") == (done.returncode, done.stderr)
+    line = b"error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
+    for words in (("info", csplat_file), ("--version",)):
+        with Path("/dev/full").open("wb") as full:
+            done = subprocess.run([*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, check=False)
+        assert (1, line) == (done.returncode, done.stderr)
+    assert refused("decode", csplat_file, "/dev/full").startswith("error: /dev/full: No space left")
 
 
 # Wrong kinds of files -----------------------------------------------------------------------------
@@ -545,6 +549,9 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
         (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
         (("render", "scene.ply", "out.ply", "--orbit", "2"), "csplat render scene.ply out.webp"),
         (("lint", "scene.ply", "--fix", "out.csplat"), "csplat encode scene.ply out.csplat"),
+        (("info", "scene.csplat", "--page", "out.png"), "--page out.html"),
+        (("tradeoff", "scene.ply", "-o", "out.png"), "-o out.html"),
+        (("encode", "scene.ply", "out.csplat", "--report", "out.csv"), "--report out.json"),
     ],
 )
 def test_a_name_that_contradicts_the_command_is_refused_with_the_one_meant(
@@ -634,7 +641,7 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     ]
     assert f"at byte {at}, index.scene_flags: bits 0x08 are reserved" in lines[2]
     assert result.stderr.splitlines() == [
-        f"error: {csplat_file}: 4 violations of HDR-3, IDX-1, RES-1",
+        f"error: {csplat_file}: 4 violations of HDR-3, IDX-1, RES-1; copy or make it again (E_CRC, E_RESERVED)",
         "error: the stated errors were not looked at",
     ]
     assert invoke("verify", csplat_file, "--quiet").stdout == ""
@@ -763,7 +770,7 @@ def test_a_command_imports_itself_alone():
         "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "options", "settings")}
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "groups", "options", "settings")}
     assert {"csplat_tools.cli.info"} == set(done.stderr.split()) - shared
 
 

@@ -209,7 +209,7 @@ def test_failures_are_shown_with_their_clause():
 def test_wrong_words_are_one_line(words, message):
     result = invoke(*words)
 
-    assert 1 == result.exit_code
+    assert (2 if "--level" in words else 1) == result.exit_code
     assert message in result.stderr
     assert 1 == len(result.stderr.strip().splitlines())
 

@@ -393,13 +393,13 @@ def test_the_guides_recommend_patterns():
 def test_a_level_that_is_none_is_one_line():
     result = invoke("--level", "9")
 
-    assert (1, 1) == (result.exit_code, len(result.stderr.splitlines()))
+    assert (2, 1) == (result.exit_code, len(result.stderr.splitlines()))
 
 
 def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = f"touch {tmp_path / 'ran'}"
-    result = invoke("--cmd", command + " {input} {outdir}", "--report", "same.txt", "--junit", "same.txt")
+    result = invoke("--cmd", command + " {input} {outdir}", "--report", "same.json", "--junit", "same.json")
     assert 1 == result.exit_code
     assert "is wanted for two outputs" in result.stderr
     assert [] == list(tmp_path.iterdir())

@@ -99,14 +99,17 @@ def test_a_splat_of_huge_and_of_small_scales_has_a_stated_error(tmp_path):
     assert 0 == run("verify", file, "--source", ply).exit_code
 
 
-def test_a_scene_of_nothing_but_nan_becomes_an_empty_file(tmp_path):
+def test_a_scene_without_splats_becomes_an_empty_file_and_one_of_nothing_but_nan_none(tmp_path):
     columns = CONDITIONS["needles"].make()
-    columns["means"][:] = np.nan
-    ply, file = write_columns(tmp_path / "scene.ply", columns), tmp_path / "scene.csplat"
-    assert "300 splats with NaN or infinity" in run("encode", ply, file).stderr
+    ply, file = tmp_path / "scene.ply", tmp_path / "scene.csplat"
+    write_columns(ply, {name: array[:0] for name, array in columns.items()})
+    assert 0 == run("encode", ply, file).exit_code
     assert 0 == run("verify", file, "--source", ply).exit_code
     assert "without splats cannot be simplified" in refused("simplify", ply, tmp_path / "half.ply", "--keep", 0.5)
     assert 0 == run("render", file, "--orbit", 1, "--size", "32x24", "-o", tmp_path / "pictures").exit_code
+    columns["means"][:] = np.nan
+    write_columns(ply, columns)
+    assert "300 splats with NaN or infinity: none is left" in refused("encode", ply, tmp_path / "none.csplat")
     assert ["pictures", "scene.csplat", "scene.ply"] == names_in(tmp_path)
 
 

@@ -97,11 +97,13 @@ def test_rows_are_dropped_wherever_they_are(path):
     assert np.array_equal(model.shN[:, 2, 2], rows["f_rest_8"][~bad])
 
 
-def test_a_file_of_nothing_but_nan_has_no_splats(path):
+def test_a_file_of_nothing_but_nan_is_refused(path):
     rows = good_rows()
     rows["x"] = np.nan
     path.write_bytes(header(rows) + rows.tobytes())
-    assert 0 == len(read_ply(path))
+    assert "error" == found(path)["nonfinite-rows"].kind
+    with pytest.raises(InputError, match="5 splats with NaN or infinity: none is left"):
+        read_ply(path)
 
 
 def test_a_nan_opacity_is_a_defect_and_an_infinite_one_is_not(path):

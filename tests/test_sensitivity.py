@@ -375,10 +375,12 @@ def test_the_command_measures_what_encode_takes(tmp_path, camera_file):
     assert 0 == checked.exit_code, checked.stderr
 
 
-def test_the_command_makes_views_where_there_are_none(tmp_path, sample_path):
+def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes(tmp_path, sample_path, monkeypatch):
+    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda *_, **__: 1.0)
     done = run("sensitivity", sample_path, tmp_path / "s.npz", "--views", "20", "--no-matrices")
     assert 0 == done.exit_code, done.stderr
     assert "20 virtual views" in done.stderr
+    assert "this takes about 2 to 4 minutes here" in done.stderr  # 36 pictures: 16 more check
     assert read_sensitivity(tmp_path / "s.npz", read_ply(sample_path)).matrices is None
 
 

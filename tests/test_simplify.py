@@ -306,13 +306,15 @@ def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path
     assert "--force replaces it" in again.stderr
 
 
-def test_the_command_takes_cameras_and_prints_json(source, tmp_path):
+def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(source, tmp_path, monkeypatch):
+    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda _, cameras, **__: cameras[0].W / 4800)
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
     words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--set", "refit=no", "--cameras", cameras)
     result = invoke(*words, "--view-size", "48x36", "--json")
     assert result.exit_code == 0, result.output
+    assert "this takes about 1 to 3 minutes here" in result.stderr
     report = json.loads(result.stdout)
     assert report["decided_psnr"] >= 30.0
     assert {"cameras": "cameras.json", "views": 10} == report["judged_by"]

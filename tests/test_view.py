@@ -352,7 +352,7 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
     ("words", "status", "expected"),
     [
         (["absent.csplat"], 1, "No such file"),
-        (["SAMPLE", "--preset", "tiny"], 2, "preset is 'tiny'"),
+        (["SAMPLE", "--preset", "tiny"], 2, "'tiny' is not one of"),
         (["SAMPLE", "--axes", "RRR"], 2, "the axes are 'RRR'"),
         (["SAMPLE", "--cameras", "absent.json"], 1, "absent.json"),
         (["SAMPLE", "--port", "70000"], 2, "65535"),

@@ -54,7 +54,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
     with TemporaryDirectory(prefix="csplat-") as folder:
         said = getattr(file, "name", None)
         spool = Path(folder) / (name or (Path(said).name if isinstance(said, str) else "") or "data")
-        with spool.open("wb") as stream:
+        with _named(spool), spool.open("wb") as stream:
             for part in _parts(file):
                 stream.write(part)
         yield spool
@@ -72,6 +72,17 @@ def _parts(file: Any) -> Iterator[memoryview]:
         raise InputError(
             f"a {type(file).__name__} is no file, wanted a path, a binary file or bytes: {error}"
         ) from None
+
+
+@contextmanager
+def _named(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Say in errors which file could not be written: writing itself does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = os.fspath(path)
+        raise
 
 
 @contextmanager
@@ -110,7 +121,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         OSError: the folder does not exist, is full or is not writable.
     """
     if Path(path).exists() and not Path(path).is_file():
-        with Path(path).open("wb") as stream:  # not resolved: /dev/stdout leads to no name
+        with _named(path), Path(path).open("wb") as stream:  # not resolved: /dev/stdout leads to no name
             yield stream
         return
     target = Path(path).resolve()

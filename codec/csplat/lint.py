@@ -14,7 +14,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `extra-columns` | columns that splats do not have: dropped, unless asked to keep them | repair |
 | `list-columns` | list properties of splats: dropped | repair |
 | `other-elements` | elements besides the splats: dropped | repair |
-| `nonfinite-rows` | splats with NaN or infinity: dropped | repair |
+| `nonfinite-rows` | splats with NaN or infinity: dropped; where all are like that, an error | repair |
 | `zero-quats` | rotations of length 0: the identity | repair |
 | `unnormalised-quats` | rotations that are not unit: scaled, as every renderer does | note |
 | `infinite-logits` | opacities of exactly 0 or 1 | note |

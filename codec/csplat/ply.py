@@ -220,7 +220,7 @@ def _header_findings(header: bytes, size: int) -> list[Finding]:
 def _row_finding(error: Any) -> Finding:
     present, declared = error.row or 0, error.element.count
     if error.message == "early end-of-file":
-        text = f"{declared} rows of {error.element.name} are declared, {present} are there"
+        text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
         return Finding("truncated", declared - present, text, "error")
     return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}", "error")
 

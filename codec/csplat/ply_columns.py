@@ -91,7 +91,7 @@ def gather(
     kept = _part(out, slice(0, at))
     if len(columns.scales) == 2 and at:
         kept.scales[:, 2] = kept.scales[:, :2].min() - np.float32(_FLAT_SCALE_STEP)
-    return kept, _findings(counts)
+    return kept, _findings(counts, count)
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:
@@ -244,14 +244,12 @@ def _repair_quats(quats: F32, counts: _Counts) -> None:
     quats[:] = normalise_quats(quats)
 
 
-def _findings(counts: _Counts) -> list[Finding]:
+def _findings(counts: _Counts, count: int) -> list[Finding]:
+    nonfinite = f"{counted(counts.nonfinite, 'splat')} with NaN or infinity"
     findings = [
-        Finding(
-            "nonfinite-rows",
-            counts.nonfinite,
-            f"{counted(counts.nonfinite, 'splat')} with NaN or infinity: dropped",
-            "repair",
-        ),
+        Finding("nonfinite-rows", counts.nonfinite, f"{nonfinite}: dropped", "repair")
+        if counts.nonfinite < count
+        else Finding("nonfinite-rows", count, f"{nonfinite}: none is left; export the scene again", "error"),
         Finding(
             "zero-quats",
             counts.zero_quats,

@@ -101,7 +101,7 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float,
                 words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
             )
         except OSError as error:
-            raise InputError(f"{words[0]}: {error.strerror or error}") from None
+            raise InputError(f"{words[0]}: {error.strerror or error}; is it installed, and its name right?") from None
         status: Status | None = None
         try:
             returncode = process.wait(timeout_seconds)

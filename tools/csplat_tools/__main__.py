@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
 
 from csplat_tools import VERSIONS
 
@@ -18,8 +20,9 @@ def main() -> None:
     versions alone want none of them.
     """
     if sys.argv[1:] == ["--version"]:
-        print(VERSIONS)  # noqa: T201  # data, before there is a console
-        return
+        with suppress(OSError):  # a full disk is told below
+            os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())  # data, before there is a console
+            return
     try:
         from csplat_tools.cli.app import app
 

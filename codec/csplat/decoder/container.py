@@ -10,14 +10,11 @@ import mmap
 import os
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
-
-if TYPE_CHECKING:
-    from csplat.inputs import File
+from csplat.inputs import File, mapped
 
 __all__ = [
     "Cursor",
@@ -86,7 +83,7 @@ def view_of(data: File) -> memoryview:
         OSError: it cannot be read.
     """
     if isinstance(data, (str, os.PathLike)):
-        return memoryview(_mapped(data))
+        return memoryview(mapped(data))
     try:
         # An mmap is a buffer and a file; of others that are read, what comes has to be bytes.
         read = None if isinstance(data, mmap.mmap) else getattr(data, "read", None)
@@ -95,15 +92,6 @@ def view_of(data: File) -> memoryview:
         raise InputError(
             f"data is a {type(data).__name__}, wanted a path, a binary file or contiguous bytes: {error}"
         ) from None
-
-
-def _mapped(path: str | os.PathLike[str]) -> bytes | mmap.mmap:
-    """A file in memory, without reading it where that is possible; it is closed when nobody looks at it any more."""
-    with Path(path).open("rb") as stream:
-        try:
-            return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except (ValueError, OSError):  # empty, or a pipe
-            return stream.read()
 
 
 def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:

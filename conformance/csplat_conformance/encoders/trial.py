@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from csplat.files import atomic_writer
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.process import Ended, run_program
 
@@ -69,7 +70,8 @@ def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner
     places = {
         name: folder / _NAMES[name] for name in (*PLACES, *OPTIONAL_PLACES) if name in PLACES or _has(command, name)
     }
-    places["ply"].write_bytes(ply)
+    with atomic_writer(places["ply"]) as stream:
+        stream.write(ply)
     named = {name: str(path) for name, path in places.items()}
     traces: list[str] = []
     started = time.monotonic()

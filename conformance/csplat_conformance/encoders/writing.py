@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from csplat.files import atomic_writer
 from csplat_conformance.encoders.inputs import PSNR_MIN, Input
 from csplat_conformance.encoders.run import chosen_inputs
 
@@ -35,10 +36,12 @@ def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:
         file = folder / f"{one.name}.ply"
         file.parent.mkdir(parents=True, exist_ok=True)
         data = one.make()
-        file.write_bytes(data)
+        with atomic_writer(file) as stream:
+            stream.write(data)
         entries.append(_entry(one, data))
     result = {"inputs": entries}
-    (folder / LIST).write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+    with atomic_writer(folder / LIST) as stream:
+        stream.write((json.dumps(result, indent=2) + "\n").encode())
     return result
 
 

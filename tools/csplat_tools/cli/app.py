@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
+from csplat_tools.cli.console import WrongCommandLine, guarded, refuse_command_line
 from csplat_tools.files.console import say
 
 __all__ = ["app"]
@@ -46,6 +48,17 @@ class _Commands(TyperGroup):
             if name not in self.commands:
                 self.commands[name] = _imported(name)
         return self.commands.get(cmd_name)
+
+    def main(self, *args: Any, **how: Any) -> Any:
+        """Run a command line, and end; typer would draw a box about what is wrong with it."""
+        if not how.get("standalone_mode", True):
+            return super().main(*args, **how)
+        try:
+            sys.exit(guarded(super().main)(*args, **{**how, "standalone_mode": False}))
+        except WrongCommandLine as error:
+            refuse_command_line(error)
+        except typer.Exit as error:  # help could not be printed
+            sys.exit(error.exit_code)
 
 
 def _imported(name: str) -> Any:

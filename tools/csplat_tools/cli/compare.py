@@ -10,22 +10,21 @@ import typer
 
 from csplat.errors import counted
 from csplat.files import read_array
-from csplat_tools.cli.options import Lpips, Mode, Output, command
-from csplat_tools.cli.parsing import parse_mode
-from csplat_tools.cli.view_options import SplitWord, Views, check_split
-from csplat_tools.files.console import format_range, format_table
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Lpips, ModeWord, command
+from csplat_tools.cli.view_options import SplitWord, Views
+from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.inspect.attributes import AttributeErrors
+from csplat_tools.views import counted_views
 
 if TYPE_CHECKING:
     from csplat_tools.inspect.compare import Comparison
 
 __all__ = ["compare"]
 
-_SECONDS_WORTH_SAYING = 10.0
-_SPREAD = (0.6, 1.7)  # how much less and more it may take
 _PAIRING = {
     "index": "pairs from the source index",
     "order": "pairs by their order",
@@ -57,7 +56,7 @@ def compare(
     ] = None,
     amplify: Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Of the differences shown.")] = 10.0,
     lpips: Lpips = None,
-    mode: Mode = "standard",
+    mode: ModeWord = "standard",
 ) -> None:
     """Compare a scene with its source: sizes, errors of the splats, and pictures.
 
@@ -76,25 +75,23 @@ def compare(
     """
     import csplat_tools
 
-    out.check(inputs=(a, b, views.cameras, source_index))
-    chosen, part = parse_mode(mode), check_split(split)
+    out.check(inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
     need_renderer()
     rows = None if source_index is None else read_array(source_index)
     source = load_model(a)
-    around = views.find(source.model, out, count=0, split=part)
-    if chosen == "exact" and around.judges and not out.quiet:
-        from csplat_tools.views.timing import picture_seconds
+    around = views.find(source.model, out, count=0, split=split)
+    if mode == "exact":
+        from csplat_tools.views.timing import pictures_seconds
 
-        seconds = 2 * len(around.judges) * picture_seconds(source.model, around.judges, mode=chosen)
-        if seconds > _SECONDS_WORTH_SAYING:
-            about = format_range(_SPREAD[0] * seconds, _SPREAD[1] * seconds)
-            out.remark(f"the exact mode takes about {about} here; the standard one takes seconds")
+        out.foretell(
+            lambda: 2 * pictures_seconds(source.model, around.judges, mode=mode), "--mode standard takes seconds"
+        )
     with out.bar() as progress:
         compared = csplat_tools.compare(
             source, b, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
-            background=views.colour, mode=chosen, force=out.force,
+            background=views.colour, mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
     out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
@@ -146,7 +143,8 @@ def _quality(compared: Comparison) -> str:
         "cover": None if quality.cover is None else f"{100.0 * quality.cover:.1f} %",
     }
     rows = [(name, text) for name, text in values.items() if text is not None]
-    head, *others = format_table(("pictures", _cameras(compared)), rows).splitlines()
+    views = counted_views(len(quality.each), compared.cameras)
+    head, *others = format_table(("pictures", views), rows).splitlines()
     lines = [head, *(f"{line}  {_WORDS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)
     if compared.a.model.antialiased != compared.b.model.antialiased:
@@ -162,13 +160,6 @@ def _photographs(scores: dict[str, Any]) -> str:
             rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
     header = (f"against {scores['a']['views']} {scores['split']} photographs", "A", "B", "B - A")
     return format_table(header, rows)
-
-
-def _cameras(compared: Comparison) -> str:
-    views = len(compared.quality.each)
-    if compared.cameras == "virtual":
-        return counted(views, "virtual view")
-    return f"{counted(views, 'view')} of {compared.cameras}"
 
 
 def _ignored(compared: Comparison) -> list[str]:

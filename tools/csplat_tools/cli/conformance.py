@@ -21,7 +21,8 @@ from csplat_conformance.near import EXACT
 from csplat_conformance.report import Report, to_json, to_junit, to_table
 from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Group, Output, command
+from csplat_tools.cli.groups import Group, Output
+from csplat_tools.cli.options import chosen, command
 from csplat_tools.files.console import Progress, note, say
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
@@ -144,7 +145,7 @@ def decoder(
     run.check(out)
     with out.bar() as bar:
         # A renderer alone is tested at L4 alone.
-        levels = parse_levels(level or ("3" if render_program is None else "4"))
+        levels = chosen(parse_levels, text=level or ("3" if render_program is None else "4"))
         timeout = run.timeout or TIMEOUT_SECONDS
         choice = Choice(run.pattern, _joined(clause), levels, exact, timeout, run.jobs, by)
         if program is None and render_program is None:
@@ -204,7 +205,7 @@ def encoder(
         made = write_inputs(_checked_folder(folder, force=out.force), run.pattern)
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
-    levels = tuple(f"L{number}" for number in parse_levels(level))
+    levels = tuple(f"L{number}" for number in chosen(parse_levels, text=level))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
     pictures, reason = _picture_judge(levels, quiet=out.quiet)
     choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)

@@ -5,20 +5,22 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import typer
 
 from csplat.errors import CsplatError, InputError
 from csplat_tools.files.console import note
 
-__all__ = ["FAILED", "INTERRUPTED", "guarded"]
+__all__ = ["FAILED", "INTERRUPTED", "WrongCommandLine", "guarded", "refuse_command_line"]
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+_WRONG_USE = 2
 
 _AGAIN = "copy or download it again"
 _NEWER = "a newer csplat may know it"
@@ -45,19 +47,24 @@ _OS_ADVICE = {
     errno.EDQUOT: "no half of a file was left; make room, or name another place",
 }
 
+#: What typer raises of a command line. It names one kind alone.
+WrongCommandLine: type[Exception] = typer.BadParameter.__bases__[0]
+_SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in its words
+
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
-def guarded(command: Callable[P, None]) -> Callable[P, None]:
+def guarded(command: Callable[P, T]) -> Callable[P, T]:
     """Turn what goes wrong on purpose into one line on standard error and status 1.
 
     Defects of csplat itself still end in a traceback: that is what a report of them needs.
     """
 
     @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
-            command(*args, **kwargs)
+            result = command(*args, **kwargs)
             sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
         except CsplatError as error:
             _fail(_csplat_error(error))
@@ -73,11 +80,22 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except KeyboardInterrupt:
             note("interrupted")
             raise typer.Exit(INTERRUPTED) from None
+        return result
 
     return run
 
 
-def _fail(message: str) -> None:
+def refuse_command_line(error: Any) -> NoReturn:
+    """Say what is wrong with a command line in one line, as other errors are told, and end with status 2."""
+    message = " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
+    if message:  # of a command line without a word, help is printed already
+        of = error.ctx.command_path if error.ctx is not None else "csplat"
+        helps = f"`{of} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
+        note(f"error: {of}: {message}; {helps} says what is possible (E_USAGE)")
+    sys.exit(_WRONG_USE)
+
+
+def _fail(message: str) -> NoReturn:
     note("error: " + " ".join(message.split()))
     raise typer.Exit(FAILED) from None
 
@@ -97,7 +115,7 @@ def _os_error(error: OSError) -> str:
     number = error.errno or 0
     code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
     if error.filename is None:
-        return ("standard output: " if number in _FULL else "") + reason + code
+        return (f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason) + code
     return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
 
 

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.options import Output, ShDegree, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import ShDegree, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import decode_file
 from csplat_tools.files.streams import check_name

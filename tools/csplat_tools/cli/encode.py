@@ -16,13 +16,14 @@ from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_render.standing import seeming_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
-from csplat_tools.cli.options import Group, Importance, Output, SourceIndex, command
+from csplat_tools.cli.groups import Group, Output
+from csplat_tools.cli.options import Importance, SourceIndex, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
-from csplat_tools.files.console import Progress, format_bytes, format_range, format_table, note
+from csplat_tools.files.console import Progress, format_bytes, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import check_name
 from csplat_tools.inspect.glance import SIZE, glance
 
@@ -33,7 +34,6 @@ __all__ = ["encode"]
 
 _TARGET = "Targets (one of the first four, which want the render extra)"
 _RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
-_SECONDS_WORTH_SAYING = 10.0
 _SPLATS_LOOKED_AT = 1_000_000  # more take longer to render than anybody wants to wait for a remark
 
 
@@ -177,10 +177,10 @@ def encode(
         goal.read(1.0)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    out.check(output, inputs=(source, importance, views.cameras), named={"--source-index": source_index})
+    out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".csplat", "encode", source)
     if goal.is_rendered:
-        prepare_renderer(quiet=out.quiet, simplify=True)
+        need_renderer()
     reaching: Encoder = partial(_reach, goal, views, virtual, importance, out)
     with out.bar() as progress:
         encoded = encode_file(
@@ -221,25 +221,22 @@ def _reach(
     assert target is not None
     weights = None if importance is None else read_weights(importance, model)
     if target.is_rendered:
+        prepare_renderer(quiet=out.quiet, simplify=True)
         from csplat_tools.optimise.optimiser import expected_seconds
 
         around = views.find(model, out, **virtual.given())
-        if not out.quiet and len(model) and around.judges:
-            seconds = expected_seconds(model, encoding, target, around, keep_all=goal.keep_all)
-            if seconds[1] > _SECONDS_WORTH_SAYING:
-                out.remark(_forecast(seconds, may_keep_all=not goal.keep_all and goal.keep is None))
+        if len(model) and around.judges:
+            may_keep_all = not goal.keep_all and goal.keep is None
+            out.foretell(
+                partial(expected_seconds, model, encoding, target, around, keep_all=goal.keep_all),
+                "--keep-all takes a sixth of that, a preset seconds" if may_keep_all else "a preset takes seconds",
+            )
     made = csplat_tools.encode_to(
         model, psnr=target.psnr, size=target.size_bytes, loss=target.max_loss, keep=target.keep,
         errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
         progress=progress,
     )  # fmt: skip
     return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
-
-
-def _forecast(seconds: tuple[float, float], *, may_keep_all: bool) -> str:
-    """One line: how long it takes, and how to have it sooner."""
-    sooner = "--keep-all takes a sixth of that, a preset seconds" if may_keep_all else "a preset takes seconds"
-    return f"this takes about {format_range(*seconds)} here; {sooner}"
 
 
 def _stated(encoded: Encoded) -> list[str]:

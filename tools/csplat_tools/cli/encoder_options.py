@@ -8,19 +8,20 @@ from typing import Annotated
 import typer
 
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
-from csplat_tools.cli.options import Group, chosen
+from csplat_tools.cli.groups import Group
+from csplat_tools.cli.options import chosen
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import SceneOverrides
 
-__all__ = ["ENCODER", "Encoding", "Facts", "Preset", "check_preset"]
+__all__ = ["ENCODER", "Encoding", "Facts", "Preset"]
 
 _SCENE = "What the PLY may not say"
 
 #: What `--set` takes of the encoder.
 ENCODER = "csplat.encoder.options:EncodeOptions"
 
-Preset = Annotated[str, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
+Preset = Annotated[PresetName, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
 
 
 @dataclass(frozen=True)
@@ -92,12 +93,3 @@ class Encoding(Group):
         """
         own = {one.name: getattr(self, one.name) for one in fields(self)}
         return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=facts.keep_extra)
-
-
-def check_preset(preset: str) -> PresetName:
-    """Refuse what is no preset.
-
-    Raises:
-        typer.BadParameter: it is none.
-    """
-    return chosen(EncodeOptions, preset=preset).preset

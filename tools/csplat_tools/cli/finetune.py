@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
+from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import (
     Checkpoint,
     CheckpointEvery,
     Importance,
     Lpips,
-    Output,
     Resume,
     SourceIndex,
     chosen,
@@ -116,10 +116,7 @@ def finetune(
         encoder = replace(encoder, shape_codebook_size=tuning.SHAPE_ENTRIES)
     # A checkpoint may take the place of the one that it goes on from.
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
-    inputs = (source, importance, views.cameras, None if lpips == "auto" else lpips)
-    for path in (resume, importance):
-        if path is not None:
-            Path(path).stat()  # an OSError that names it, before the minutes that views and splats may take
+    inputs = (source, importance, *views.inputs, None if lpips == "auto" else lpips)
     named = {"--source-index": source_index, "--checkpoint": checkpoint}
     if again:
         out.check(inputs=inputs, named={"--checkpoint": checkpoint}, force=True)

@@ -10,7 +10,8 @@ import typer
 
 from csplat.decoder import StatedErrors
 from csplat.errors import counted
-from csplat_tools.cli.options import Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_pictures, prepare_renderer
 from csplat_tools.files.streams import mapped_csplat

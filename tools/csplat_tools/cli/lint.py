@@ -6,10 +6,12 @@ from typing import Annotated
 
 import typer
 
+from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.ply import lint_ply, read_ply
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, ply_path, write_model
@@ -42,7 +44,7 @@ def lint(
     """
     out.check(fix, inputs=(source,))
     if fix is not None:
-        check_name(fix, ".ply", "lint --fix", source)
+        check_name(fix, ".ply", "--fix", source)
     with ply_path(source) as path:
         findings = lint_ply(path)
         if keep_extra:
@@ -56,6 +58,8 @@ def lint(
         out.remark(table)
     result = {"clean": clean, "fixed": fix is not None and not errors, "findings": findings_as_json(findings)}
     out.publish(result, "" if fix == STANDARD_STREAM else table)
+    if fix is not None and errors:
+        raise InputError(f"{source} cannot be repaired, and {fix} was not written; export the scene again")
     if errors or (fix is None and not clean):
         raise typer.Exit(FAILED)
 

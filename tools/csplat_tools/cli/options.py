@@ -11,29 +11,27 @@ import functools
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from copy import copy
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+from dataclasses import fields
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from typer.models import OptionInfo
 
 from csplat.errors import InputError
-from csplat.lint import Finding
+from csplat_render import Mode
 from csplat_tools.cli.console import guarded
+from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.settings import Settings, describe_settings, read_settings
-from csplat_tools.files.console import Progress, note, progress_bar, say, say_json
-from csplat_tools.files.streams import STANDARD_STREAM, check_outputs, write_json
+from csplat_tools.files.console import progress_bar, say
 
 __all__ = [
     "Checkpoint",
     "CheckpointEvery",
-    "Group",
     "Importance",
     "Lpips",
-    "Mode",
-    "Output",
+    "ModeWord",
     "Resume",
     "Scene",
     "Seed",
@@ -49,7 +47,7 @@ Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choic
 Threads = Annotated[
     int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")
 ]
-Mode = Annotated[str, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
+ModeWord = Annotated[Mode, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
 Lpips = Annotated[
     str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
 ]
@@ -79,93 +77,6 @@ _HELP_ALL = "help_all"
 _ALIAS = "output_option"  # `-o`, beside the argument
 _EXCLUDED_MAX = 6  # options that one excludes and that say so themselves
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Group:
-    """Options that belong together: the fields, with their defaults.
-
-    Class attributes:
-        one_of: of each of these options one at most may be given.
-        needs: options that say nothing unless one of others is given.
-    """
-
-    one_of: ClassVar[Sequence[tuple[str, ...]]] = ()
-    needs: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-
-    def parse(self) -> None:
-        """Refuse words that say nothing, before any work is done.
-
-        Raises:
-            typer.BadParameter: there are such.
-        """
-
-
-@dataclass(frozen=True)
-class Output(Group):
-    """Where results go: the same for every command."""
-
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False
-    report: Annotated[str | None, typer.Option(metavar="FILE.json", help="Write the result as JSON.")] = None
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")] = False
-
-    def check(
-        self,
-        *outputs: str | None,
-        inputs: Sequence[str | None] = (),
-        named: Mapping[str, str | None] | None = None,
-        force: bool = False,
-    ) -> None:
-        """Refuse files before any work is done for them.
-
-        Args:
-            outputs: what the command writes, or `-`; `None` for what is not wanted.
-            inputs: what it reads: none of them may be written.
-            named: by option, what it writes beside them, which cannot be `-`.
-            force: they may be replaced, whatever the user says.
-
-        Raises:
-            InputError: one exists, or two are the same.
-            OSError: a folder does not exist.
-            typer.BadParameter: two of them want standard output, or one that cannot go there.
-        """
-        files = {"--report": self.report, **(named or {})}
-        for name, path in files.items():
-            if path == STANDARD_STREAM:
-                raise typer.BadParameter(f"{name} wants the name of a file")
-        if self.as_json and STANDARD_STREAM in outputs:
-            raise typer.BadParameter("--json and - both want standard output")
-        check_outputs((*outputs, *files.values()), force=self.force or force, inputs=inputs)
-
-    def publish(self, result: Any, text: str = "") -> None:
-        """Give the result: as JSON into `--report` and with `--json`, else as text.
-
-        Args:
-            result: JSON-compatible, without NaN and infinities.
-            text: what people read on standard output; nothing where a file is the result.
-        """
-        if self.report is not None:
-            write_json(self.report, result)
-        if self.as_json:
-            say_json(result)
-        elif text:
-            say(text)
-
-    def remark(self, *lines: str) -> None:
-        """Tell people on standard error, unless they asked for silence."""
-        for line in () if self.quiet else lines:
-            note(line)
-
-    def findings(self, findings: Sequence[Finding]) -> None:
-        """Tell what lint noticed in a PLY that is not usual; what was repaired is told in any case."""
-        for one in findings:
-            if one.kind == "repair" or not (self.quiet or one.usual):
-                note(str(one))
-
-    def bar(self) -> AbstractContextManager[Progress | None]:
-        """The progress bar, see `progress_bar`."""
-        return progress_bar(quiet=self.quiet)
 
 
 def command(

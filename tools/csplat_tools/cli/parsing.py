@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -12,10 +11,7 @@ from csplat.errors import InputError
 from csplat.model import check_axes
 from csplat.upright import Direction, unit_up
 
-if TYPE_CHECKING:
-    from csplat_render import Mode
-
-__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_mode", "parse_size", "parse_up", "up_word"]
+__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_size", "parse_up", "up_word"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -83,20 +79,6 @@ def parse_axes(text: str) -> str:
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
     return text
-
-
-def parse_mode(text: str) -> Mode:
-    """A mode of the renderer.
-
-    Raises:
-        typer.BadParameter: there is no such mode.
-    """
-    from csplat_render.conventions import MODES  # not wanted by commands that render nothing
-
-    for mode in MODES:
-        if mode == text:
-            return mode
-    raise typer.BadParameter(f"the mode is {text!r}, wanted one of {', '.join(MODES)}")
 
 
 def parse_decibels(text: str) -> float:

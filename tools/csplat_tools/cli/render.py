@@ -11,9 +11,10 @@ import typer
 
 from csplat.errors import counted
 from csplat_render.standing import seeming_up
-from csplat_tools.cli.options import Mode, Output, Scene, ShDegree, command
-from csplat_tools.cli.parsing import parse_mode, parse_size
-from csplat_tools.cli.view_options import SplitWord, Upright, Views, check_split
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import ModeWord, Scene, ShDegree, command
+from csplat_tools.cli.parsing import parse_size
+from csplat_tools.cli.view_options import SplitWord, Upright, Views
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
@@ -62,7 +63,7 @@ def render(
     fps: Annotated[
         float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Pictures per second of a film.")
     ] = DEFAULT_FPS,
-    mode: Mode = "standard",
+    mode: ModeWord = "standard",
     sh_degree: ShDegree = None,
     depth: Annotated[bool, typer.Option("--depth", help="Write NAME.depth.npy too, float32, scene units.")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Write NAME.alpha.png too.")] = False,
@@ -92,21 +93,22 @@ def render(
     if film and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
     pixels = None if views.size is None else parse_size(views.size)
-    colour, chosen = views.colour, parse_mode(mode)
+    colour = views.colour
     shots = views.photographs()
-    out.check(output if film else None, inputs=(source, views.cameras))
-    check_name(output, ".webp", "render", source)
+    out.check(output if film else None, inputs=(source, *views.inputs))
+    if not film:
+        check_name(output, ".webp", "render", source)
     need_renderer()
     model = upright.upright().applied(load_model(source).model)
     if sh_degree is not None:
         model = without_bands(model, sh_degree)
-    cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=check_split(split))
+    cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split)
     if orbit is not None:
         upright.seeming(seeming_up(model), out)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
     with out.bar() as progress:
         rendered = write(
-            model, cameras, output, background=colour, mode=chosen, force=out.force,
+            model, cameras, output, background=colour, mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
         )  # fmt: skip
     if rendered.ignored_count:

@@ -8,15 +8,18 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.options import Output, Scene, Seed, Threads, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, Seed, Threads, command
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name
 
 __all__ = ["sensitivity"]
 
+#: What it costs, in pictures of all views.
+_PASSES = 4.4
 _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
 
 
@@ -48,15 +51,21 @@ def sensitivity(
       csplat sensitivity scene.ply scene.npz --data photographs
       csplat encode scene.ply scene.csplat --importance scene.npz
     """
-    out.check(inputs=(source, views.cameras), named={"OUT.npz": output})
+    out.check(inputs=(source, *views.inputs), named={"OUT.npz": output})
     check_name(output, ".npz", "sensitivity", source)
-    looked_for = views.data is None and views.cameras is None  # virtual ones
-    prepare_renderer(quiet=out.quiet, simplify=looked_for)
+    need_renderer()
     from csplat_tools.optimise.sensitivity import measure_scene
+    from csplat_tools.views.timing import pictures_seconds
 
     model = load_model(source).model
+    looked_for = views.data is None and views.cameras is None  # virtual ones
+    prepare_renderer(quiet=out.quiet, simplify=looked_for)
     count = {"count": 0} if views.cameras is not None else {}
     around = views.find(model, out, seed=seed, aside=None if views.data is None else 0, **virtual.given() | count)
+    out.foretell(
+        lambda: _PASSES * pictures_seconds(model, around.teaches or around.judges),
+        "fewer or smaller views take less: --help-all",
+    )
     with out.bar() as progress:
         measured = measure_scene(model, around, matrices=matrices, threads=threads, progress=progress)
     measured.write(output)

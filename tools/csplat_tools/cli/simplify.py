@@ -9,18 +9,21 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.options import Output, Scene, Seed, SourceIndex, Threads, chosen, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, Seed, SourceIndex, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright, Views, Virtual
 from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name, write_array, write_model
 
 __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
+#: What it costs, in pictures of all views that teach: of a share, and of a target, which looks for one.
+_PASSES = (15.0, 55.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 
 
@@ -67,20 +70,28 @@ def simplify(
       csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
-    prepare_renderer(quiet=out.quiet, simplify=True)
+    need_renderer()
     import csplat_tools
     from csplat_tools.optimise.simplify import SimplifyOptions
     from csplat_tools.optimise.target import Target
+    from csplat_tools.views import reduced
+    from csplat_tools.views.timing import pictures_seconds
 
     loss = None if max_loss is None else parse_decibels(max_loss)
     chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
-    out.check(output, inputs=(source, views.cameras), named={"--source-index": source_index})
+    out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
     model = upright.upright().applied(load_model(source).model)
+    prepare_renderer(quiet=out.quiet, simplify=True)
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])
+    passes = _PASSES[keep is None]
+    out.foretell(
+        lambda: passes * pictures_seconds(model, reduced(around.teaches, given["size"])),
+        "fewer or smaller views take less: --help-all",
+    )
     with out.bar() as progress:
         result = csplat_tools.simplify(
             model, keep=keep, psnr=target_psnr, loss=loss, views=around, options=options, progress=progress

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.options import Lpips, Output, Threads, chosen, command
-from csplat_tools.cli.parsing import parse_mode
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Lpips, Threads, chosen, command
 from csplat_tools.cli.view_options import Views
 from csplat_tools.files.console import note
-from csplat_tools.files.extras import need_pictures, need_plots, prepare_renderer
+from csplat_tools.files.extras import need_pictures, need_plots, need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
 
@@ -70,18 +69,14 @@ def tradeoff(
     """
     wanted = chosen(
         parse_what, text=what, preset=preset, iterations=iterations, threads=threads,
-        modes=tuple(parse_mode(mode.strip()) for mode in modes.split(",")),
+        modes=tuple(mode.strip() for mode in modes.split(",")),
     )  # fmt: skip
     if plots == STANDARD_STREAM:
         raise typer.BadParameter("--plots wants the name of a folder")
-    inputs = (source, views.cameras, None if lpips == "auto" else lpips)
-    for path in inputs:
-        if path not in (None, STANDARD_STREAM):
-            Path(str(path)).stat()  # an OSError that names it, before the seconds that the renderer may take
-    out.check(inputs=inputs, named={"--output": page})
+    out.check(inputs=(source, *views.inputs, None if lpips == "auto" else lpips), named={"-o": page})
     if page is not None or plots is not None:
         need_plots()
-    prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
+    need_renderer()
     need_pictures()
     import csplat_tools
     from csplat_tools.tradeoffs.page import check_plots, write_page, write_plots
@@ -92,6 +87,7 @@ def tradeoff(
     setting = read_setting(
         source, cameras=views.cameras, data=views.photographs(), background=views.colour, lpips=lpips
     )
+    prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
     out.findings(setting.findings)
     out.remark(*setting.views.notes)
     with out.bar() as progress:

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Output, Resume, Seed, Threads, chosen, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
@@ -97,7 +98,7 @@ def train(
     )  # fmt: skip
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     out.check(
-        output, inputs=(resume, lpips_weights),
+        output, inputs=(source, resume, lpips_weights),
         named={"--plot": plot, "--checkpoint": None if again else checkpoint},
     )  # fmt: skip
     check_name(output, ".ply", "train", source)

@@ -9,7 +9,8 @@ import typer
 from csplat.errors import CsplatError, counted
 from csplat_conformance.stated import MeasureProof, Proof
 from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.options import Output, command
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table, note
 from csplat_tools.inspect.verify import Verified, verify_file
 
@@ -60,8 +61,8 @@ def verify(
 def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
     violations = verified.validation.violations
     if violations:
-        clauses = sorted({one.clause for one in violations})
-        note(f"error: {path}: {counted(len(violations), 'violation')} of {', '.join(clauses)}")
+        clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
+        note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
     if unproved:
         note("error: the stated errors were not looked at")
     for failure in verified.proof.failures if verified.proof is not None else ():

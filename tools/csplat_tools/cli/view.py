@@ -11,8 +11,9 @@ import typer
 
 from csplat.decoder import decode_scene
 from csplat.errors import counted
-from csplat_tools.cli.encoder_options import Preset, check_preset
-from csplat_tools.cli.options import Output, Scene, command
+from csplat_tools.cli.encoder_options import Preset
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import Scene, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, note
 from csplat_tools.files.streams import check_name, write_bytes
@@ -51,12 +52,11 @@ def view(
       csplat view scene.ply --preset small --up z
       csplat view scene.csplat --no-browser --port 8000
     """
-    name = check_preset(preset)
     out.check(inputs=(source, cameras))
     wishes = view_wishes(cameras, upright.upright())
     with ExitStack() as stack:
         with out.bar() as progress:
-            scene = stack.enter_context(open_scene(source, preset=name, progress=progress))
+            scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
         wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
@@ -93,11 +93,10 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    name = check_preset(preset)
     wishes = view_wishes(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
-    with out.bar() as progress, open_scene(source, preset=name, progress=progress) as scene:
+    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
         wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import typer
 
 from csplat.model import SplatModel
 from csplat.upright import Direction
-from csplat_tools.cli.options import Group, Output
+from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up, up_word
 from csplat_tools.files.convert import SceneOverrides
+from csplat_tools.views import DataOptions, Split, ViewSet, find_view_set
 
-if TYPE_CHECKING:
-    from csplat_tools.views import DataOptions, Split, ViewSet
-
-__all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual", "check_split"]
+__all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual"]
 
 _DATA = "Photographs of --data (by default as the scene was trained)"
 _VIEWS = "Views (virtual ones by default)"
 
-SplitWord = Annotated[str, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
+SplitWord = Annotated[Split, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
 Near = Annotated[
     float | None, typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Their near plane.")
 ]
@@ -113,14 +111,17 @@ class Views(Group):
         _ = self.colour, None if self.size is None else parse_size(self.size)
 
     @property
+    def inputs(self) -> tuple[str | None, str | None]:
+        """What is read."""
+        return self.cameras, self.data
+
+    @property
     def colour(self) -> tuple[float, float, float] | None:
         """What is behind the scene; `None`: as usual."""
         return None if self.background is None else parse_colour(self.background)
 
     def photographs(self, near: float | None = None) -> DataOptions | None:
         """The data set; `None` without one."""
-        from csplat_tools.views import DataOptions  # not wanted by commands that render nothing
-
         size = None if self.size is None else parse_size(self.size)
         return None if self.data is None else DataOptions(self.data, size, self.images, self.test_every, near)
 
@@ -133,8 +134,6 @@ class Views(Group):
             near: near plane of the photographs; `None`: one that suits.
             how: what else `find_view_set` is told; handed on, so that its defaults stand in one place.
         """
-        from csplat_tools.views import find_view_set
-
         found = find_view_set(model, cameras=self.cameras, data=self.photographs(near), background=self.colour, **how)
         output.remark(*found.notes)
         return found
@@ -165,17 +164,3 @@ class Virtual(Group):
         """What is asked for, as `find_view_set` takes it."""
         size = None if self.view_size is None else parse_size(self.view_size)
         return {name: value for name, value in (("count", self.views), ("size", size)) if value is not None}
-
-
-def check_split(word: str) -> Split:
-    """Refuse what is no part of a data set.
-
-    Raises:
-        typer.BadParameter: it is none.
-    """
-    from csplat_tools.views import SPLITS
-
-    for split in SPLITS:
-        if split == word:
-            return split
-    raise typer.BadParameter(f"the split is {word!r}, wanted one of {', '.join(SPLITS)}")

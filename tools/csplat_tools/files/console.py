@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 __all__ = [
+    "WORTH_SAYING",
     "Display",
     "Progress",
     "finite",
+    "format_about",
     "format_bytes",
     "format_range",
     "format_seconds",
@@ -40,10 +42,13 @@ _LOOK = 0.2  # seconds from one look at the clock to the next
 _ENOUGH = (0.03, 1.0)  # share and seconds of a stage from which the rest of it is judged
 _TOLD = 2  # reports of steps from which the others are judged,
 _SPREAD = (0.8, 2.0)  # how much less and more they may take: a scene that grows takes longer,
-_WORTH_SAYING = 10.0  # and seconds of them that are foretold
+_ABOUT = (0.6, 1.7)  # the same of work that is foretold by how long pictures take
 _STAGES = 2  # that are shown at a time: those that were told last
 _WORKING = "working"  # where no stage is known
 _MINUTES_FROM = 100.0  # seconds
+
+#: Seconds of work that are foretold.
+WORTH_SAYING = 10.0
 
 #: What is told how far long work has come: the name of the stage, and how much of it is done, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -112,7 +117,7 @@ def step_progress(
         if len(told) == _TOLD:  # the first steps, which load and compile, say nothing of the others
             (begun, first), (seconds, last) = told[0], told[-1]
             left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
-            if left > _WORTH_SAYING:
+            if left > WORTH_SAYING:
                 note(f"{name} takes about {format_range(_SPREAD[0] * left, _SPREAD[1] * left)} from here")
         if display is not None:
             display.tell(name, now.iteration / now.iterations, tell(now))
@@ -227,6 +232,11 @@ def format_bytes(size_bytes: int) -> str:
 def format_seconds(seconds: float) -> str:
     """Format a duration for people, who do not count: `12 s`, `3 minutes`."""
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
+
+
+def format_about(seconds: float) -> str:
+    """Format how long work may take that takes about so long: `20 to 50 s`."""
+    return format_range(_ABOUT[0] * seconds, _ABOUT[1] * seconds)
 
 
 def format_range(least: float, most: float) -> str:

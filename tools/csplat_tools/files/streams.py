@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import io
 import json
-import mmap
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from mmap import mmap
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,7 +23,7 @@ from csplat._spec import MAGIC
 from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
 from csplat.foreign import HEAD_SIZE, foreign_name, refuse_known
-from csplat.inputs import File
+from csplat.inputs import File, mapped
 from csplat.model import SplatModel
 from csplat.ply import write_ply
 
@@ -54,6 +54,9 @@ _MAKERS = {
     ("*", ".html"): "export-html",
     ("*", ".npz"): "sensitivity",
 }
+
+#: Endings of what csplat does not write, or beside a scene alone.
+_OTHERS = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 _free: set[Path] = set()  # names that nobody had when they were checked: whoever takes one meanwhile keeps it
 
@@ -96,11 +99,11 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     Args:
         paths: the files to be written, or `-`; None for those that are not wanted.
         force: existing files may be replaced.
-        inputs: files that the command reads; None for those that are not given.
+        inputs: files that the command reads, or folders; None for those that are not given.
 
     Raises:
         InputError: as `check_output`; or two paths name the same file.
-        OSError: a folder does not exist.
+        OSError: an input does not exist, or the folder of an output.
     """
     outputs = [path for path in paths if path is not None]
     places = [path if path == STANDARD_STREAM else Path(path).resolve() for path in outputs]
@@ -108,32 +111,40 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
         if place in places[:number]:
             raise InputError(f"{outputs[number]} is wanted for two outputs: name a file for each")
     read = tuple(path for path in inputs if path is not None)
+    for path in read:
+        if path != STANDARD_STREAM:
+            Path(path).stat()  # an OSError that names it, before anything that takes time
     for path in outputs:
         check_output(path, force=force, inputs=read)
 
 
-def check_name(path: str, wanted: str, command: str, source: str) -> None:
-    """Refuse an output whose name says that it is something else than the command writes.
+def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
+    """Refuse an output whose name says that it is something else than what is written.
 
     Args:
         path: the output, or `-`.
         wanted: the ending that it might have.
-        command: the name of the command.
-        source: its input.
+        writer: the name of the command that has it for an argument, or the option that it is the value of.
+        source: the input of that command; what it can be made into is told.
 
     Raises:
-        InputError: the name ends otherwise, as files of another kind do. The message has the command that was meant.
+        InputError: the name ends otherwise, as files of another kind do. The message has what was meant.
     """
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
         return
     known = foreign_name(target)
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix))
-    if known is None and maker is None and suffix not in {kind for pair in _MAKERS for kind in pair}:
+    if known is None and maker is None and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
         return
-    meant = f"csplat {maker} {source} {path}" if maker else f"csplat {command} {source} {target.with_suffix(wanted)}"
     what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
-    raise InputError(f"{path}: {what} `csplat {command}` writes a {wanted} file: did you mean `{meant}`?")
+    line = writer if writer.startswith("-") else f"csplat {writer}"
+    meant = (
+        f"{line} {target.with_suffix(wanted)}" if line == writer else f"{line} {source} {target.with_suffix(wanted)}"
+    )
+    if maker and source:
+        meant = f"csplat {maker} {source} {path}"
+    raise InputError(f"{path}: {what} `{line}` writes a {wanted} file: did you mean `{meant}`?")
 
 
 @contextmanager
@@ -185,7 +196,7 @@ def is_csplat(path: Path) -> bool:
 
 
 @contextmanager
-def mapped_csplat(path: str) -> Iterator[bytes | mmap.mmap]:
+def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
     """Give the bytes of a .csplat file, memory-mapped where that is possible.
 
     Whether they are valid is for the decoder to say; only a PLY is recognised and refused here.
@@ -194,25 +205,15 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap.mmap]:
         InputError: it is a PLY.
         OSError: it cannot be read.
     """
-    if path == STANDARD_STREAM:
-        data = sys.stdin.buffer.read()
+    is_path = path != STANDARD_STREAM
+    data = mapped(path) if is_path else sys.stdin.buffer.read()
+    try:
         with _naming(path):
-            _refuse_others("standard input", data)
+            _refuse_others(path if is_path else "standard input", data[:HEAD_SIZE])
             yield data
-        return
-    with Path(path).open("rb") as stream, _naming(path):
-        try:
-            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except (ValueError, OSError, io.UnsupportedOperation):  # empty, or a pipe
-            data = stream.read()
-            _refuse_others(path, data)
-            yield data
-            return
-        try:
-            _refuse_others(path, mapped[:HEAD_SIZE])
-            yield mapped
-        finally:
-            _close(mapped)
+    finally:
+        if isinstance(data, mmap):
+            _close(data)
 
 
 def write_array(path: str, array: NDArray[Any]) -> None:
@@ -272,7 +273,7 @@ def _naming(file: File) -> Iterator[None]:
     try:
         yield
     except CsplatError as error:
-        if isinstance(file, (str, os.PathLike)):
+        if error.path is None and isinstance(file, (str, os.PathLike)):
             error.path = "standard input" if file == STANDARD_STREAM else os.fspath(file)
         raise
 
@@ -284,8 +285,8 @@ def _refuse_others(name: str, data: bytes) -> None:
         refuse_known(Path(name), data[:HEAD_SIZE])
 
 
-def _close(mapped: mmap.mmap) -> None:
+def _close(data: mmap) -> None:
     try:
-        mapped.close()
+        data.close()
     except BufferError:
         return  # an error on its way up still holds a view; the garbage collector closes it

@@ -37,9 +37,8 @@ from csplat_tools.views.timing import picture_seconds
 __all__ = ["check", "expected_seconds", "optimise"]
 
 #: What a target costs, in pictures of 640x480, without and with removal: 380 to 690 and 2,800 to 3,900 of plane3,
-#: donut, lego60k and fox120k. And how much less and more it may be.
+#: donut, lego60k and fox120k.
 _PICTURES = (520.0, 3400.0)
-_SPREAD = (0.6, 1.7)
 _INSIDE = (
     "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
     " --data, or --cameras with 40 of them, would decide by yours, --keep-all leaves all"
@@ -109,14 +108,13 @@ def optimise(
 
 def expected_seconds(
     source: SplatModel, encoding: EncodeOptions, target: Target, views: ViewSet, *, keep_all: bool
-) -> tuple[float, float]:
-    """How long a target takes here, at least and at most, for a person who may choose otherwise.
+) -> float:
+    """About how long a target takes here, for a person who may choose otherwise.
 
     By how long the views that judge take now: what is done costs so many pictures of them, whatever the machine.
     """
     pictures = _PICTURES[not _all_stay(target, encoding, keep_all=keep_all)]
-    seconds = pictures * picture_seconds(source, views.judges, threads=encoding.threads)
-    return seconds * _SPREAD[0], seconds * _SPREAD[1]
+    return pictures * picture_seconds(source, views.judges, threads=encoding.threads)
 
 
 def _all_stay(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> bool:

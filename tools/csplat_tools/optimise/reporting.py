@@ -11,6 +11,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, spread_of
+from csplat_tools.views import counted_views
 
 __all__ = ["reported"]
 
@@ -34,11 +35,7 @@ def reported(
     """
     errors, spread = found.errors, spread_of(found.errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
-    many = (
-        counted(len(errors), "virtual view")
-        if views_of == "virtual"
-        else f"{counted(len(errors), 'view')} of {views_of}"
-    )
+    many = counted_views(len(errors), views_of)
     sure = (
         f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
     )

@@ -10,6 +10,7 @@ from typing import Any
 from csplat.encoder import PRESETS, PresetName
 from csplat.errors import InputError
 from csplat_render import Mode
+from csplat_render.conventions import MODES
 from csplat_tools.optimise.target import parse_size_bytes
 
 __all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
@@ -72,8 +73,8 @@ class Wanted:
         for share in self.keep:
             if not 0.0 < share <= 1.0:
                 raise InputError(f"a share of the splats is {share:g}, wanted above 0, at most 1")
-        if not self.modes:
-            raise InputError("no mode of the renderer is given")
+        if not self.modes or not {*self.modes} <= {*MODES}:
+            raise InputError(f"the modes are {', '.join(map(repr, self.modes))}, wanted some of {', '.join(MODES)}")
 
 
 def parse_what(text: str, **how: Any) -> Wanted:

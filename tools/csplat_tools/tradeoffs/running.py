@@ -11,7 +11,7 @@ from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import Progress, format_bytes, format_range
+from csplat_tools.files.console import Progress, format_about, format_bytes
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
@@ -23,18 +23,17 @@ from csplat_tools.views import Colour, DataOptions
 
 __all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
-# Seconds by kind of point, on two cores: for each million splats, and for each second that eight
-# pictures of the source take; for an estimate that a person decides by, no more.
-_SPREAD = (0.6, 1.7)  # how much less and more all of them may take
+# Seconds by kind of point, on two cores: for each, by its scores and, of presets, those with fewer bands; for each
+# million splats; and for each second that eight pictures of the source take. An estimate that a person decides by.
 _COSTS = {
-    "presets": (12.0, 15.0),
-    "precision": (12.0, 6.0),
-    "strategies": (12.0, 6.0),
-    "k-means": (250.0, 6.0),
-    "distilled": (40.0, 110.0),
-    "targets": (100.0, 60.0),
-    "simplify": (40.0, 250.0),
-    "finetune": (100.0, 500.0),
+    "presets": (3.6, 12.0, 10.0),
+    "precision": (1.2, 12.0, 4.0),
+    "strategies": (1.2, 12.0, 4.0),
+    "k-means": (1.2, 250.0, 6.0),
+    "distilled": (1.2, 40.0, 80.0),
+    "targets": (1.2, 0.0, 425.0),  # 3,400 pictures, see `optimiser`
+    "simplify": (1.2, 40.0, 250.0),
+    "finetune": (1.2, 100.0, 500.0),
 }
 
 
@@ -158,8 +157,7 @@ def tradeoff(
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
         costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        about = format_range(_SPREAD[0] * sum(costs), _SPREAD[1] * sum(costs))
-        tell(f"{counted(len(tried), 'file')} to make and to measure: about {about} here")
+        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_about(sum(costs))} here")
         points = list[Point | Failure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
@@ -174,10 +172,10 @@ def tradeoff(
 
 def estimated_seconds(kind: str, setting: Setting, wanted: Wanted, modes: dict[str, ModeTime]) -> float:
     """About how long a point takes that is like those of a family."""
-    by_splats, by_pictures = _COSTS[kind]
+    each, by_splats, by_pictures = _COSTS[kind]
     milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
     steps = wanted.iterations / Wanted.iterations if kind == "finetune" else 1.0
-    return 0.5 + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
+    return each + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
 
 
 def _measured(measurer: Measurer, candidate: Candidate, progress: Progress) -> Point | Failure:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from csplat_tools.files.console import format_bytes, format_table
 from csplat_tools.tradeoffs.points import Partial, Point
 from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.views import counted_views
 
 __all__ = ["MARK", "Column", "columns_of", "format_tradeoff", "mode_rows", "partial_rows", "views_line"]
 
@@ -125,8 +126,7 @@ def views_line(tradeoff: Tradeoff) -> str:
     setting = tradeoff.setting
     sizes = sorted({(camera.W, camera.H) for camera in setting.views.judges})
     size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
-    where = "virtual views" if setting.views.name == "virtual" else f"views of {setting.views.name}"
-    return f"judged from {len(setting.views.judges)} {where}, {size}"
+    return f"judged from {counted_views(len(setting.views.judges), setting.views.name)}, {size}"
 
 
 def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from csplat_tools.views.finding import DataOptions, comparison_cameras, find_view_set, with_deciders
 from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced
 from csplat_tools.views.showing import showing_cameras
-from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet
+from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, counted_views
 
 __all__ = [
     "BLACK",
@@ -21,6 +21,7 @@ __all__ = [
     "ViewSet",
     "camera_sequence",
     "comparison_cameras",
+    "counted_views",
     "evenly",
     "find_view_set",
     "reduced",

@@ -10,10 +10,15 @@ from csplat_render import Camera, Mode
 from csplat_render.cameras import resized
 from csplat_render.judge import renderer
 
-__all__ = ["picture_seconds"]
+__all__ = ["picture_seconds", "pictures_seconds"]
 
 _SAMPLES = 2  # cameras that are tried
 _SMALLER = 8  # times on each side, where a whole picture takes a minute: seconds grow with its pixels
+
+
+def pictures_seconds(source: SplatModel, cameras: Sequence[Camera], *, mode: Mode = "standard") -> float:
+    """Seconds that all pictures take, by some of them; 0 where there are none."""
+    return len(cameras) * picture_seconds(source, cameras, mode=mode) if len(source) and cameras else 0.0
 
 
 def picture_seconds(

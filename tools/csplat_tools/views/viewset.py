@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_render import Camera, Mode
 from csplat_render.judge import Judge
@@ -16,7 +16,7 @@ from csplat_render.judge import Judge
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
 
-__all__ = ["BLACK", "SPLITS", "VIRTUAL", "WHITE", "Colour", "Split", "ViewSet", "pose"]
+__all__ = ["BLACK", "SPLITS", "VIRTUAL", "WHITE", "Colour", "Split", "ViewSet", "counted_views", "pose"]
 
 Colour = tuple[float, float, float]
 
@@ -144,6 +144,16 @@ class ViewSet:
             raise InputError("there are no photographs: name a data set")
         shown = self.pictures(cameras)
         return photograph_judge(shown, self.background, mode=mode, threads=threads, origin=self.origin)
+
+
+def counted_views(count: int, name: str) -> str:
+    """How many views there are and where they come from: `8 virtual views`, `8 views of lego`.
+
+    Args:
+        count: how many.
+        name: of the set.
+    """
+    return counted(count, "virtual view") if name == VIRTUAL else f"{counted(count, 'view')} of {name}"
 
 
 def pose(camera: Camera) -> bytes:
