@@ -618,7 +618,7 @@ def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
 @pytest.mark.parametrize("option", ["--resume", "--importance"])
 def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_path, option):
     out, absent = tmp_path / "s.csplat", tmp_path / "absent.npz"
-    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path / "nothing", "-o", out, option, absent)
+    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path, "-o", out, option, absent)
     assert 1 == result.exit_code
     assert "absent.npz: No such file" in result.stderr
 
