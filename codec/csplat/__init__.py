@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         LimitError,
         UnsupportedError,
     )
+    from csplat.formats import read, write
     from csplat.model import SplatModel
     from csplat.ply import lint_ply, read_ply, write_ply
 
@@ -54,9 +55,11 @@ __all__ = [
     "encode_with_report",
     "from_gsplat",
     "lint_ply",
+    "read",
     "read_header",
     "read_ply",
     "to_gsplat",
+    "write",
     "write_ply",
 ]
 
@@ -105,8 +108,10 @@ _MODULE_OF = {
     "from_gsplat": "csplat.bridges",
     "lint_ply": "csplat.ply",
     "read_header": "csplat.decoder",
+    "read": "csplat.formats",
     "read_ply": "csplat.ply",
     "to_gsplat": "csplat.bridges",
+    "write": "csplat.formats",
     "write_ply": "csplat.ply",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

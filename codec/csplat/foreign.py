@@ -13,7 +13,15 @@ from pathlib import Path
 
 from csplat.errors import InputError
 
-__all__ = ["HEAD_SIZE", "foreign_name", "refuse_folder", "refuse_foreign", "refuse_known", "refuse_packed_header"]
+__all__ = [
+    "HEAD_SIZE",
+    "foreign_name",
+    "refuse_folder",
+    "refuse_foreign",
+    "refuse_known",
+    "refuse_packed_header",
+    "unknown",
+]
 
 #: Bytes of the beginning of a file that `refuse_foreign` wants to see.
 HEAD_SIZE = 512
@@ -58,6 +66,24 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
             f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
         )
     raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}; wanted one of Gaussian splats")
+
+
+def unknown(path: Path, head: bytes) -> InputError:
+    """The error for a file or folder in no format that is known here: what it may be, and what converts it.
+
+    Args:
+        path: of it.
+        head: its first `HEAD_SIZE` bytes; none of a folder.
+    """
+    if path.is_dir():
+        return InputError(f"{path.name} is a folder, and no scene")
+    try:
+        refuse_known(path, head)
+    except InputError as error:
+        return error
+    if not head:
+        return InputError(f"{path.name} is empty")
+    return InputError(f"{path.name} is in no format that csplat knows: it begins with {head[:8]!r}")
 
 
 def refuse_known(path: Path, head: bytes) -> None:

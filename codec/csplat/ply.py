@@ -1,8 +1,5 @@
 """Read and write PLY files of 3D Gaussian splats (INRIA's layout and its relatives).
 
-The only module that imports `plyfile`, which is GPL-3.0-or-later: programs that embed the decoder
-and never touch a PLY do not load it.
-
 PLY has no place for what a scene needs beyond its columns, so it goes into header comments:
 `csplat origin X Y Z` (x, y, z are relative to it), `csplat absolute_origin X Y Z` (x, y, z are
 absolute, in doubles), `csplat coordinate_system RDF`, `csplat up X Y Z`, `csplat unit_metres U`,
@@ -12,33 +9,26 @@ absolute, in doubles), `csplat coordinate_system RDF`, `csplat up X Y Z`, `cspla
 
 from __future__ import annotations
 
-import io
-import re
-import warnings
+import math
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
-import plyfile
 
-from csplat.errors import InputError, counted
 from csplat.files import local_file
-from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_packed_header
 from csplat.inputs import File
-from csplat.lint import Finding, find_columns, refuse
-from csplat.model import SplatModel
-from csplat.ply_columns import Rows, gather
-from csplat.ply_comments import parse_comments
+from csplat.lint import Columns, Finding, find_columns, refuse
+from csplat.model import F32, SplatModel
+from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather
+from csplat.ply_comments import SceneFacts, parse_comments
+from csplat.ply_file import blocks_of, parse
 from csplat.ply_origin import relative_to_origin
 from csplat.ply_write import write_ply
+from csplat.scene import BLOCK, Scene
 
-__all__ = ["lint_ply", "read_ply", "write_ply"]
-
-_ELEMENT = "vertex"
-_END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)")
-_MAX_HEADER_SIZE = 1 << 20
-_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+__all__ = ["lint_ply", "open_ply", "read_ply", "write_ply"]
 
 
 def read_ply(
@@ -105,9 +95,62 @@ def lint_ply(file: File) -> list[Finding]:
     return findings
 
 
-def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> SplatModel | None:
-    """Read a file, appending what is noticed to `findings`; `None` where that holds an error."""
-    content = _parse(path, findings)
+@contextmanager
+def open_ply(path: Path) -> Iterator[Scene]:
+    """Open a PLY as `csplat.formats` does; the rest as `read_ply`.
+
+    What belongs to all splats (how many are kept, an origin for doubles, the thickness of discs) is found first, in a
+    pass of its own.
+    """
+    findings: list[Finding] = []
+    opened = _opened(path, findings, keep_extra=True, strict=False)
+    refuse(findings, strict=False)
+    assert opened is not None, "without an error there are rows"
+    rows, columns = opened.rows, opened.columns
+    counts, total, positions, thinnest = Counts(), 0, [], math.inf
+    for block in blocks_of(path, rows, BLOCK):
+        arrays = gather([block], len(block), rows.dtype, columns, counts=counts)
+        total += len(arrays.means)
+        thinnest = min(thinnest, float(arrays.scales[:, : len(columns.scales)].min(initial=math.inf)))
+        if columns.double:
+            positions.append(arrays.means)
+    findings += findings_of(counts, len(rows))
+    refuse(findings, strict=False)
+    everything = None
+    if columns.double:
+        everything = relative_to_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
+        findings.append(_doubles_finding(total, everything[1]))
+
+    def blocks() -> Iterator[SplatModel]:
+        at = 0
+        for block in blocks_of(path, rows, BLOCK):
+            arrays = gather([block], len(block), rows.dtype, columns, keep_extra=True, thinnest=thinnest)
+            part = slice(at, at + len(arrays.means))
+            if everything is None:
+                placed = relative_to_origin(arrays.means, opened.facts)
+            else:
+                means, origin, doubles = everything
+                placed = means[part], origin, None if doubles is None else doubles[part]
+            at = part.stop
+            if len(arrays.means):
+                yield _model(arrays, placed, opened)
+
+    empty = gather([], 0, rows.dtype, columns, keep_extra=True)
+    placed = relative_to_origin(empty.means, opened.facts)
+    facts = _model(empty, placed if everything is None else (placed[0], everything[1], None), opened)
+    yield Scene(total, facts, blocks, findings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    rows: Rows
+    columns: Columns
+    facts: SceneFacts
+
+
+def _opened(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> _Opened | None:
+    """Look at all but the rows, appending what is noticed to `findings`; `None` where that holds an error."""
+    content = parse(path, findings)
     if content is None:
         return None
     rows, comments = content
@@ -116,16 +159,33 @@ def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool
     if columns is None:
         return None
     refuse(findings, strict=strict)  # before the work
-    facts = parse_comments(comments)
-    blocks = _blocks(path, rows)
-    arrays, more = gather(blocks, len(rows), rows.dtype, columns, keep_extra=keep_extra)
-    findings += more
+    return _Opened(rows, columns, parse_comments(comments))
+
+
+def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> SplatModel | None:
+    """Read a file, appending what is noticed to `findings`; `None` where that holds an error."""
+    opened = _opened(path, findings, keep_extra=keep_extra, strict=strict)
+    if opened is None:
+        return None
+    rows, columns, counts = opened.rows, opened.columns, Counts()
+    arrays = gather(blocks_of(path, rows), len(rows), rows.dtype, columns, keep_extra=keep_extra, counts=counts)
+    findings += findings_of(counts, len(rows))
     if len(rows) == 0:
         findings.append(Finding("empty", 0, "the file holds no splats", "note"))
-    means, origin, doubles = relative_to_origin(arrays.means, facts)
+    placed = relative_to_origin(arrays.means, opened.facts)
     if columns.double:
-        text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
-        findings.append(Finding("double-means", len(means), text, "note"))
+        findings.append(_doubles_finding(len(arrays.means), placed[1]))
+    return _model(arrays, placed, opened)
+
+
+def _doubles_finding(count: int, origin: tuple[float, float, float]) -> Finding:
+    text = f"positions are in doubles: {count} means are float32 relative to {origin}"
+    return Finding("double-means", count, text, "note")
+
+
+def _model(arrays: Arrays, placed: tuple[F32, tuple[float, float, float], F64 | None], opened: _Opened) -> SplatModel:
+    means, origin, doubles = placed
+    facts = opened.facts
     return SplatModel(
         means=means,
         quats=arrays.quats,
@@ -137,161 +197,8 @@ def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool
         coordinate_system=facts.coordinate_system,
         unit_metres=facts.unit_metres,
         antialiased=facts.antialiased,
-        flat=facts.flat or len(columns.scales) == 2,
+        flat=facts.flat or len(opened.columns.scales) == 2,
         metadata=facts.metadata,
         extra=arrays.extra,
         means_double=doubles,
     )
-
-
-def _parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
-    """Let plyfile parse a file. Returns rows of scalar columns, and the comments."""
-    header = _header(path)
-    refuse_packed_header(path, header)
-    findings += _header_findings(header, path.stat().st_size)
-    if any(not one.repairable for one in findings):
-        return None
-    with _open(path, header) as stream:
-        try:
-            # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an
-            # empty table, which plyfile then refuses.
-            with np.errstate(over="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)
-                parsed = plyfile.PlyData.read(stream)
-        except plyfile.PlyElementParseError as error:
-            findings.append(_row_finding(error))
-            return None
-        except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
-            raise InputError(f"{path.name}: {error or type(error).__name__}") from None
-        end = None if parsed.text else stream.tell()
-    row_count = sum(element.count for element in parsed)
-    findings += _trailing_findings(path, len(header), end, row_count)
-    if _ELEMENT not in parsed:
-        raise InputError(f"{path.name} has no element {_ELEMENT!r}: not a PLY of splats")
-    others = [element.name for element in parsed if element.name != _ELEMENT]
-    if others:
-        text = f"elements besides {_ELEMENT}: {', '.join(others)}: dropped"
-        findings.append(Finding("other-elements", len(others), text, "repair"))
-    rows, lists = _scalars(parsed[_ELEMENT].data)
-    if lists:
-        text = f"list properties {', '.join(lists)}: dropped"
-        findings.append(Finding("list-columns", len(lists), text, "repair"))
-    comments = [*parsed.comments, *parsed.obj_info]
-    for element in parsed:
-        comments += element.comments
-    return rows, comments
-
-
-def _header(path: Path) -> bytes:
-    """The bytes of a PLY header, up to and including the line `end_header`."""
-    if path.is_dir():
-        refuse_folder(path)
-    with path.open("rb") as stream:
-        refuse_foreign(path, stream.read(HEAD_SIZE), path.stat().st_size)
-        stream.seek(0)
-        start = stream.read(_MAX_HEADER_SIZE)
-    end = _END_OF_HEADER.search(start)
-    if end is None:
-        raise InputError(f"{path.name}: the PLY header has no line end_header")
-    return start[: end.end()]
-
-
-def _header_findings(header: bytes, size: int) -> list[Finding]:
-    findings = []
-    if not header.isascii():
-        count = sum(byte > 127 for byte in header)
-        text = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
-        findings.append(Finding("non-ascii-header", count, text, "note"))
-    for line in header.splitlines():
-        words = line.split()
-        if words[:1] != [b"element"] or len(words) != 3:
-            continue
-        if words[2].startswith(b"-"):
-            text = f"{words[2].decode('ascii', 'replace')} rows are declared"
-            findings.append(Finding("malformed", 1, text, "error"))
-        elif words[2].isdigit():
-            count = int(words[2])
-            if count > size:  # a row takes a byte at least: do not let anyone allocate for it
-                text = f"{count} rows are declared, the file has {size} bytes"
-                findings.append(Finding("truncated", count, text, "error"))
-    return findings
-
-
-def _row_finding(error: Any) -> Finding:
-    present, declared = error.row or 0, error.element.count
-    if error.message == "early end-of-file":
-        text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
-        return Finding("truncated", declared - present, text, "error")
-    return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}", "error")
-
-
-def _trailing_findings(path: Path, header_size: int, end: int | None, row_count: int) -> list[Finding]:
-    """Count the bytes after the last row; an ASCII file (`end` is `None`) has a line per row."""
-    if end is not None:
-        count = path.stat().st_size - end
-    else:
-        with path.open("rb") as stream:
-            stream.seek(header_size)
-            lines = stream.read().splitlines(keepends=True)
-        count = len(b"".join(lines[row_count:]).strip())
-    if count == 0:
-        return []
-    text = f"{counted(count, 'byte')} after the last row: ignored"
-    return [Finding("trailing-bytes", count, text, "repair")]
-
-
-def _scalars(data: Rows) -> tuple[Rows, list[str]]:
-    """Take list properties out of rows. Returns contiguous rows and the names taken out."""
-    names = data.dtype.names or ()
-    lists = [name for name in names if data.dtype[name].hasobject]
-    if not lists:
-        return data, []
-    kept = [(name, data.dtype[name]) for name in names if name not in lists]
-    rows = np.empty(len(data), kept)
-    for name, _ in kept:
-        rows[name] = data[name]
-    return rows, lists
-
-
-def _blocks(path: Path, rows: Rows) -> Iterator[Rows]:
-    """Rows in blocks. Those of a memory map are read instead: aligned, and not resident twice."""
-    step = max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
-    if not isinstance(rows, np.memmap):
-        yield from (rows[start : start + step] for start in range(0, len(rows), step))
-        return
-    with path.open("rb") as stream:
-        stream.seek(rows.offset)
-        for start in range(0, len(rows), step):
-            want = min(step, len(rows) - start)
-            block = np.fromfile(stream, rows.dtype, want)
-            if len(block) != want:
-                raise InputError(f"{path.name} became shorter while it was read")
-            yield block
-
-
-def _open(path: Path, header: bytes) -> IO[Any]:
-    """Open a PLY for plyfile: as text where it is text, and ASCII where plyfile insists on it."""
-    if any(line.split()[:2] == [b"format", b"ascii"] for line in header.splitlines()):
-        return io.TextIOWrapper(_AsciiReader(path, path.stat().st_size), encoding="ascii")
-    return _AsciiReader(path, len(header))
-
-
-class _AsciiReader(io.BufferedReader):
-    """A file whose first bytes read as ASCII, whatever they are: plyfile stops at others."""
-
-    def __init__(self, path: Path, ascii_size: int) -> None:
-        super().__init__(io.FileIO(path))
-        self._ascii_left = ascii_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        return self._as_ascii(super().read(size))
-
-    def read1(self, size: int = -1, /) -> bytes:
-        return self._as_ascii(super().read1(size))
-
-    def _as_ascii(self, data: bytes) -> bytes:
-        if self._ascii_left <= 0 or data.isascii():
-            self._ascii_left -= len(data)
-            return data
-        self._ascii_left -= len(data)
-        return bytes(byte if byte < 128 else ord("?") for byte in data)

@@ -19,7 +19,7 @@ from csplat.errors import counted
 from csplat.lint import Columns, Finding
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
-__all__ = ["Arrays", "alpha_of_logits", "gather", "logits_of_alpha"]
+__all__ = ["Arrays", "Counts", "alpha_of_logits", "findings_of", "gather", "logits_of_alpha"]
 
 F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
@@ -54,7 +54,9 @@ class Arrays:
 
 
 @dataclass
-class _Counts:
+class Counts:
+    """What was noticed in rows, to be added to."""
+
     nonfinite: int = 0
     zero_quats: int = 0
     unnormalised: int = 0
@@ -65,8 +67,15 @@ class _Counts:
 
 
 def gather(
-    blocks: Iterable[Rows], count: int, dtype: np.dtype[Any], columns: Columns, *, keep_extra: bool
-) -> tuple[Arrays, list[Finding]]:
+    blocks: Iterable[Rows],
+    count: int,
+    dtype: np.dtype[Any],
+    columns: Columns,
+    *,
+    keep_extra: bool = False,
+    counts: Counts | None = None,
+    thinnest: float = math.inf,
+) -> Arrays:
     """Copy columns into arrays, dropping rows that are not finite and repairing rotations.
 
     Args:
@@ -75,12 +84,14 @@ def gather(
         dtype: of the blocks.
         columns: which column is what.
         keep_extra: keep `columns.extra` too.
+        counts: what is noticed and repaired is added to it.
+        thinnest: the smallest scale of all discs, where these are not all of them.
 
     Returns:
-        Arrays of the splats that were kept, and what was noticed and repaired.
+        Arrays of the splats that were kept.
     """
     out = _allocate(count, dtype, columns, keep_extra=keep_extra)
-    counts = _Counts()
+    counts = Counts() if counts is None else counts
     at = 0
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is found below
         for rows in blocks:
@@ -90,8 +101,8 @@ def gather(
             at += _repair(part, len(columns.scales), counts)
     kept = _part(out, slice(0, at))
     if len(columns.scales) == 2 and at:
-        kept.scales[:, 2] = kept.scales[:, :2].min() - np.float32(_FLAT_SCALE_STEP)
-    return kept, _findings(counts, count)
+        kept.scales[:, 2] = min(kept.scales[:, :2].min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP)
+    return kept
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:
@@ -197,7 +208,7 @@ def _nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
     return int(np.count_nonzero(nonzero))
 
 
-def _repair(part: Arrays, scale_count: int, counts: _Counts) -> int:
+def _repair(part: Arrays, scale_count: int, counts: Counts) -> int:
     """Repair a block in place; its first rows are those that are kept. Returns how many."""
     checked = (part.means, part.quats, part.scales[:, :scale_count], part.sh0, part.shN)
     sums = [float(array.sum()) for array in (*checked, part.opacities)]
@@ -230,7 +241,7 @@ def _huge_rows(part: Arrays, scale_count: int) -> int:
     return 0 if huge is None else int(np.count_nonzero(huge))
 
 
-def _repair_quats(quats: F32, counts: _Counts) -> None:
+def _repair_quats(quats: F32, counts: Counts) -> None:
     wide = quats.astype(np.float64)
     squared = np.einsum("ij,ij->i", wide, wide)
     zero = int(np.count_nonzero(squared == 0.0))
@@ -244,7 +255,8 @@ def _repair_quats(quats: F32, counts: _Counts) -> None:
     quats[:] = normalise_quats(quats)
 
 
-def _findings(counts: _Counts, count: int) -> list[Finding]:
+def findings_of(counts: Counts, count: int) -> list[Finding]:
+    """What was noticed in so many rows."""
     nonfinite = f"{counted(counts.nonfinite, 'splat')} with NaN or infinity"
     findings = [
         Finding("nonfinite-rows", counts.nonfinite, f"{nonfinite}: dropped", "repair")

@@ -13,8 +13,9 @@ from csplat.files import BinaryWriter, opened_for_writing
 from csplat.model import SplatModel, check_model
 from csplat.ply_columns import logits_of_alpha
 from csplat.ply_comments import format_comments
+from csplat.scene import Scene
 
-__all__ = ["write_ply"]
+__all__ = ["write_ply", "write_scene_ply"]
 
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are put together at a time: they stay in the cache
 
@@ -52,16 +53,22 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         OSError: the file cannot be written.
     """
     check_model("write_ply", model)
-    dtype = _row_dtype(model, absolute=absolute)
+    write_scene_ply(file, Scene(len(model), model.select(slice(0, 0)), lambda: iter([model])), absolute=absolute)
+
+
+def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *, absolute: bool = False) -> None:
+    """Write a scene that is read some splats at a time; the rest as `write_ply`."""
+    dtype = _row_dtype(scene.facts, absolute=absolute)
+    step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with opened_for_writing(file) as stream:
-        stream.write(_header(model, absolute=absolute))
-        step = max(1, _BLOCK_SIZE // dtype.itemsize)
-        rows = np.zeros(min(step, len(model)), dtype)
-        for start in range(0, len(model), step):
-            part = slice(start, min(start + step, len(model)))
-            block = rows[: part.stop - part.start]
-            _fill(block, model, part, absolute=absolute)
-            stream.write(block.view(np.uint8).data)
+        stream.write(_header(scene.facts, scene.count, absolute=absolute))
+        rows = np.zeros(min(step, scene.count), dtype)
+        for model in scene.blocks():
+            for start in range(0, len(model), step):
+                part = slice(start, min(start + step, len(model)))
+                block = rows[: part.stop - part.start]
+                _fill(block, model, part, absolute=absolute)
+                stream.write(block.view(np.uint8).data)
 
 
 def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
@@ -80,14 +87,14 @@ def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
     )
 
 
-def _header(model: SplatModel, *, absolute: bool) -> bytes:
+def _header(model: SplatModel, count: int, *, absolute: bool) -> bytes:
     # Comments come last: SIBR's viewer expects the element on the third line.
     position = "double" if absolute else "float"
     rest_count = 3 * model.shN.shape[1]
     floats = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     floats += [f"f_rest_{index}" for index in range(rest_count)]
     floats += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(model)}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {position} {name}" for name in ("x", "y", "z")]
     lines += [f"property float {name}" for name in floats]
     for name, column in model.extra.items():

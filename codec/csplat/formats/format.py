@@ -1,0 +1,97 @@
+"""What a format of files is: how it is told apart, read and written, and what of a scene it has a place for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from csplat.model import UNSPECIFIED, SplatModel
+from csplat.scene import Scene
+
+__all__ = ["Format", "Reader", "Writer"]
+
+
+class Reader(Protocol):
+    """Opens a file."""
+
+    def __call__(self, path: Path, /) -> AbstractContextManager[Scene]:
+        """Give the scene, whose blocks can be read as long as the context lasts.
+
+        Raises:
+            InputError: the file is not whole, or none of this format. Blocks raise it, too.
+            OSError: it cannot be read.
+        """
+        ...
+
+
+class Writer(Protocol):
+    """Writes a file, or the files of a folder."""
+
+    def __call__(self, path: Path, scene: Scene, /) -> None:
+        """Write all of a scene; `path` takes its name when it is complete.
+
+        Raises:
+            InputError: the format cannot hold it at all: too many splats, positions out of its reach.
+            OSError: it cannot be written.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of files.
+
+    Attributes:
+        name: as `csplat formats` and `--format` have it: `spz`.
+        title: as people write it: `SPZ 4`.
+        suffixes: of file names, the usual one first; with their dots, in small letters.
+        sniff: whether a file is of this format, by its content: path, and the first bytes of it (none of a folder).
+        open: reads it; `None`: it is not read.
+        write: writes it; `None`: it is not written.
+        degree: highest SH degree that it holds.
+        axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
+        exact: names of the arrays of a model that come back bit for bit.
+        carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,
+            `cameras` it has a place for.
+    """
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[Path, bytes], bool]
+    open: Reader | None = None
+    write: Writer | None = None
+    degree: int = 3
+    axes: str = ""
+    exact: frozenset[str] = frozenset()
+    carries: frozenset[str] = frozenset()
+
+    def losses(self, facts: SplatModel) -> tuple[str, ...]:
+        """What of a scene this format has no place for, a few words each; precision is not among them.
+
+        Args:
+            facts: of a `Scene`, or a model.
+        """
+        lost = []
+        if facts.sh_degree > self.degree:
+            bands = range(self.degree + 1, facts.sh_degree + 1)
+            lost.append(f"SH band{'s' if len(bands) > 1 else ''} {' and '.join(map(str, bands))}")
+        for name, (words, is_there) in _PARTS.items():
+            if name not in self.carries and is_there(facts):
+                lost.append(words)
+        return tuple(lost)
+
+
+_PARTS: dict[str, tuple[str, Callable[[SplatModel], Any]]] = {
+    "antialiased": ("that it is antialiased", lambda facts: facts.antialiased),
+    "origin": ("the origin", lambda facts: any(facts.origin)),
+    "coordinate_system": ("the axes", lambda facts: facts.coordinate_system != UNSPECIFIED),
+    "unit_metres": ("the length of a unit", lambda facts: facts.unit_metres is not None),
+    "flat": ("that splats are discs", lambda facts: facts.flat),
+    "cameras": ("cameras", lambda facts: facts.cameras),
+    "metadata": ("metadata", lambda facts: facts.metadata),
+    "extra": ("extra columns", lambda facts: facts.extra),
+}

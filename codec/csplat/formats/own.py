@@ -1,0 +1,40 @@
+"""The format of this project."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from csplat._spec import MAGIC
+from csplat.decoder import decode
+from csplat.encoder import EncodeOptions, encode
+from csplat.files import atomic_writer
+from csplat.formats.format import Format
+from csplat.scene import Scene, scene_of
+
+__all__ = ["FORMAT"]
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Scene]:
+    yield scene_of(decode(path))
+
+
+def _write(path: Path, scene: Scene) -> None:
+    data = encode(scene.model(), EncodeOptions(keep_extra=True))
+    with atomic_writer(path) as stream:
+        stream.write(data)
+
+
+FORMAT = Format(
+    name="csplat",
+    title="csplat",
+    suffixes=(".csplat",),
+    sniff=lambda _path, head: head.startswith(MAGIC),
+    open=_open,
+    write=_write,
+    carries=frozenset(
+        {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "cameras", "extra", "metadata"}
+    ),
+)

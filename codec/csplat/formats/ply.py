@@ -1,0 +1,27 @@
+"""PLY of INRIA's layout and its relatives: what the project's own tools and most trainers write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from csplat.formats.format import Format
+from csplat.ply import open_ply
+from csplat.ply_write import write_scene_ply
+
+__all__ = ["FORMAT"]
+
+
+def _is_ply(_path: Path, head: bytes) -> bool:
+    return head[:3] == b"ply" and head[3:4] in (b"\n", b"\r")
+
+
+FORMAT = Format(
+    name="ply",
+    title="PLY",
+    suffixes=(".ply",),
+    sniff=_is_ply,
+    open=open_ply,
+    write=write_scene_ply,
+    exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
+    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
+)

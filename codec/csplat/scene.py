@@ -1,0 +1,71 @@
+"""A scene that is read some splats at a time.
+
+What is known before the first splat comes first, then blocks: a block is a `SplatModel` of a bounded number of splats
+that says the same of the scene as all others. Who writes a scene may go through its blocks several times, and needs no
+more memory than a block wants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from csplat.lint import Finding
+from csplat.model import SplatModel
+
+__all__ = ["BLOCK", "Scene", "scene_of"]
+
+#: Splats of a block, at most.
+BLOCK = 65_536
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene that is read some splats at a time.
+
+    Attributes:
+        count: N.
+        facts: the scene without its splats: SH degree, axes, origin, antialiasing, metadata, names and types of extra
+            columns.
+        blocks: begins at the first splat whenever it is called, and gives all of them in order, in models of `BLOCK`
+            splats at most, whose facts are `facts`.
+        findings: what was noticed so far; grows while the first blocks are read.
+    """
+
+    count: int
+    facts: SplatModel
+    blocks: Callable[[], Iterator[SplatModel]]
+    findings: list[Finding] = field(default_factory=list)
+
+    def model(self) -> SplatModel:
+        """All of it in memory."""
+        return _joined(self.facts, list(self.blocks()))
+
+
+def scene_of(model: SplatModel) -> Scene:
+    """A scene that is in memory already."""
+
+    def blocks() -> Iterator[SplatModel]:
+        for start in range(0, len(model), BLOCK):
+            yield model.select(slice(start, start + BLOCK))
+
+    return Scene(len(model), model.select(slice(0, 0)), blocks)
+
+
+def _joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
+    if len(blocks) < 2:
+        return blocks[0] if blocks else facts
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in blocks])
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
+    }
+    doubles = [one.means_double for one in blocks]
+    return replace(
+        facts,
+        **arrays,
+        extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in facts.extra},
+        means_double=None if doubles[0] is None else np.concatenate([one for one in doubles if one is not None]),
+    )

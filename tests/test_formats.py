@@ -1,0 +1,119 @@
+"""Any format in, any format out: what is told apart, read in blocks, written, refused."""
+
+import io
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import formats, open_scene, write_scene
+from csplat.ply import read_ply, write_ply
+from csplat.scene import BLOCK, Scene, scene_of
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def same(a, b):
+    assert all((getattr(a, name) == getattr(b, name)).all() for name in ARRAYS)
+    assert (a.origin, a.coordinate_system, a.antialiased, a.flat, a.metadata) == (
+        b.origin, b.coordinate_system, b.antialiased, b.flat, b.metadata,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def large(make_model):
+    """More splats than a block has."""
+    model = make_model(60, 1)
+    return model.select(np.arange(BLOCK + 1000) % 60)
+
+
+def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
+    write_ply(tmp_path / "a.ply", large)
+    with open_scene(tmp_path / "a.ply") as scene:
+        assert len(large) == scene.count
+        assert 0 == len(scene.facts)
+        assert [BLOCK, 1000] == [len(block) for block in scene.blocks()]
+        same(read_ply(tmp_path / "a.ply"), scene.model())
+        write_scene(tmp_path / "b.ply", scene)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_rows_that_are_dropped_are_not_counted(tmp_path, large):
+    write_ply(tmp_path / "a.ply", large)
+    data = bytearray((tmp_path / "a.ply").read_bytes())
+    data[-4:] = np.float32(np.nan).tobytes()
+    (tmp_path / "a.ply").write_bytes(data)
+    with open_scene(tmp_path / "a.ply") as scene:
+        assert len(large) - 1 == scene.count == sum(map(len, scene.blocks()))
+        assert ["nonfinite-rows"] == [one.id for one in scene.findings if one.kind == "repair"]
+
+
+@pytest.mark.parametrize("far", [1e6 + 0.123, 0.0])
+def test_positions_in_doubles_keep_their_origin_in_every_block(tmp_path, large, far):
+    origin = (far, -far, 0.0)
+    model = csplat.SplatModel(**{**vars(large), "origin": origin})
+    write_ply(tmp_path / "a.ply", model, absolute=True)
+    with open_scene(tmp_path / "a.ply") as scene:
+        assert origin == scene.facts.origin
+        same(read_ply(tmp_path / "a.ply"), scene.model())
+
+
+def test_formats_are_told_apart_by_content_first(tmp_path, make_model):
+    model = make_model(40, 0)
+    csplat.write(tmp_path / "a.ply", model)
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.csplat").write_bytes(data)
+    same(csplat.read(tmp_path / "a.ply"), csplat.read(tmp_path / "a.csplat"))
+    same(csplat.read(data), csplat.read(io.BytesIO(data)))
+
+
+def test_a_csplat_file_is_read_and_written(tmp_path, make_model):
+    csplat.write(tmp_path / "a.csplat", make_model(40, 2))
+    same(csplat.decode(tmp_path / "a.csplat"), csplat.read(tmp_path / "a.csplat"))
+
+
+def test_what_a_format_has_no_place_for_is_told(make_model):
+    model = make_model(10, 2, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
+    (ply,) = (one for one in formats() if one.name == "ply")
+    assert () == ply.losses(model)
+    bare = type(ply)("bare", "Bare", (".bare",), lambda _path, _head: False, degree=0)
+    assert ("SH bands 1 and 2", "that it is antialiased", "the origin", "metadata") == bare.losses(model)
+
+
+def test_each_format_has_a_name_of_its_own():
+    names, endings = [one.name for one in formats()], [end for one in formats() for end in one.suffixes]
+    assert len(set(names)) == len(names)
+    assert len(set(endings)) == len(endings)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.ply", b"", "empty"),
+        ("a.txt", b"hello, this is no scene", "no format that csplat knows"),
+        ("a.ply", b"hello, this is no scene", "not a PLY"),
+        ("a.spx", b"hello", "gsbox"),
+        ("a.gz", b"\x1f\x8b\x08\x00hello", "gunzip"),
+    ],
+)
+def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, says):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=says):
+        csplat.read(tmp_path / name)
+
+
+def test_names_that_no_format_has_are_refused(tmp_path, make_model):
+    with pytest.raises(InputError, match=r"wanted one of .*\.ply"):
+        csplat.write(tmp_path / "a.xyz", make_model(3, 0))
+    with pytest.raises(InputError, match="wanted one of ply"):
+        csplat.read(tmp_path, format="xyz")
+    with pytest.raises(InputError, match="no scene"):
+        csplat.read(tmp_path)
+
+
+def test_a_scene_in_memory_is_read_in_blocks(large):
+    scene = scene_of(large)
+    assert [BLOCK, 1000] == [len(one) for one in scene.blocks()]
+    same(large, scene.model())
+    assert 0 == len(Scene(0, scene.facts, lambda: iter(())).model())
