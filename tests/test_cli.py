@@ -416,7 +416,7 @@ def test_files_have_the_usual_permissions(csplat_file):
         (("info", "absent.csplat"), "No such file"),
         (("verify", "absent.csplat"), "No such file"),
         (("lint", "absent.ply"), "No such file"),
-        (("info", "."), "Is a directory"),
+        (("info", "."), "is a folder, and no scene"),
         (("encode", "scene.ply", "."), "is a folder"),
         (("encode", "scene.ply", "no/such/folder/out.csplat"), "No such file"),
     ],
@@ -513,7 +513,7 @@ def test_a_csplat_is_not_encoded_and_a_ply_not_decoded(tmp_path, ply, csplat_fil
     for path in (csplat_file, renamed):
         assert "csplat decode" in refused("encode", path, tmp_path / "out")
         assert "csplat decode" in refused("lint", path)
-    for words in (("decode", ply, tmp_path / "out"), ("info", ply), ("verify", ply)):
+    for words in (("decode", ply, tmp_path / "out"), ("verify", ply)):
         assert "csplat encode" in refused(*words)
 
 
@@ -602,7 +602,7 @@ def test_info_refuses_every_prefix(tmp_path, csplat_file):
     data = csplat_file.read_bytes()
     for length in (0, 1, 63, 64, 100, len(data) // 2, len(data) - 1):
         (tmp_path / "prefix").write_bytes(data[:length])
-        assert "E_TRUNCATED" in refused("info", tmp_path / "prefix")
+        assert ("E_TRUNCATED" if length > 7 else "prefix is") in refused("info", tmp_path / "prefix")
     (tmp_path / "longer").write_bytes(data + b"x")
     assert "E_TRAILING" in refused("info", tmp_path / "longer")
 

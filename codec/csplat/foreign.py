@@ -76,7 +76,7 @@ def unknown(path: Path, head: bytes) -> InputError:
         head: its first `HEAD_SIZE` bytes; none of a folder.
     """
     if path.is_dir():
-        return InputError(f"{path.name} is a folder, and no scene")
+        return InputError(f"{path} is a folder, and no scene")
     try:
         refuse_known(path, head)
     except InputError as error:
