@@ -533,7 +533,7 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
     for words in commands[: 2 if path.suffix == ".ply" else 3]:
         line = refused(*words)
         assert line.startswith(f"error: {name} is ")
-        assert "which csplat does not read yet: convert it to PLY first, with splat-transform" in line
+        assert re.search("convert it to PLY first, with (splat-transform|`csplat convert`)", line)
         assert line.endswith("(E_INPUT)\n")
 
 

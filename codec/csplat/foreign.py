@@ -27,8 +27,9 @@ __all__ = [
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_CONVERT = "`csplat convert`, or take csplat.read, which reads it"
 _SPLAT_ROW_SIZE = 32
-_PACKED = ("gzip", "zip", "csplat")
+_PACKED = ("gzip", "zip", "csplat", "compressed PLY")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
@@ -125,7 +126,7 @@ def refuse_packed_header(path: Path, header: bytes) -> None:
         InputError: it has packed positions.
     """
     if any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines()):
-        raise InputError(_refusal(path, "compressed PLY", _SPLAT_TRANSFORM))
+        raise InputError(_refusal(path, "compressed PLY", _CONVERT))
 
 
 def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
