@@ -38,7 +38,12 @@ __all__ = [
 
 _PLY = "ply"  # its reader needs no second pass where all of a scene is wanted at once
 
-_MODULES = ("csplat.formats.compressed_ply", "csplat.formats.ply", "csplat.formats.own")
+_MODULES = (
+    "csplat.formats.compressed_ply",
+    "csplat.formats.ply",
+    "csplat.formats.own",
+    "csplat.formats.spz",
+)
 _registered: list[Format] = []
 
 
