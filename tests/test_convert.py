@@ -51,7 +51,7 @@ def test_what_is_lost_is_said_refused_and_foretold(tmp_path, ply):
     [
         (("a.xyz",), "no format has that ending"),
         (("-",), "standard output"),
-        (("a.ply", "--to", "zzz"), "wanted one of ply"),
+        (("a.ply", "--to", "zzz"), "wanted one of "),
         (("a.ply", "--rotate", "1,2"), "wanted 3 numbers"),
         (("a.ply", "--crop-sphere", "0,0,0,-1"), "radius"),
         (("a.ply", "--scale", "0"), "above 0"),
