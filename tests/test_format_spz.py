@@ -133,3 +133,71 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     for at in range(len(whole)):
         says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
         assert not says or ("a.spz" in says and "\n" not in says)
+
+
+def fields(path):
+    """Version, count, degree, fractional bits and flags of a file."""
+    data = path.read_bytes()
+    return struct.unpack_from("<IIBBB", gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data, 4)
+
+
+@pytest.mark.parametrize(("name", "version"), [("a.spz", 3), ("a.v4.spz", 4)])
+def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, name, version):
+    model = make_model(200, 3, coordinate_system="RUB", antialiased=True)
+    shN = np.clip(model.shN / 3, -1, 0.97)
+    model = csplat.SplatModel(**{**vars(model), "shN": shN, "sh0": np.clip(model.sh0, -3, 3)})
+    csplat.write(tmp_path / name, model)
+    assert (version, 200, 3, 12, 1) == fields(tmp_path / name)
+    found = csplat.read(tmp_path / name)
+    for array, step in {
+        "means": 2**-12,
+        "scales": 1 / 16,
+        "opacities": 1 / 255,
+        "sh0": 1 / 38.25,
+        "shN": 1 / 32,
+    }.items():
+        np.testing.assert_allclose(getattr(found, array), getattr(model, array), atol=step / 2 + 1e-6, rtol=0)
+    turned = 2 * np.arccos(np.minimum(1, np.abs(np.einsum("ij,ij->i", found.quats.astype(float), model.quats))))
+    assert np.degrees(turned.max()) < 0.3
+    csplat.write(tmp_path / f"again.{name}", found)
+    assert (tmp_path / name).read_bytes() == (tmp_path / f"again.{name}").read_bytes()
+
+
+def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
+    model = make_model(2, 1, sh0=np.array([[9, -9, 0]] * 2, "f4"), shN=np.full((2, 3, 3), [2, -2, 0.99], "f4"))
+    scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
+    model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
+    csplat.write(tmp_path / "a.spz", model)
+    found = csplat.read(tmp_path / "a.spz")
+    assert [-10, 5.9375, 0] == found.scales[0].tolist()
+    assert [0, 1] == found.opacities.tolist()
+    assert [127 / 128, -1, 127 / 128] == found.shN[0, 0].tolist()
+    np.testing.assert_allclose(found.sh0[0, :2], [0.5 / 0.15, -0.5 / 0.15], rtol=1e-6)
+
+
+def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_path, make_model):
+    def bits(reach, scale):
+        means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
+        csplat.write(tmp_path / "a.spz", make_model(10, 0, means=means, scales=np.full((10, 3), scale, "f4")))
+        found = csplat.read(tmp_path / "a.spz").means * [1, -1, -1]
+        number = fields(tmp_path / "a.spz")[3]
+        np.testing.assert_allclose(found, means, atol=2.0**-number / 2)
+        return number
+
+    assert [12, 12, 16, 11, 0, 14] == [
+        bits(*one) for one in [(1, 0), (2047, 0), (1, -7.5), (2049, 0), (8e6, 0), (500, -9)]
+    ]
+    with pytest.raises(InputError, match="positions reach 9e\\+06, and SPZ holds up to 8,388,607"):
+        bits(9e6, 0)
+    assert 12 == bits(0, 0)
+
+
+def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_model):
+    model = make_model(5, 3, means=np.arange(15, dtype="f4").reshape(5, 3))
+    csplat.write(tmp_path / "a.spz", model)
+    found = csplat.read(tmp_path / "a.spz")
+    assert (model.means * [1, -1, -1]).tolist() == found.means.tolist()
+    flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of y and z, in the order of the coefficients
+    np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)
+    csplat.write(tmp_path / "b.spz", make_model(5, 3, means=model.means, coordinate_system="RDF"))
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()

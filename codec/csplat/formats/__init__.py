@@ -43,6 +43,7 @@ _MODULES = (
     "csplat.formats.ply",
     "csplat.formats.own",
     "csplat.formats.spz",
+    "csplat.formats.spz4",
 )
 _registered: list[Format] = []
 

@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
+from csplat.model import UNSPECIFIED
+from csplat.turning import USUAL
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.options import ShDegree, command
 from csplat_tools.cli.parsing import parse_axes
@@ -121,6 +123,10 @@ def convert(
     out.findings(made.findings)
     if made.losses():
         note(f"lost on the way: {made.losses()}")
+    before, after = made.axes
+    if before != after:
+        said = f"{before} axes" if before != UNSPECIFIED else f"no axes, taken as {USUAL} (--axes says others)"
+        out.remark(f"turned to {after} axes, as {made.target_format} has them; the source has {said}")
     size = "a size that depends on the scene" if made.size_bytes is None else format_bytes(made.size_bytes)
     out.remark(
         f"{counted(made.count, 'splat')}: {made.source_format}, {format_bytes(made.source_bytes)}"

@@ -13,6 +13,7 @@ from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
+from csplat.turning import USUAL
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import SceneOverrides, findings_as_json
 from csplat_tools.files.filters import Filters
@@ -33,6 +34,7 @@ class Converted:
             where that cannot be said.
         lost: what the target has no place for.
         rounded: names of the arrays that the target rounds.
+        axes: before and after.
         findings: what was noticed in the source.
     """
 
@@ -44,6 +46,7 @@ class Converted:
     size_bytes: int | None
     lost: tuple[str, ...]
     rounded: tuple[str, ...]
+    axes: tuple[str, str]
     findings: tuple[Finding, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -57,6 +60,7 @@ class Converted:
             "size_bytes": self.size_bytes,
             "lost": list(self.lost),
             "rounded": list(self.rounded),
+            "axes": list(self.axes),
             "defects": findings_as_json(self.findings),
         }
 
@@ -102,14 +106,17 @@ def convert_file(
     with local_path(source) as local, open_scene(local, read_as) as opened:
         told = facts or SceneOverrides()
         scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
-        scene = (filters or Filters()).applied(scene)
+        before = scene.facts.coordinate_system
+        filters = _with_usual_axes(filters or Filters(), named(opened.format), writes)
+        scene = filters.applied(scene)
         lost = writes.losses(scene.facts)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
         )
         made = Converted(
             opened.format, writes.name, scene.count, scene.facts.sh_degree, size_of(local),
-            writes.expected_bytes(scene.facts, scene.count), lost, rounded, (),
+            writes.expected_bytes(scene.facts, scene.count), lost, rounded,
+            (before, writes.axes or scene.facts.coordinate_system), (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {made.losses()}")
@@ -134,6 +141,13 @@ def format_rows() -> list[tuple[str, ...]]:
         )
         for one in formats()
     ]
+
+
+def _with_usual_axes(filters: Filters, reads: Format, writes: Format) -> Filters:
+    """What comes from a format of fixed axes stands in a PLY and its kin as their programs expect it."""
+    if filters.to_axes is not None or not reads.axes or writes.axes or writes.name == "csplat":
+        return filters
+    return replace(filters, to_axes=USUAL)
 
 
 def _exactness(one: Format) -> str:
