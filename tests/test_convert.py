@@ -141,3 +141,14 @@ def test_info_and_lint_take_any_format(tmp_path, ply):
     assert 200 == json.loads(call("info", ply, "--json").stdout)["splats"]
     assert "nothing found" in call("lint", ply).stdout
     assert "E_INPUT" in call("info", ply, "--page", tmp_path / "p.html", status=1).stderr
+
+
+def test_what_has_fixed_axes_comes_back_as_it_went(tmp_path, ply):
+    there = json.loads(call("convert", ply, tmp_path / "a.spz", "--json").stdout)
+    back = json.loads(call("convert", tmp_path / "a.spz", tmp_path / "b.ply", "--json").stdout)
+    assert (["unspecified", "RUB"], ["RUB", "RDF"]) == (there["axes"], back["axes"])
+    source, found = read_ply(ply), read_ply(tmp_path / "b.ply")
+    assert np.allclose(source.means, found.means, atol=1e-3)
+    assert (np.abs(np.sum(source.quats * found.quats, axis=1)) > 0.999).all()
+    call("convert", tmp_path / "a.spz", tmp_path / "c.ply", "--to-axes", "RUB")
+    assert np.allclose(read_ply(tmp_path / "c.ply").means, source.means * [1, -1, -1], atol=1e-3)
