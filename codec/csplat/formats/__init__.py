@@ -44,6 +44,7 @@ _MODULES = (
     "csplat.formats.own",
     "csplat.formats.spz",
     "csplat.formats.spz4",
+    "csplat.formats.splat",
 )
 _registered: list[Format] = []
 
