@@ -457,7 +457,7 @@ def test_names_sog_in_a_zip_and_in_a_folder(tmp_path):
     folder.mkdir()
     (folder / "meta.json").write_text("{}")
     for path in (tmp_path / "scene.ply", folder):
-        with pytest.raises(InputError, match=r"is SOG, .* splat-transform"):
+        with pytest.raises(InputError, match=r"is SOG, .* `csplat convert`.*csplat\.read"):
             read_ply(path)
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "refuse_known",
     "refuse_packed_header",
     "unknown",
+    "zip_holds_meta",
 ]
 
 #: Bytes of the beginning of a file that `refuse_foreign` wants to see.
@@ -29,12 +30,12 @@ HEAD_SIZE = 512
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _CONVERT = "`csplat convert`, or take csplat.read, which reads it"
 _SPLAT_ROW_SIZE = 32
-_PACKED = ("gzip", "zip", "csplat", "compressed PLY")
+_PACKED = ("gzip", "zip", "csplat", "compressed PLY", "SOG")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
     ".spz": ("SPZ", _SPLAT_TRANSFORM),
-    ".sog": ("SOG", _SPLAT_TRANSFORM),
+    ".sog": ("SOG", _CONVERT),
     ".splat": (".splat", _SPLAT_TRANSFORM),
     ".ksplat": (".ksplat", _SPLAT_TRANSFORM),
     ".spx": (".spx", "gsbox"),
@@ -111,7 +112,7 @@ def refuse_folder(path: Path) -> None:
         InputError: always.
     """
     if (path / "meta.json").exists():
-        raise InputError(_refusal(path, "SOG", _SPLAT_TRANSFORM))
+        raise InputError(_refusal(path, "SOG", _CONVERT))
     raise InputError(f"{path.name} is a folder, wanted a PLY")
 
 
@@ -137,7 +138,7 @@ def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
             return _BY_SUFFIX[".spz"]
         return ("gzip", "gunzip")
     if head[:4] == b"PK\x03\x04":
-        return _BY_SUFFIX[".sog"] if _zip_holds_meta(path) else ("zip", "unzip")
+        return _BY_SUFFIX[".sog"] if zip_holds_meta(path) else ("zip", "unzip")
     if head[:4] == b"glTF":
         return _BY_SUFFIX[".glb"]
     if path.name == "meta.json":
@@ -152,7 +153,8 @@ def _inflated_head(head: bytes) -> bytes:
         return b""
 
 
-def _zip_holds_meta(path: Path) -> bool:
+def zip_holds_meta(path: Path) -> bool:
+    """Whether a zip is SOG; of a broken one its name says it."""
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.rsplit("/", 1)[-1] == "meta.json" for name in archive.namelist())
