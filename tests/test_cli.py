@@ -517,24 +517,16 @@ def test_a_csplat_is_not_encoded_and_a_ply_not_decoded(tmp_path, ply, csplat_fil
         assert "csplat encode" in refused(*words)
 
 
-@pytest.mark.parametrize(
-    ("name", "head"),
-    [
-        ("a.spz", gzip.compress(b"NGSP" + bytes(60))),
-        ("a.splat", bytes(320)),
-        ("a.compressed.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
-         b"property uint packed_position\nend_header\n" + bytes(4)),
-    ],
-)  # fmt: skip
-def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
-    path = tmp_path / name
-    path.write_bytes(head)
-    commands = [("encode", path, tmp_path / "out.csplat"), ("lint", path), ("info", path)]
-    for words in commands[: 2 if path.suffix == ".ply" else 3]:
+def test_formats_that_are_not_read_are_named_with_a_converter(tmp_path):
+    path = tmp_path / "a.lcc"
+    path.write_bytes(bytes(60))
+    for words in [("encode", path, tmp_path / "out.csplat"), ("lint", path), ("info", path)]:
         line = refused(*words)
-        assert line.startswith(f"error: {name} is ")
-        assert re.search("convert it to PLY first, with (splat-transform|`csplat convert`)", line)
+        assert line.startswith("error: a.lcc is LCC, which csplat does not read: convert it to PLY first, with splat-t")
         assert line.endswith("(E_INPUT)\n")
+    (tmp_path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(60)))
+    for words in [("decode", tmp_path / "a.spz", tmp_path / "out.ply"), ("verify", tmp_path / "a.spz")]:
+        assert "`csplat encode` makes a .csplat file" in refused(*words)
 
 
 @pytest.mark.parametrize(
@@ -543,7 +535,7 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, head):
         (("encode", "scene.ply", "out.ply"), "csplat encode scene.ply out.csplat"),
         (("encode", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
         (("encode", "scene.ply", "page.html"), "csplat export-html scene.ply page.html"),
-        (("encode", "scene.ply", "out.spz"), "csplat encode scene.ply out.csplat"),
+        (("encode", "scene.ply", "out.spz"), "csplat convert scene.ply out.spz"),
         (("decode", "scene.csplat", "out.csplat"), "csplat decode scene.csplat out.ply"),
         (("decode", "scene.ply", "out.csplat"), "csplat encode scene.ply out.csplat"),
         (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),

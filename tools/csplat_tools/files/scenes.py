@@ -89,6 +89,8 @@ def load_model(scene: SceneLike) -> LoadedModel:
 
 def size_of(path: Path) -> int:
     """Bytes of a file, or of all files of a folder."""
+    if path.name.lower() in ("meta.json", "lod-meta.json"):  # of SOG: what it names lies beside it
+        path = path.parent
     if not path.is_dir():
         return path.stat().st_size
     return sum(one.stat().st_size for one in path.rglob("*") if one.is_file())

@@ -285,7 +285,12 @@ def _refuse_others(name: str, data: bytes) -> None:
     if data[:4] in _PLY_MAGICS:
         raise InputError(f"{name} is a PLY, wanted a .csplat file: `csplat encode` makes one")
     if not data.startswith(MAGIC) and Path(name).suffix.lower() != ".csplat":
-        refuse_known(Path(name), data[:HEAD_SIZE])
+        try:
+            refuse_known(Path(name), data[:HEAD_SIZE])
+        except InputError:
+            raise InputError(
+                f"{name} is a scene in another format: `csplat encode` makes a .csplat file of it"
+            ) from None
 
 
 def _close(data: mmap) -> None:
