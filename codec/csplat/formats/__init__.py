@@ -21,7 +21,7 @@ from csplat.scene import Scene, scene_of
 
 __all__ = ["Format", "format_of", "formats", "named_by", "open_scene", "read", "register", "write", "write_scene"]
 
-_MODULES = tuple(f"csplat.formats.{name}" for name in ("ply", "own", "spz", "spz4", "splat"))
+_MODULES = tuple(f"csplat.formats.{name}" for name in ("ply", "own", "spz", "spz4", "splat", "ksplat"))
 _registered: list[Format] = []
 
 
