@@ -129,7 +129,8 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
         return ""
 
     assert not read(whole)
-    assert all(read(whole[:size]) for size in range(len(whole)))
+    assert all(read(whole[:size]) for size in range(0, len(whole), 3))
+    assert read(whole[:-1])
     for at in range(len(whole)):
         says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
         assert not says or ("a.spz" in says and "\n" not in says)

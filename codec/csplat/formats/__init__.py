@@ -45,6 +45,7 @@ _MODULES = (
     "csplat.formats.spz",
     "csplat.formats.spz4",
     "csplat.formats.splat",
+    "csplat.formats.ksplat",
     "csplat.formats.sog",
 )
 _registered: list[Format] = []
