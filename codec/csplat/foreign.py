@@ -27,8 +27,9 @@ __all__ = [
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_CONVERT = "`csplat convert`, or take csplat.read, which reads it"
 _SPLAT_ROW_SIZE = 32
-_PACKED = ("gzip", "zip", "csplat")
+_PACKED = ("gzip", "zip", "csplat", "glTF")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
@@ -38,8 +39,8 @@ _BY_SUFFIX = {
     ".ksplat": (".ksplat", _SPLAT_TRANSFORM),
     ".spx": (".spx", "gsbox"),
     ".lcc": ("LCC", _SPLAT_TRANSFORM),
-    ".glb": ("glTF", "gsbox"),
-    ".gltf": ("glTF", "gsbox"),
+    ".glb": ("glTF", _CONVERT),
+    ".gltf": ("glTF", _CONVERT),
     ".csplat": ("csplat", "`csplat decode`"),
 }
 

@@ -21,7 +21,7 @@ from csplat.scene import Scene, scene_of
 
 __all__ = ["Format", "format_of", "formats", "named_by", "open_scene", "read", "register", "write", "write_scene"]
 
-_MODULES = ("csplat.formats.ply", "csplat.formats.own")
+_MODULES = ("csplat.formats.ply", "csplat.formats.own", "csplat.formats.gltf")
 _registered: list[Format] = []
 
 
