@@ -8,7 +8,7 @@ import pytest
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import scene_of
-from csplat.turning import axes_rotation, in_axes, moved, scaled, turned
+from csplat.turning import axes_rotation, in_axes, moved, scaled, stretched, turned
 from csplat.upright import up_of
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -55,6 +55,18 @@ def test_shapes_and_colours_turn_with_their_places(make_model, matrix):
     assert np.abs(matrix @ covariances(model) @ matrix.T - covariances(after)).max() < 1e-6
     assert np.abs(colours(model, directions) - colours(after, directions @ matrix.T)).max() < 2e-6
     assert (model.scales[:, 2] == after.scales[:, 2]).all()  # of discs the third one means nothing
+
+
+@pytest.mark.parametrize("matrix", [ANY @ np.diag([0.5, 2.0, 1.0]), [[-3, 0, 0], [1, 1, 0], [0, 0, 2]], 2.0 * ANY])
+def test_any_linear_map_takes_shapes_along(make_model, matrix):
+    model = make_model(20, 1, origin=(1.0, 2.0, 3.0))
+    after = stretched(model, matrix)
+    assert (
+        np.abs(np.dot(matrix, covariances(model)).swapaxes(0, 1) @ np.transpose(matrix) - covariances(after)).max()
+        < 1e-6
+    )
+    world = np.dot(model.means + model.origin, np.transpose(matrix))
+    assert np.abs(world - after.means - after.origin).max() < 1e-5
 
 
 @pytest.mark.parametrize("degree", range(4))

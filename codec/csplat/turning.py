@@ -1,4 +1,4 @@
-"""The same scene in other coordinates: turned, mirrored, scaled, moved.
+"""The same scene in other coordinates: turned, mirrored, scaled, moved, stretched.
 
 A mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ does not tell M from -M, one of which is a rotation.
 Its colours follow by the parity of their SH bands. So axes of either handedness can be reached from any others.
@@ -20,7 +20,7 @@ from csplat.scene import Scene
 from csplat.training import VIEW
 from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 
-__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "turned"]
+__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "stretched", "turned"]
 
 F64 = NDArray[np.float64]
 _Rows = TypeVar("_Rows", F32, F64)
@@ -31,6 +31,7 @@ USUAL = "RDF"
 _ORTHOGONAL = 1e-6  # of the entries of M Mᵀ - 1
 _WHOLE = 1e-9  # entries of a computed rotation that are as near to a whole number are that number
 _DIRECTIONS = 40
+_EVEN = 1e-6  # lengths in three directions that differ by less are one: files have them in float32
 _ROWS = 1024  # that are in float64 at a time: they stay in the cache
 
 
@@ -137,6 +138,40 @@ def scaled(model: SplatModel, factor: float) -> SplatModel:
         )
 
 
+def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
+    """The same scene under any linear map: turned, and scaled in three directions, of which each may be another's.
+
+    Args:
+        model: the scene, or some of its splats; its colours turn. Where lengths change by direction, cameras are lost.
+        matrix: [3, 3], applied to columns, not flat.
+
+    Raises:
+        InputError: something leaves float32.
+    """
+    left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
+    model = turned(model, _snapped(left @ right))
+    factor = float(lengths.mean())
+    if np.ptp(lengths) < _EVEN * factor:
+        return model if abs(factor - 1.0) < _WHOLE else scaled(model, factor)
+    stretch: F64 = (left * lengths) @ left.T
+    x, y, z = (stretch @ model.origin).tolist()
+    doubles = None if model.means_double is None else _applied(stretch, model.means_double)
+    with np.errstate(over="ignore"):
+        root = stretch @ _matrices(model.quats) * np.exp(model.scales.astype(np.float64))[:, None]
+        turns, axes, _ = np.linalg.svd(root)
+        turns[:, :, 2] *= np.linalg.det(turns)[:, None]
+        return replace(
+            model,
+            means=_applied(stretch, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
+            quats=normalise_quats(_quat_of(turns)),
+            scales=np.log(np.maximum(axes, np.finfo(np.float32).tiny)).astype(np.float32),
+            origin=(x, y, z),
+            means_double=doubles,
+            cameras=None,
+            metadata={name: said for name, said in model.metadata.items() if name != VIEW},
+        )
+
+
 def moved(model: SplatModel, offset: Direction) -> SplatModel:
     """The same scene elsewhere: its origin moves, to which means and cameras are relative."""
     x, y, z = (a + b for a, b in zip(model.origin, offset, strict=True))
@@ -197,16 +232,24 @@ def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
 
 
 def _quat_of(matrix: F64) -> F64:
-    """The quaternion of a rotation: eigenvector of the largest eigenvalue (Bar-Itzhack 2000), defined at any angle."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix
-    lower = [
-        [a + e + i, 0, 0, 0],
-        [h - f, a - e - i, 0, 0],
-        [c - g, b + d, e - a - i, 0],
-        [d - b, c + g, f + h, i - a - e],
+    """Quaternions of rotations [..., 3, 3]: eigenvectors of largest eigenvalues (Bar-Itzhack 2000), at any angle."""
+    a, b, c, d, e, f, g, h, i = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 9), -1, 0)
+    lower = np.zeros((*matrix.shape[:-2], 4, 4))
+    entries = (a + e + i, h - f, a - e - i, c - g, b + d, e - a - i, d - b, c + g, f + h, i - a - e)
+    for row, column, entry in zip(*np.tril_indices(4), entries, strict=True):
+        lower[..., row, column] = entry
+    quats: F64 = np.linalg.eigh(lower)[1][..., 3]
+    return quats
+
+
+def _matrices(quats: F32) -> F64:
+    w, x, y, z = normalise_quats(quats).astype(np.float64).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
     ]
-    quat: F64 = np.linalg.eigh(np.array(lower))[1][:, 3]
-    return quat
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def _product(quat: F64) -> F64:

@@ -47,6 +47,7 @@ _MODULES = (
     "csplat.formats.splat",
     "csplat.formats.ksplat",
     "csplat.formats.sog",
+    "csplat.formats.gltf",
 )
 _registered: list[Format] = []
 
