@@ -106,7 +106,7 @@ def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, says):
 def test_names_that_no_format_has_are_refused(tmp_path, make_model):
     with pytest.raises(InputError, match=r"wanted one of .*\.ply"):
         csplat.write(tmp_path / "a.xyz", make_model(3, 0))
-    with pytest.raises(InputError, match="wanted one of ply"):
+    with pytest.raises(InputError, match=r"wanted one of .*\bply\b"):
         csplat.read(tmp_path, format="xyz")
     with pytest.raises(InputError, match="no scene"):
         csplat.read(tmp_path)

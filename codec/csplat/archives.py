@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["Archive", "read_archive"]
+__all__ = ["DAMAGED", "Archive", "read_archive"]
 
-# What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
-# sizes that no array has, OSError for places outside the file and broken bz2.
-_DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
+#: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
+#: sizes that no array has, OSError for places outside the file and broken bz2.
+DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
             SyntaxError, OSError, struct.error, tokenize.TokenError, lzma.LZMAError, zlib.error,
             zipfile.BadZipFile)  # fmt: skip
 
@@ -88,7 +88,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         try:
             with np.load(stream, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
-        except _DAMAGED as error:
+        except DAMAGED as error:
             nothing.refuse(error)
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray):  # NumPy gives the bytes of what is no array

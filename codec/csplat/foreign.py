@@ -21,25 +21,27 @@ __all__ = [
     "refuse_known",
     "refuse_packed_header",
     "unknown",
+    "zip_holds_meta",
 ]
 
 #: Bytes of the beginning of a file that `refuse_foreign` wants to see.
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_GSBOX = "gsbox"
+_CONVERT = "`csplat convert`, or take csplat.read, which reads it"
 _SPLAT_ROW_SIZE = 32
-_PACKED = ("gzip", "zip", "csplat")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
-    ".spz": ("SPZ", _SPLAT_TRANSFORM),
-    ".sog": ("SOG", _SPLAT_TRANSFORM),
-    ".splat": (".splat", _SPLAT_TRANSFORM),
-    ".ksplat": (".ksplat", _SPLAT_TRANSFORM),
-    ".spx": (".spx", "gsbox"),
+    ".spz": ("SPZ", _CONVERT),
+    ".sog": ("SOG", _CONVERT),
+    ".splat": (".splat", _CONVERT),
+    ".ksplat": (".ksplat", _CONVERT),
+    ".spx": (".spx", _GSBOX),
     ".lcc": ("LCC", _SPLAT_TRANSFORM),
-    ".glb": ("glTF", "gsbox"),
-    ".gltf": ("glTF", "gsbox"),
+    ".glb": ("glTF", _CONVERT),
+    ".gltf": ("glTF", _CONVERT),
     ".csplat": ("csplat", "`csplat decode`"),
 }
 
@@ -63,7 +65,7 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
     if size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
         raise InputError(
             f"{path.name} is not a PLY; its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that"
-            f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
+            f" of a .splat file: if it is one, convert it to PLY first, with `csplat convert --from splat`"
         )
     raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}; wanted one of Gaussian splats")
 
@@ -76,7 +78,7 @@ def unknown(path: Path, head: bytes) -> InputError:
         head: its first `HEAD_SIZE` bytes; none of a folder.
     """
     if path.is_dir():
-        return InputError(f"{path.name} is a folder, and no scene")
+        return InputError(f"{path} is a folder, and no scene")
     try:
         refuse_known(path, head)
     except InputError as error:
@@ -110,7 +112,7 @@ def refuse_folder(path: Path) -> None:
         InputError: always.
     """
     if (path / "meta.json").exists():
-        raise InputError(_refusal(path, "SOG", _SPLAT_TRANSFORM))
+        raise InputError(_refusal(path, "SOG", _CONVERT))
     raise InputError(f"{path.name} is a folder, wanted a PLY")
 
 
@@ -125,7 +127,7 @@ def refuse_packed_header(path: Path, header: bytes) -> None:
         InputError: it has packed positions.
     """
     if any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines()):
-        raise InputError(_refusal(path, "compressed PLY", _SPLAT_TRANSFORM))
+        raise InputError(_refusal(path, "compressed PLY", _CONVERT))
 
 
 def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
@@ -136,7 +138,7 @@ def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
             return _BY_SUFFIX[".spz"]
         return ("gzip", "gunzip")
     if head[:4] == b"PK\x03\x04":
-        return _BY_SUFFIX[".sog"] if _zip_holds_meta(path) else ("zip", "unzip")
+        return _BY_SUFFIX[".sog"] if zip_holds_meta(path) else ("zip", "unzip")
     if head[:4] == b"glTF":
         return _BY_SUFFIX[".glb"]
     if path.name == "meta.json":
@@ -151,7 +153,8 @@ def _inflated_head(head: bytes) -> bytes:
         return b""
 
 
-def _zip_holds_meta(path: Path) -> bool:
+def zip_holds_meta(path: Path) -> bool:
+    """Whether a zip is SOG; of a broken one its name says it."""
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.rsplit("/", 1)[-1] == "meta.json" for name in archive.namelist())
@@ -160,5 +163,5 @@ def _zip_holds_meta(path: Path) -> bool:
 
 
 def _refusal(path: Path, what: str, converter: str) -> str:
-    why = "not a plain PLY" if what in _PACKED else "which csplat does not read yet"
+    why = "which csplat does not read" if converter in (_SPLAT_TRANSFORM, _GSBOX) else "not a plain PLY"
     return f"{path.name} is {what}, {why}: convert it to PLY first, with {converter}"

@@ -17,6 +17,7 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
+_MODE = "SplatRenderMode:"  # as Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs)
 
 
 @dataclass
@@ -54,6 +55,9 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
             facts.metadata[TRAINING] = _training(comment).as_json()
         elif words[:2] == [_PREFIX, VIEW]:
             facts.metadata[VIEW] = _view(comment)
+        elif words[:1] == [_MODE] and words[1:] in (["default"], ["mip"], ["2dgs"]):
+            facts.antialiased |= words[1] == "mip"
+            facts.flat |= words[1] == "2dgs"
         elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
             others.append(comment)
     if others:

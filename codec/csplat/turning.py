@@ -20,14 +20,14 @@ from csplat.scene import Scene
 from csplat.training import VIEW
 from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 
-__all__ = ["axes_rotation", "in_axes", "moved", "scaled", "turned"]
+__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "turned"]
 
 F64 = NDArray[np.float64]
 _Rows = TypeVar("_Rows", F32, F64)
 
 _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
 #: What the axes of a scene are taken for that does not name them: those of its cameras' makers, COLMAP and OpenCV.
-_USUAL = "RDF"
+USUAL = "RDF"
 _ORTHOGONAL = 1e-6  # of the entries of M Mᵀ - 1
 _WHOLE = 1e-9  # entries of a computed rotation that are as near to a whole number are that number
 _DIRECTIONS = 40
@@ -148,7 +148,7 @@ def moved(model: SplatModel, offset: Direction) -> SplatModel:
 
 def _rotation_to(facts: SplatModel, axes: str) -> F64:
     known = facts.coordinate_system != UNSPECIFIED
-    matrix = axes_rotation(facts.coordinate_system if known else _USUAL, axes)
+    matrix = axes_rotation(facts.coordinate_system if known else USUAL, axes)
     up, wanted = up_of(facts.metadata), up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix

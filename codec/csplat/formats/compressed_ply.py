@@ -1,0 +1,291 @@
+"""PlayCanvas' compressed PLY: a PLY of packed words, each in the bounds of its 256 splats.
+
+Read in the sources of splat-transform (MIT), `decompress-ply.ts` and `compressed-chunk.ts`. Facts beyond the splats
+stand in the comments of its header, as those of a plain PLY do.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError, counted
+from csplat.files import atomic_writer
+from csplat.formats.format import Format
+from csplat.formats.packing import all_three, morton_order, smallest_three
+from csplat.model import F32, SplatModel
+from csplat.ply_comments import format_comments, parse_comments
+from csplat.scene import BLOCK, Scene
+
+__all__ = ["FORMAT"]
+
+U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
+
+_CHUNK = 256  # splats that share bounds
+_SH_C0 = 0.28209479177387814
+_LARGEST_LOG = 20.0  # log scales beyond are no splat's, and would take all steps of their chunk
+_MAX_HEADER_SIZE = 1 << 16
+_END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+_BOUNDS = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+_COLOUR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+_WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+
+
+@dataclass(frozen=True)
+class _Element:
+    """Rows of one kind: where they begin, how many there are and what they hold."""
+
+    offset: int
+    count: int
+    dtype: np.dtype[Any]
+
+    def read(self, path: Path, start: int, stop: int) -> NDArray[Any]:
+        with path.open("rb") as stream:
+            stream.seek(self.offset + start * self.dtype.itemsize)
+            rows = np.fromfile(stream, self.dtype, stop - start)
+        if len(rows) != stop - start:
+            raise InputError(f"{path.name} became shorter while it was read")
+        return rows
+
+
+def _is_compressed(path: Path, head: bytes) -> bool:
+    if head[:3] != b"ply" or head[3:4] not in (b"\n", b"\r"):
+        return False
+    if b"end_header" not in head:  # the words come after bounds and comments
+        with path.open("rb") as stream:
+            head = stream.read(_MAX_HEADER_SIZE)
+    return b"packed_position" in head.partition(b"end_header")[0]
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Scene]:
+    elements, comments = _header(path)
+    chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
+    if chunk is None or vertex is None:
+        raise InputError(f"{path.name} has no element {'chunk' if chunk is None else 'vertex'}: no compressed PLY")
+    _check_columns(path, "vertex", vertex, _WORDS, "<u4")
+    coloured = "min_r" in (chunk.dtype.names or ())
+    names = _BOUNDS + (_COLOUR_BOUNDS if coloured else [])
+    _check_columns(path, "chunk", chunk, names, "<f4")
+    if chunk.count != -(-vertex.count // _CHUNK):
+        raise InputError(
+            f"{path.name}: {counted(chunk.count, 'chunk')} for {counted(vertex.count, 'splat')},"
+            f" wanted one for each {_CHUNK}"
+        )
+    rest = 0
+    if sh is not None:
+        rest = len(sh.dtype.names or ())
+        if sh.count != vertex.count or rest not in (9, 24, 45):
+            raise InputError(
+                f"{path.name}: {counted(sh.count, 'row')} of {rest} SH coefficients for"
+                f" {counted(vertex.count, 'splat')}, wanted as many, of 9, 24 or 45"
+            )
+        _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
+    table = chunk.read(path, 0, chunk.count)
+    bounds = np.stack([table[name] for name in names], 1).astype(np.float64).reshape(chunk.count, len(names) // 6, 2, 3)
+    bad = np.argwhere(~np.isfinite(bounds))
+    if len(bad):
+        row, kind, end, axis = bad[0]
+        raise InputError(f"{path.name}: chunk {row} has no finite {names[kind * 6 + end * 3 + axis]}")
+    try:
+        said = parse_comments(comments)
+        facts = SplatModel(
+            **_unpacked(np.zeros(0, vertex.dtype), bounds[:0], None, rest),
+            origin=said.origin or (0.0, 0.0, 0.0),
+            coordinate_system=said.coordinate_system,
+            unit_metres=said.unit_metres,
+            antialiased=said.antialiased,
+            flat=said.flat,
+            metadata=said.metadata,
+        )
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+
+    def blocks() -> Iterator[SplatModel]:
+        for start in range(0, vertex.count, BLOCK):
+            stop = min(start + BLOCK, vertex.count)
+            coefficients = None if sh is None else sh.read(path, start, stop)
+            words = vertex.read(path, start, stop)
+            own = bounds[start // _CHUNK : -(-stop // _CHUNK)]
+            yield replace(facts, **_unpacked(words, own, coefficients, rest))
+
+    yield Scene(vertex.count, facts, blocks)
+
+
+def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:
+    """The elements, whose rows are all there, and the comments."""
+    with path.open("rb") as stream:
+        start = stream.read(_MAX_HEADER_SIZE)
+    end = _END_OF_HEADER.search(start)
+    if not start.startswith(b"ply") or end is None:
+        raise InputError(f"{path.name}: the PLY header has no line end_header")
+    lines = [line.strip() for line in start[: end.start()].decode("ascii", "replace").splitlines()]
+    found: list[tuple[str, int, list[tuple[str, str]]]] = []
+    comments, form = [], ""
+    for line in lines[1:]:
+        words = line.split()
+        if words[:1] == ["comment"]:
+            comments.append(line[len("comment ") :])
+        elif words[:1] == ["format"]:
+            form = " ".join(words[1:])
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+            found.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and found:
+            found[-1][2].append((words[2], _TYPES[words[1]]))
+        elif words and words[0] != "obj_info":
+            raise InputError(f"{path.name}: the header line {line[:80]!r} is none of a compressed PLY")
+    if form != "binary_little_endian 1.0":
+        raise InputError(f"{path.name}: the format is {form[:40]!r}, wanted binary_little_endian 1.0")
+    elements: dict[str, _Element] = {}
+    offset, size = end.end(), path.stat().st_size
+    for name, count, columns in found:
+        if len({column for column, _ in columns}) != len(columns) or name in elements:
+            raise InputError(f"{path.name}: the header says something of {name} twice")
+        elements[name] = _Element(offset, count, np.dtype(columns))
+        offset += count * elements[name].dtype.itemsize
+    if offset > size:
+        raise InputError(f"{path.name}: {size:,} bytes, its header declares {offset:,}: copy or download it again")
+    return elements, comments
+
+
+def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
+    fields: Mapping[str, Any] = element.dtype.fields or {}
+    for column in wanted:
+        if column not in fields or fields[column][0] != np.dtype(kind):
+            raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: no compressed PLY")
+
+
+def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, rest: int) -> dict[str, Any]:
+    """The arrays of a model of packed words, the bounds of their chunks [C, 2 or 3, 2, 3], and the rows of SH."""
+    count = len(words)
+
+    def placed(parts: NDArray[np.float64], kind: int) -> NDArray[np.float64]:
+        low, high = (np.repeat(bounds[:, kind, end], _CHUNK, 0)[:count] for end in (0, 1))
+        placed: NDArray[np.float64] = low * (1.0 - parts) + high * parts
+        return placed
+
+    rotation, colour = (words[name] for name in ("packed_rotation", "packed_color"))
+    three = np.stack([(rotation >> shift & 1023) for shift in (20, 10, 0)], 1).astype(np.float32)
+    channels = np.stack([colour >> shift & 255 for shift in (24, 16, 8)], 1) / 255.0
+    if bounds.shape[1] == 3:
+        channels = placed(channels, 2)
+    shN = np.zeros((count, rest // 3, 3), np.float32)
+    if sh is not None:
+        codes = sh.view(np.uint8).reshape(count, rest)  # bytes only, none between them
+        names = sh.dtype.names or ()
+        places = [names.index(f"f_rest_{index}") for index in range(rest)]
+        shN = _sh_values()[codes[:, places].reshape(count, 3, -1).transpose(0, 2, 1)]
+    return {
+        "means": placed(_thirds(words["packed_position"]), 0).astype(np.float32),
+        "scales": placed(_thirds(words["packed_scale"]), 1).astype(np.float32),
+        "quats": all_three(rotation >> 30, (three / np.float32(1023) - np.float32(0.5)) * np.float32(2**0.5)),
+        "opacities": ((colour & 255) / 255.0).astype(np.float32),
+        "sh0": ((channels - 0.5) / _SH_C0).astype(np.float32),
+        "shN": np.ascontiguousarray(shN),
+    }
+
+
+def _thirds(words: U32) -> NDArray[np.float64]:
+    return np.stack([(words >> 21) / 2047.0, (words >> 11 & 1023) / 1023.0, (words & 2047) / 2047.0], 1)
+
+
+def _sh_values() -> F32:
+    values = (np.arange(256) + 0.5) / 32.0 - 4.0
+    values[[0, -1]] = -4.0, 4.0
+    return values.astype(np.float32)
+
+
+def _write(path: Path, scene: Scene) -> None:
+    """Write all of a scene along a Z curve. 41 bytes of a splat are kept, one more for each coefficient of SH."""
+    rest = 3 * scene.facts.shN.shape[1]
+    parts = [_kept(model) for model in scene.blocks()] or [_kept(scene.facts)]
+    means, scales, colours, rotation, alpha, sh = (np.concatenate(one) for one in zip(*parts, strict=True))
+    del parts
+    order = morton_order(means)
+    words = np.empty((len(order), 4), "<u4")
+    words[:, 1] = rotation[order]
+    bounds = []
+    for column, values, bits in ((0, means, (11, 10, 11)), (2, scales, (11, 10, 11)), (3, colours, (8, 8, 8))):
+        words[:, column], low, high = _packed(values[order], bits)
+        bounds += [low, high]
+    words[:, 3] |= alpha[order]
+    with atomic_writer(path) as stream:
+        stream.write(_written_header(scene.facts, len(order), rest))
+        stream.write(np.concatenate(bounds, 1).astype("<f4").tobytes())
+        stream.write(words.tobytes())
+        for start in range(0, len(order) if rest else 0, BLOCK):
+            stream.write(sh[order[start : start + BLOCK]].tobytes())
+
+
+def _kept(model: SplatModel) -> tuple[F32, F32, F32, U32, U32, U8]:
+    """What is wanted of a block: float32 means, log scales and colours, packed rotations and alphas, bytes of SH."""
+    largest, three = smallest_three(model.quats)
+    steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.uint32)
+    rotation = largest.astype(np.uint32) << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    sh = np.clip(np.floor(model.shN.transpose(0, 2, 1) * np.float32(32) + np.float32(128)), 0, 255).astype(np.uint8)
+    return (
+        model.means,
+        np.clip(model.scales, -_LARGEST_LOG, _LARGEST_LOG),
+        (model.sh0 * _SH_C0 + 0.5).astype(np.float32),
+        rotation,
+        np.rint(model.opacities * np.float32(255)).astype(np.uint32),
+        sh.reshape(len(model), 3 * model.shN.shape[1]),
+    )
+
+
+def _packed(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
+    """Pack three columns into the upper bits of words. Also the least and the largest of each chunk, [C, 3]."""
+    count = len(values)
+    if not count:
+        return np.zeros(0, np.uint32), values, values
+    starts = np.arange(0, count, _CHUNK)
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    span = (high.astype(np.float64) - low).clip(min=np.finfo(np.float32).tiny)
+    words, shift = np.zeros(count, np.uint32), 32
+    for axis, width in enumerate(bits):
+        scale = ((1 << width) - 1) / span[:, axis]
+        share = (values[:, axis] - np.repeat(low[:, axis].astype(np.float64), _CHUNK)[:count]) * np.repeat(
+            scale, _CHUNK
+        )[:count]
+        shift -= width
+        words |= np.rint(share).astype(np.uint32) << np.uint32(shift)
+    return words, low, high
+
+
+def _written_header(facts: SplatModel, count: int, rest: int) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in format_comments(facts, absolute=False)),
+    ]
+    if facts.antialiased or facts.flat:
+        lines.append(f"comment SplatRenderMode: {'mip' if facts.antialiased else '2dgs'}")
+    lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _WORDS)]
+    if rest:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+
+
+FORMAT = Format(
+    name="compressed-ply",
+    title="compressed PLY",
+    suffixes=(".compressed.ply",),
+    sniff=_is_compressed,
+    open=_open,
+    write=_write,
+    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
+)

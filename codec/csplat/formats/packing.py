@@ -1,0 +1,69 @@
+"""What formats that pack splats do alike: rotations as three numbers, an order in which neighbours stay together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.morton import morton_codes
+from csplat.model import F32, normalise_quats
+
+__all__ = ["all_three", "morton_order", "smallest_three"]
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def smallest_three(quats: F32) -> tuple[NDArray[np.int64], F32]:
+    """Leave out the largest component of each rotation, made positive: the others say it.
+
+    Args:
+        quats: [N, 4], unit.
+
+    Returns:
+        Which one is left out [N], 0 to 3, of equal ones the first; and the others [N, 3] in their order, within
+        ± 1 / sqrt(2).
+    """
+    largest = np.argmax(np.abs(quats), 1)
+    rows = np.arange(len(quats))
+    sign = np.where(quats[rows, largest] < 0, np.float32(-1), np.float32(1))
+    return largest, quats[rows[:, None], _OTHERS[largest]] * sign[:, None]
+
+
+def all_three(largest: NDArray[Any], three: F32) -> F32:
+    """The rotations of `smallest_three`; numbers that leave no room for a largest one are scaled.
+
+    Args:
+        largest: [N], 0 to 3.
+        three: [N, 3] float32, within ± 1.
+
+    Returns:
+        [N, 4] float32, unit.
+    """
+    quats = np.empty((len(three), 4), np.float32)
+    left = 1.0 - np.einsum("nd,nd->n", three, three)
+    np.sqrt(np.maximum(left, 0.0, out=left), out=left)
+    for index, others in enumerate(_OTHERS):
+        here = np.flatnonzero(largest == index)
+        quats[here[:, None], others] = three[here]
+        quats[here, index] = left[here]
+    return normalise_quats(quats)
+
+
+def morton_order(means: F32) -> NDArray[np.int64]:
+    """The rows along a Z curve through the box of all.
+
+    Args:
+        means: [N, 3].
+
+    Returns:
+        [N]; equal places in their old order.
+    """
+    if not len(means):
+        return np.zeros(0, np.int64)
+    low = means.min(0).astype(np.float64)
+    span = means.max(0) - low
+    span[span == 0] = 1.0
+    steps = np.minimum((means - low) / span * (1 << 21), (1 << 21) - 1)  # of equal parts, as splat-transform has them
+    return np.argsort(morton_codes(steps.astype(np.int64).T), kind="stable")

@@ -1,0 +1,199 @@
+"""Where the parts of a SOG lie, in a folder or in a zip, and what its JSON says; neither is trusted."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.archives import DAMAGED
+from csplat.errors import InputError, missing
+
+__all__ = ["Json", "Parts", "parts_at", "picture_of"]
+
+_LARGEST_JSON = 1 << 25
+_LARGEST_PART = 1 << 30
+_LONGEST_NAME = 200
+_EXPANSION = 4  # of a part in a zip: pictures and short texts do not deflate to less
+_FREE = 1 << 20  # bytes that may come out of a zip whatever is in it
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of one SOG, by name.
+
+    Attributes:
+        path: the folder, or the zip.
+        title: for messages.
+        folder: inside of the zip; `None`: there is none.
+    """
+
+    path: Path
+    title: str
+    folder: PurePosixPath | None = None
+
+    def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
+        """The bytes of a part.
+
+        Raises:
+            InputError: it is not there, too large, damaged, or its name leads out of the folder.
+            OSError: it cannot be read.
+        """
+        if self.folder is not None:
+            return self._unzipped(str(self.folder / self._inside(name)), most)
+        with self.file(name).open("rb") as stream:
+            data = stream.read(most + 1)
+        if len(data) > most:
+            self.refuse(f"{name[:80]} has more than {most:,} bytes")
+        return data
+
+    def file(self, name: str) -> Path:
+        """Where a part of a folder is; the rest as `read`."""
+        path = self.path / self._inside(name)
+        if self.folder is not None or not path.is_file():
+            self.refuse(f"there is no {name[:80]}")
+        return path
+
+    def _inside(self, name: str) -> PurePosixPath:
+        place = PurePosixPath(name)
+        if place.is_absolute() or ".." in place.parts or "\\" in name or "\0" in name or len(name) > _LONGEST_NAME:
+            self.refuse(f"the part {name[:80]!r} would lie outside of it")
+        return place
+
+    def _unzipped(self, name: str, most: int) -> bytes:
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                info = archive.getinfo(name)
+                if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
+                    self.refuse(f"{name} of {info.compress_size:,} bytes says that {info.file_size:,} come out of it")
+                return archive.read(info)
+        except KeyError:
+            self.refuse(f"there is no {name[:80]}")
+        except DAMAGED as error:
+            self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
+
+    def json(self, name: str) -> Json:
+        """What a part of JSON says."""
+        data = self.read(name, _LARGEST_JSON)
+        try:
+            value = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            reason = "too many brackets" if isinstance(error, RecursionError) else " ".join(str(error).split())[:80]
+            self.refuse(f"{name[:80]} is not JSON: {reason}")
+        return Json(self, name, value)
+
+    def refuse(self, reason: str) -> NoReturn:
+        """Raise the `InputError` that says what is wrong with it."""
+        raise InputError(f"{self.title}: {reason}")
+
+
+@dataclass(frozen=True)
+class Json:
+    """A value of JSON and where it stands; asked for what it is not, it is an `InputError`."""
+
+    parts: Parts
+    place: str
+    value: Any
+
+    def __contains__(self, name: str) -> bool:
+        return isinstance(self.value, dict) and self.value.get(name) is not None
+
+    def __getitem__(self, name: str) -> Json:
+        inside = Json(self.parts, f"{self.place} {name}", None)
+        if name not in self:
+            self.parts.refuse(f"{inside.place} is missing")
+        return Json(self.parts, inside.place, self.value[name])
+
+    def list(self) -> list[Json]:
+        """Its values."""
+        if not isinstance(self.value, list):
+            self.parts.refuse(f"{self.place} is no list")
+        return [Json(self.parts, self.place, one) for one in self.value]
+
+    def text(self) -> str:
+        """A string."""
+        if not isinstance(self.value, str):
+            self.parts.refuse(f"{self.place} is no text")
+        return self.value
+
+    def whole(self, most: int) -> int:
+        """An integer from 0 to `most`."""
+        if type(self.value) is not int or not 0 <= self.value <= most:
+            self.parts.refuse(f"{self.place} is {str(self.value)[:40]}, wanted an integer from 0 to {most:,}")
+        return int(self.value)
+
+    def numbers(self, least: int, most: int) -> NDArray[np.float64]:
+        """So many finite numbers; one alone may stand without brackets."""
+        values = self.value if isinstance(self.value, list) else [self.value]
+        if not least <= len(values) <= most:
+            self.parts.refuse(f"{self.place} has {len(values)} numbers, wanted {least if least == most else most}")
+        for one in values:
+            if type(one) not in (int, float) or not abs(one) <= 1e30 or not math.isfinite(one):
+                self.parts.refuse(f"{self.place} holds {str(one)[:40]}, wanted finite numbers")
+        return np.array(values, np.float64)
+
+
+def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
+    """The parts of a SOG, and the name of the one that says what the others are.
+
+    Args:
+        path: of a folder, of a zip, or of the meta.json of a folder.
+        title: for messages; `None`: the name of the path.
+
+    Raises:
+        InputError: there are no such parts.
+        OSError: it cannot be read.
+    """
+    title = title or path.name
+    if path.is_dir():
+        names = [name for name in ("meta.json", "lod-meta.json") if (path / name).is_file()]
+        if not names:
+            Parts(path, title).refuse("a folder without meta.json, no SOG")
+        return Parts(path, title), names[0]
+    with path.open("rb") as stream:
+        zipped = stream.read(2) == b"PK"
+    if not zipped:
+        return Parts(path.parent, title), path.name
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if PurePosixPath(name).name == "meta.json"]
+    except DAMAGED as error:
+        Parts(path, title).refuse(f"a damaged zip: {' '.join(str(error).split())[:120] or type(error).__name__}")
+    if not names:
+        Parts(path, title).refuse("a zip without meta.json, no SOG")
+    return Parts(path, title, PurePosixPath(min(names, key=len)).parent), "meta.json"
+
+
+def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:
+    """The pixels of a WebP, [H, W, 4].
+
+    Args:
+        parts: where it is from.
+        name: of the part, for messages.
+        data: its bytes.
+        fits: is asked whether width and height are wanted, before there are pixels.
+
+    Raises:
+        InputError: it is damaged or of another size; or Pillow is absent.
+    """
+    try:
+        from PIL import Image
+    except ModuleNotFoundError as error:
+        raise missing(error, "Pillow") from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is looked at here
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                if not fits(*image.size):
+                    parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which is not what was declared")
+                return np.asarray(image.convert("RGBA"))
+    except (*DAMAGED, Image.DecompressionBombError) as error:
+        parts.refuse(f"{name} is no whole WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")

@@ -1,0 +1,139 @@
+"""PlayCanvas' compressed PLY: files that are built here word by word, and what goes there and back."""
+
+import struct
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import format_of, named_by, open_scene
+from csplat.ply import read_ply
+from csplat.scene import BLOCK
+
+BOUNDS = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z max_scale_x max_scale_y max_scale_z"
+COLOURS = "min_r min_g min_b max_r max_g max_b"
+WORDS = "packed_position packed_rotation packed_scale packed_color"
+
+
+def built(bounds, words, sh=(), *, comments=(), chunk_count=None, colours=True, rest=9):
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {one}" for one in comments)]
+    lines += [f"element chunk {len(bounds) if chunk_count is None else chunk_count}"]
+    lines += [f"property float {name}" for name in f"{BOUNDS} {COLOURS if colours else ''}".split()]
+    lines += [f"element vertex {len(words)}", *(f"property uint {name}" for name in WORDS.split())]
+    if len(sh):
+        lines += [f"element sh {len(sh)}", *(f"property uchar f_rest_{index}" for index in range(rest))]
+    header = "\n".join([*lines, "end_header\n"]).encode()
+    return header + b"".join(struct.pack(f"<{len(row)}f", *row) for row in bounds) + (
+        b"".join(struct.pack("<4I", *row) for row in words) + b"".join(map(bytes, sh))
+    )  # fmt: skip
+
+
+ROW = [0, 10, -1, 4, 10, 1, -8, -7, -6, -4, -3, -2, 0.5, 0, 0, 1.5, 1, 1]
+# Of the largest component the index, then three of ten bits; 511.5 would be 0.
+WORD = (2047 << 21 | 1023 << 11 | 0, 1 << 30 | 1023 << 20 | 511 << 10 | 512, 0, 255 << 24 | 0 << 16 | 255 << 8 | 51)
+SMALL = built([ROW], [WORD, (0, 0, 0xFFFFFFFF, 0)], [[0, 255, 128, *range(3, 9)], range(9)], comments=["made by hand"])
+
+
+def test_words_mean_what_they_say(tmp_path):
+    (tmp_path / "a.ply").write_bytes(SMALL)
+    model = csplat.read(tmp_path / "a.ply")
+    assert [[4, 10, -1], [0, 10, -1]] == model.means.tolist()
+    assert [[-8, -7, -6], [-4, -3, -2]] == model.scales.tolist()
+    assert np.array([0.2, 0.0], np.float32).tolist() == model.opacities.tolist()
+    np.testing.assert_allclose(model.sh0[0] * 0.28209479 + 0.5, [1.5, 0, 1], atol=1e-6)
+    half = 0.5 / 1023 * 2**0.5
+    np.testing.assert_allclose(model.quats[0], [2**-0.5, (0.5 - 2 * half**2) ** 0.5, -half, half], atol=1e-6)
+    assert [-4, 4, 0.5 / 32] == model.shN[0, :, 0].tolist()
+    assert [(index + 0.5) / 32 - 4 for index in (3, 6)] == model.shN[0, 0, 1:].tolist()
+    assert {"comments": ["made by hand"]} == model.metadata
+
+
+def test_files_of_old_have_no_bounds_of_colour(tmp_path):
+    (tmp_path / "a.ply").write_bytes(built([ROW[:12]], [WORD], colours=False))
+    np.testing.assert_allclose(csplat.read(tmp_path / "a.ply").sh0[0] * 0.28209479 + 0.5, [1, 0, 1], atol=1e-6)
+
+
+def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
+    model = make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
+    csplat.write(tmp_path / "a.compressed.ply", model)
+    back = csplat.read(tmp_path / "a.compressed.ply")
+    assert (True, (1.0, 2.0, 3.0), {"licence": "CC0"}) == (back.antialiased, back.origin, back.metadata)
+    # Splats change places; the nearest mean tells which is which.
+    rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
+    assert 700 == len(set(rows))
+    for name, error in (("means", 0.006), ("scales", 0.006), ("opacities", 0.002), ("sh0", 0.03), ("shN", 0.0157)):
+        wanted = getattr(model, name)[rows].clip(-4 if name == "shN" else None, 4)
+        assert np.abs(wanted - getattr(back, name)).max() < error
+    assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 5e-6
+
+
+def test_blocks_are_of_whole_chunks(tmp_path, make_model):
+    model = make_model(300, 1)
+    large = model.select(np.arange(BLOCK + 300) % 300)
+    csplat.write(tmp_path / "a.compressed.ply", large)
+    with open_scene(tmp_path / "a.compressed.ply") as scene:
+        assert [BLOCK, 300] == [len(one) for one in scene.blocks()]
+        assert np.abs(np.sort(large.means[:, 0]) - np.sort(scene.model().means[:, 0])).max() < 0.01
+
+
+def test_no_splats_are_a_scene(tmp_path, make_model):
+    csplat.write(tmp_path / "a.compressed.ply", make_model(0, 2))
+    assert (0, 2) == (
+        len(csplat.read(tmp_path / "a.compressed.ply")),
+        csplat.read(tmp_path / "a.compressed.ply").sh_degree,
+    )
+
+
+def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
+    (tmp_path / "a.ply").write_bytes(SMALL)
+    assert "compressed-ply" == format_of(tmp_path / "a.ply").name == named_by(tmp_path / "b.Compressed.ply").name
+    assert "ply" == named_by(tmp_path / "b.ply").name
+    with pytest.raises(InputError, match=r"a\.ply is compressed PLY.*csplat convert.*csplat\.read"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (SMALL[:-1], "copy or download it again"),
+        (SMALL.replace(b"vertex 2", b"vertex 2000000000"), "copy or download it again"),
+        (SMALL.replace(b"vertex 2", b"vertex " + b"9" * 30), "header line"),
+        (SMALL.replace(b"vertex 2", b"vertex -2"), "header line"),
+        (built([ROW, ROW], [WORD]), "2 chunks for 1 splat,"),
+        (SMALL.replace(b"element sh 2", b"element sh 1"), "1 row of 9 SH"),
+        (SMALL.replace(b"property uchar f_rest_8\n", b""), "8 SH coefficients"),
+        (SMALL.replace(b"min_scale_x", b"min_scale_q"), "no float32 min_scale_x"),
+        (SMALL.replace(b"uint packed_scale", b"int packed_scale"), "no uint32 packed_scale"),
+        (SMALL.replace(b"packed_color", b"packed_scale"), "twice"),
+        (SMALL.replace(b"little", b"big"), "wanted binary_little_endian"),
+        (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
+        (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "chunk 0 has no finite max_y"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path, data, says):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(InputError, match=says):
+        csplat.read(tmp_path / "a.ply", "compressed-ply")
+
+
+def test_damage_is_refused_or_read(tmp_path):
+    path = tmp_path / "a.ply"
+    damaged = [SMALL[:size] for size in range(0, len(SMALL), 7)]
+    for place in range(len(SMALL)):
+        data = bytearray(SMALL)
+        data[place] ^= 1 << place % 8
+        damaged.append(data)
+    messages = []
+    for data in damaged:
+        path.write_bytes(data)
+        try:
+            csplat.read(path, "compressed-ply")
+        except InputError as error:
+            messages.append(str(error))
+    assert len(messages) > 500
+    assert all(one.startswith("a.ply") for one in messages)
+
+
+def test_real_files_are_read(data_dir):
+    assert 90_854 == len(csplat.read(data_dir / "other" / "guitar.compressed.ply"))

@@ -1,0 +1,274 @@
+"""SOG, versions 1 and 2, in folders, zips and levels: files that are built here byte by byte, and what is written."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import format_of, open_scene
+
+Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
+
+COUNT = 5
+
+
+def webp(pixels):
+    buffer = io.BytesIO()
+    Image.fromarray(pixels, "RGBA" if pixels.shape[2] == 4 else "RGB").save(buffer, "WEBP", lossless=True, exact=True)
+    return buffer.getvalue()
+
+
+def pixels(seed, shape=(4, 4)):
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 4), np.uint8)
+
+
+def splats(version=2, sh=True):
+    """The parts of a SOG of five splats."""
+    names = ("means_l", "means_u", "quats", "scales", "sh0")
+    pictures = {f"{name}.webp": pixels(seed) for seed, name in enumerate(names)}
+    pictures["quats.webp"][..., 3] = 252 + np.arange(16).reshape(4, 4) % 4
+    meta = {
+        "means": {"mins": [-1, 0, 2.5], "maxs": [1, 0, 3], "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"files": ["sh0.webp"]},
+    }
+    if version == 2:
+        meta |= {"version": 2, "count": COUNT, "model": "antialiased"}
+        meta["scales"]["codebook"] = [index / 16 - 12 for index in range(256)]
+        meta["sh0"]["codebook"] = [index / 64 - 2 for index in range(256)]
+    else:
+        meta["means"]["shape"] = [COUNT, 3]
+        meta["scales"] |= {"mins": [-9, -8, -7], "maxs": [-3, -2, -1]}
+        meta["sh0"] |= {"mins": [-2, -1, 0, -5], "maxs": [2, 1, 3, 5]}
+    if sh:
+        pictures["palette.webp"] = pixels(7, (1, 192))
+        pictures["labels.webp"] = pixels(8)
+        pictures["labels.webp"][..., :2] = [63, 0]
+        meta["shN"] = {"files": ["palette.webp", "labels.webp"]}
+        if version == 2:
+            meta["shN"] |= {"count": 64, "bands": 1, "codebook": [index / 128 - 1 for index in range(256)]}
+        else:
+            meta["shN"] |= {"mins": -0.5, "maxs": 0.5}
+    return meta, pictures
+
+
+def files_of(meta, pictures):
+    return {"meta.json": json.dumps(meta).encode(), **{name: webp(one) for name, one in pictures.items()}}
+
+
+def zipped(path, files, folder="", how=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", how) as archive:
+        for name, data in files.items():
+            archive.writestr(folder + name, data)
+    return path
+
+
+def foldered(path, files):
+    for name, data in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(data)
+    return path
+
+
+def means_of(pictures):
+    low, high = (pictures[f"means_{end}.webp"].reshape(-1, 4)[:COUNT, :3].astype(float) for end in "lu")
+    logs = [-1, 0, 2.5] + (low + 256 * high) / 65535 * [2, 0, 0.5]
+    return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
+
+
+def test_version_2_means_what_it_says(tmp_path):
+    meta, pictures = splats()
+    model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
+    flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
+    np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(model.scales, flat["scales.webp"][:, :3] / 16 - 12)
+    np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 64 - 2)
+    np.testing.assert_allclose(model.opacities, flat["sh0.webp"][:, 3] / 255, rtol=1e-6)
+    np.testing.assert_allclose(model.shN[0], pictures["palette.webp"][0, -3:, :3] / 128 - 1)
+    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # of splat 1 x is left out
+    quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
+    np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
+    assert model.antialiased
+    assert not model.flat
+
+
+def test_version_1_means_what_it_says(tmp_path):
+    meta, pictures = splats(1)
+    model = csplat.read(foldered(tmp_path / "a", files_of(meta, pictures)))
+    flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
+    np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(model.scales, flat["scales.webp"][:, :3] / 255 * 6 + [-9, -8, -7], rtol=1e-6)
+    np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 255 * [4, 2, 3] - [2, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(model.opacities, 1 / (1 + np.exp(5 - flat["sh0.webp"][:, 3] / 25.5)), rtol=1e-5)
+    np.testing.assert_allclose(model.shN[4], pictures["palette.webp"][0, -3:, :3] / 255 - 0.5, atol=1e-6)
+
+
+def test_folder_json_and_zip_are_the_same_scene(tmp_path):
+    files = files_of(*splats())
+    folder = foldered(tmp_path / "a", files)
+    paths = [folder, folder / "meta.json", zipped(tmp_path / "b", files, "inside/", zipfile.ZIP_DEFLATED)]
+    models = [csplat.read(path) for path in paths]
+    assert ["sog"] * 3 == [format_of(path).name for path in paths]
+    assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
+
+
+def test_rotations_without_a_tag_are_none_and_said(tmp_path):
+    meta, pictures = splats()
+    pictures["quats.webp"][0, 0, 3] = 17
+    with open_scene(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
+        assert [1, 0, 0, 0] == scene.model().quats[0].tolist()
+        assert [("zero-quats", 1)] == [(one.id, one.count) for one in scene.findings]
+
+
+def test_the_first_entry_that_early_writers_lost_continues_the_others(tmp_path):
+    meta, pictures = splats(sh=False)
+    meta["scales"]["codebook"][0] = None
+    pictures["scales.webp"][:] = 0
+    model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
+    np.testing.assert_allclose(model.scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)
+
+
+def levels(tmp_path, **changes):
+    """Streamed SOG: two files of the finest level, a coarser one, surroundings."""
+    files = {}
+    for number, name in enumerate(("0_0", "0_1", "1_0", "env")):
+        meta, pictures = splats(sh=number == 1)
+        meta["sh0"]["codebook"] = [float(number)] * 256
+        files |= {f"{name}/{part}": data for part, data in files_of(meta, pictures).items()}
+    one = {"0": {"file": 0, "offset": 0, "count": 5}, "1": {"file": 2, "offset": 0, "count": 3}}
+    two = {"0": {"file": 1, "offset": 1, "count": 3}, "1": {"file": 2, "offset": 3, "count": 2}}
+    meta = {
+        "lodLevels": 2, "environment": "env/meta.json",
+        "filenames": [f"{name}/meta.json" for name in ("0_0", "0_1", "1_0")],
+        "tree": {"children": [{"lods": one}, {"lods": two}]}, **changes,
+    }  # fmt: skip
+    return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
+
+
+def test_of_levels_the_finest_is_the_scene(tmp_path):
+    path = levels(tmp_path)
+    for place in (path, path / "lod-meta.json"):
+        with open_scene(place) as scene:
+            model = scene.model()
+            assert (13, 1, True) == (scene.count, model.sh_degree, model.antialiased)
+            assert [0] * 5 + [1] * 3 + [3] * 5 == model.sh0[:, 0].tolist()
+            assert not model.shN[:5].any()
+            assert model.shN[5:8].any()
+    (path / "env" / "meta.json").unlink()
+    with pytest.raises(InputError, match=r"there is no env/meta\.json"):
+        csplat.read(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"version": 2}, "version 2 of streamed"),
+        ({"filenames": ["../a", "b", "c"]}, "outside"),
+        ({"filenames": []}, "integer from 0"),
+        ({"tree": {"children": 3}}, "no list"),
+        ({"tree": {"lods": {"0": {"file": 0, "offset": 4, "count": 2}}}}, "up to 6"),
+        ({"tree": {"lods": {"x": {"file": 0, "offset": 4, "count": 2}}}}, "no level"),
+        ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "wanted twice"),
+    ],
+)
+def test_levels_that_do_not_fit_are_refused(tmp_path, changes, says):
+    with pytest.raises(InputError, match=says):
+        csplat.read(levels(tmp_path, **changes))
+
+
+def changed(path, value, version=2, **pictures):
+    meta, more = splats(version)
+    place = meta
+    for key in path[:-1]:
+        place = place[key]
+    if path and value is None:
+        del place[path[-1]]
+    elif path:
+        place[path[-1]] = value
+    return {**files_of(meta, more), **{f"{name}.webp": data for name, data in pictures.items()}}
+
+
+BAD = {
+    "a later version": (changed(["version"], 3), "version 3"),
+    "more splats than pixels": (changed(["count"], 17), "pixels"),
+    "more splats than bytes can hold": (changed(["count"], 200_000_000), "200,000,000 splats are declared"),
+    "a huge number": (changed(["count"], 10**400), "wanted an integer"),
+    "no integer": (changed(["count"], 5.0), "wanted an integer"),
+    "a truth": (changed(["count"], True), "wanted an integer"),
+    "no count": (changed(["count"], None), "count is missing"),
+    "no files": (changed(["quats", "files"], []), "quats files: 0 names"),
+    "files of no names": (changed(["quats", "files"], [7]), "no text"),
+    "a way out": (changed(["quats", "files"], ["../quats.webp"]), "outside"),
+    "a part that is absent": (changed(["quats", "files"], ["q.webp"]), "no q"),
+    "two bounds": (changed(["means", "mins"], [1, 2]), "means mins has 2 numbers"),
+    "bounds of no end": (changed(["means", "mins"], [0, 0, float("inf")]), "finite"),
+    "bounds of a text": (changed(["means", "mins"], [0, 0, "0"]), "finite"),
+    "places beyond float32": (changed(["means", "maxs"], [0, 0, 300]), "float32"),
+    "a list for an object": (changed(["means"], []), "means mins is missing"),
+    "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
+    "no codebook": (changed(["sh0", "codebook"], []), "codebook has 0 numbers"),
+    "a short codebook of SH": (changed(["shN", "codebook"], [1.0]), "beyond the codebook"),
+    "SH of degree 4": (changed(["shN", "bands"], 4), "from 0 to 3"),
+    "SH of another degree": (changed(["shN", "bands"], 2), "192 x 1 pixels"),
+    "a small palette": (changed(["shN", "count"], 63), "SH 63 of a palette of 63"),
+    "a large palette": (changed(["shN", "count"], 65), "192 x 1 pixels"),
+    "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
+    "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
+    "a text for a picture": (changed([], 0, means_l=b"no picture"), "no whole WebP"),
+    "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "no whole WebP"),
+    "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "too many brackets"),
+    "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),
+    "no object": (changed([], 0) | {"meta.json": b"3"}, "is missing"),
+    "no UTF-8": (changed([], 0) | {"meta.json": b"\xff\xff\xff"}, "not JSON"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_does_not_fit_is_refused(tmp_path, name):
+    files, says = BAD[name]
+    with pytest.raises(InputError, match=rf"^a\.sog: .*{says}"):
+        csplat.read(zipped(tmp_path / "a.sog", files))
+
+
+def test_bombs_are_not_unpacked(tmp_path):
+    files = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
+    with pytest.raises(InputError, match="30,000,000 come out of it"):
+        csplat.read(zipped(tmp_path / "a.sog", files, how=zipfile.ZIP_DEFLATED))
+
+
+def test_damage_is_refused_or_read(tmp_path):
+    whole = zipped(tmp_path / "a.sog", files_of(*splats(1, sh=False))).read_bytes()
+    damaged = [whole[:size] for size in range(0, len(whole), 31)]
+    for place in range(0, len(whole), 7):
+        data = bytearray(whole)
+        data[place] ^= 1 << place % 8
+        damaged.append(data)
+    messages = []
+    for data in damaged:
+        (tmp_path / "a.sog").write_bytes(data)
+        try:
+            csplat.read(tmp_path / "a.sog", "sog")
+        except InputError as error:
+            messages.append(str(error))
+    assert len(messages) > len(damaged) / 2
+    assert all(one.startswith("a.sog") and "\n" not in one for one in messages)
+
+
+def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
+    files = files_of(*splats(1, sh=False))
+    folder = foldered(tmp_path / "a", files)
+    whole = files["sh0.webp"]
+    for place in range(len(whole)):
+        data = bytearray(whole)
+        data[place] ^= 1 << place % 8
+        (folder / "sh0.webp").write_bytes(data)
+        try:
+            csplat.read(folder)
+        except InputError as error:
+            if not str(error).startswith("a: sh0.webp"):
+                raise
