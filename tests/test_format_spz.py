@@ -63,7 +63,7 @@ def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions,
     np.testing.assert_allclose([[-0.5 / 0.15, -0.3 / 0.15, 0.5 / 0.15]], model.sh0, rtol=1e-6)
     half = sqrt(0.5)
     wanted = {3: [0, half, -half, 0], 4: [-half, 0, half, 0]}.get(version, [0, sqrt(1 / 3), -sqrt(1 / 3), -sqrt(1 / 3)])
-    np.testing.assert_allclose([wanted], model.quats, atol=1e-6)
+    np.testing.assert_allclose([wanted], model.quats, atol=4e-4)  # the root of what rounding leaves of 0
     assert ("RUB", True) == (model.coordinate_system, model.antialiased)
 
 

@@ -11,27 +11,20 @@ fine (all that fit would be up to 9 % more bytes, for 0.3 dB at best), fewer whe
 
 from __future__ import annotations
 
-import gzip
 import math
-import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, cast
 
-import deflate
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.formats.format import Format
-from csplat.model import F32, MAX_SH_DEGREE, SplatModel, normalise_quats
+from csplat.formats.packing import all_three, smallest_three
+from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, is_spz, read_packed, write_packed
+from csplat.model import F32, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
 from csplat.turning import in_axes
 
@@ -39,69 +32,30 @@ __all__ = ["FORMAT", "write_spz"]
 
 U8 = NDArray[np.uint8]
 
-_AXES = "RUB"
-_MAGIC = b"NGSP"
-_GZIP = b"\x1f\x8b"
-_HEADER = struct.Struct("<4sIIBBBB")
-_HEADER_REST = struct.Struct("<I12x")  # of version 4: where the table of streams begins
-_STREAM = struct.Struct("<QQ")  # bytes packed, bytes unpacked
-_RECORD = struct.Struct("<II")  # of an extension: type, bytes of its value
-_ANTIALIASED, _EXTENDED, _LEVELS = 0x01, 0x02, 0x80
-_COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
-_SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # by number, three letters each; 0 is unspecified
-_EXTENSION_BYTES = 1 << 20  # at most
-_MOST_BITS = 30  # of a fraction: readers compute 1 << bits in 32 bits
-_RATIO = 1032  # of deflate, at most; programs of the format refuse more of Zstandard, too
 _COLOUR = np.float32(0.15)  # what a coefficient is multiplied by, of the 256 levels
+_PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # step of a component of a rotation
 _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
 _STEPS = 32  # of positions, in the median of the standard deviations
 _SH_STEP = 4  # of 256 levels
-_GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
-_LARGEST = 2 * 511 * 511  # square of the length of a rotation whose parts are in units of sqrt(1/2) / 511
-
-
-@dataclass(eq=False)
-class _Packed:
-    """A file as it lies in memory.
-
-    Attributes:
-        parts: [N, bytes] each: positions, alphas, colours, scales, rotations, SH.
-    """
-
-    name: str
-    version: int
-    count: int
-    degree: int
-    bits: int
-    flags: int
-    streams: int
-    axes: str = _AXES
-    parts: list[U8] = field(default_factory=list)
-
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """Bytes of a splat, by attribute."""
-        rest = 3 * ((self.degree + 1) ** 2 - 1)
-        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, rest
-
-    @property
-    def means_half(self) -> NDArray[np.float16]:
-        """The positions of version 1."""
-        return self.parts[0].view("<f2")
 
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
-    packed = _unpacked(path)
-    yield Scene(packed.count, _decoded(packed, slice(0, 0)), lambda: _blocks(packed))
+    packed = read_packed(path)
+
+    def blocks() -> Iterator[SplatModel]:
+        for start in range(0, packed.count, BLOCK):
+            yield _decoded(packed, slice(start, start + BLOCK))
+
+    yield Scene(packed.count, _decoded(packed, slice(0, 0)), blocks)
 
 
 def write_spz(path: Path, scene: Scene, *, version: int) -> None:
     """Write version 3 or 4; the rest as `csplat.formats.format.Writer`."""
-    scene = in_axes(scene, _AXES)
-    packed = _Packed(path.name, version, scene.count, scene.facts.sh_degree, _fraction(path, scene), 0, 0)
-    packed.flags = _ANTIALIASED if scene.facts.antialiased else 0
+    scene = in_axes(scene, AXES)
+    flags = ANTIALIASED if scene.facts.antialiased else 0
+    packed = Packed(path.name, version, scene.count, scene.facts.sh_degree, _fraction(path, scene), flags)
     packed.parts = [np.empty((scene.count, width), np.uint8) for width in packed.widths]
     start = 0
     for block in scene.blocks():
@@ -109,126 +63,10 @@ def write_spz(path: Path, scene: Scene, *, version: int) -> None:
         for part, codes in zip(packed.parts, _encoded(block, packed.bits), strict=True):
             part[rows] = codes
         start = rows.stop
-    head = _HEADER.pack(_MAGIC, version, packed.count, packed.degree, packed.bits, packed.flags, 0)
-    if version < 4:
-        data = bytes(deflate.gzip_compress(b"".join([head, *(part.tobytes() for part in packed.parts)]), _GZIP_LEVEL))
-    else:
-        data = _with_streams(head, packed.parts)
-    with atomic_writer(path) as stream:
-        stream.write(data)
+    write_packed(path, packed)
 
 
-def _blocks(packed: _Packed) -> Iterator[SplatModel]:
-    for start in range(0, packed.count, BLOCK):
-        yield _decoded(packed, slice(start, start + BLOCK))
-
-
-def _unpacked(path: Path) -> _Packed:
-    with path.open("rb") as stream:
-        zipped = stream.read(2) == _GZIP
-    try:
-        with cast(BinaryIO, gzip.open(path) if zipped else path.open("rb")) as stream:
-            packed = _header(path, stream)
-            (_read_streams if packed.version == 4 else _read_arrays)(packed, path, stream)
-    except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
-        raise InputError(f"{path.name} is damaged: {str(error) or 'it ends too early'}") from None
-    if packed.version == 1 and not np.isfinite(packed.means_half).all():
-        raise InputError(f"{path.name} has positions that are NaN or infinite")
-    return packed
-
-
-def _header(path: Path, stream: BinaryIO) -> _Packed:
-    magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_taken(path.name, stream, _HEADER.size))
-    if magic != _MAGIC:
-        raise InputError(f"{path.name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
-    if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
-        raise InputError(f"{path.name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
-    if degree > MAX_SH_DEGREE:
-        raise InputError(f"{path.name} has SH degree {degree}, wanted at most {MAX_SH_DEGREE}")
-    if version > 1 and bits > _MOST_BITS:
-        raise InputError(f"{path.name} has {bits} fractional bits, wanted at most {_MOST_BITS}")
-    if flags & _LEVELS:
-        raise InputError(f"{path.name} holds levels of detail of Spark in one list, which csplat does not read")
-    packed = _Packed(path.name, version, count, degree, bits, flags, streams)
-    unpacked, size = count * sum(packed.widths), path.stat().st_size
-    if unpacked > _RATIO * size:
-        raise InputError(f"{path.name} says it has {count:,} splats, more than its {size:,} bytes can hold")
-    return packed
-
-
-def _read_arrays(packed: _Packed, path: Path, stream: BinaryIO) -> None:
-    """Versions 1 to 3: one attribute after the other, then extensions."""
-    data = np.empty(packed.count * sum(packed.widths), np.uint8)
-    _fill(path.name, stream, data)
-    ends = np.cumsum((0, *packed.widths)) * packed.count
-    packed.parts = [
-        data[start:end].reshape(packed.count, width)
-        for (start, end), width in zip(pairwise(ends), packed.widths, strict=True)
-    ]
-    tail = stream.read(_EXTENSION_BYTES + 1)  # to the end, where gzip has its checksum
-    if len(tail) > _EXTENSION_BYTES:
-        raise InputError(f"{path.name} goes on after its last splat")
-    _read_extensions(packed, tail)
-
-
-def _read_streams(packed: _Packed, path: Path, stream: BinaryIO) -> None:
-    """Version 4: extensions, a table, then each attribute packed by itself; those without bytes are left out."""
-    (table,) = _HEADER_REST.unpack(_taken(path.name, stream, _HEADER_REST.size))
-    start = _HEADER.size + _HEADER_REST.size
-    if not start <= table <= start + _EXTENSION_BYTES:
-        raise InputError(f"{path.name} has its table of streams at byte {table}, wanted {start} or a little more")
-    _read_extensions(packed, _taken(path.name, stream, table - start))
-    sizes = [packed.count * width for width in packed.widths]
-    wanted = [size for size in sizes if size]
-    rows = [_STREAM.unpack(_taken(path.name, stream, _STREAM.size)) for _ in range(packed.streams)]
-    if [row[1] for row in rows] != wanted:
-        raise InputError(f"{path.name} has streams of {[row[1] for row in rows]} bytes, wanted {wanted}")
-    found, size = table + _STREAM.size * len(rows) + sum(row[0] for row in rows), path.stat().st_size
-    if found != size:
-        raise InputError(f"{path.name} has {size:,} bytes, and its table says {found:,}")
-    each = iter(rows)
-    for size, width in zip(sizes, packed.widths, strict=True):
-        data = np.empty(size, np.uint8)
-        if size:
-            whole = _taken(path.name, stream, next(each)[0])
-            with zstandard.ZstdDecompressor().stream_reader(whole, read_across_frames=True) as reader:
-                _fill(path.name, reader, data)
-                if reader.read(1):
-                    raise InputError(f"{path.name} has a stream that unpacks to more than {size:,} bytes")
-        packed.parts.append(data.reshape(packed.count, width))
-
-
-def _read_extensions(packed: _Packed, data: bytes) -> None:
-    """Find the axes; everything else is skipped."""
-    at = 0
-    while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
-        kind, size = _RECORD.unpack_from(data, at)
-        value = data[at + _RECORD.size : at + _RECORD.size + size]
-        at += _RECORD.size + size
-        if kind == _COORDINATE_SYSTEM and len(value) == 4:
-            number = int.from_bytes(value, "little")
-            packed.axes = _SYSTEMS[3 * number : 3 * number + 3]
-            if not packed.axes:
-                raise InputError(f"{packed.name} has axes number {number}, wanted at most {len(_SYSTEMS) // 3 - 1}")
-
-
-def _taken(name: str, stream: BinaryIO, size: int) -> bytes:
-    data = stream.read(size)
-    if len(data) < size:
-        raise InputError(f"{name} ends too early")
-    return data
-
-
-def _fill(name: str, stream: Any, data: U8) -> None:
-    at = 0
-    while at < len(data):
-        got = stream.readinto(data[at:])
-        if not got:
-            raise InputError(f"{name} ends too early: {at:,} of {len(data):,} bytes are there")
-        at += got
-
-
-def _decoded(packed: _Packed, rows: slice) -> SplatModel:
+def _decoded(packed: Packed, rows: slice) -> SplatModel:
     _, alphas, colours, scales, rotations, rest = (part[rows] for part in packed.parts)
     shN = np.subtract(rest, 128, dtype=np.float32)
     shN *= np.float32(1 / 128)
@@ -240,11 +78,11 @@ def _decoded(packed: _Packed, rows: slice) -> SplatModel:
         sh0=(np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / _COLOUR,
         shN=shN.reshape(len(rest), packed.widths[5] // 3, 3),
         coordinate_system=packed.axes,
-        antialiased=bool(packed.flags & _ANTIALIASED),
+        antialiased=bool(packed.flags & ANTIALIASED),
     )
 
 
-def _means(packed: _Packed, rows: slice) -> F32:
+def _means(packed: Packed, rows: slice) -> F32:
     if packed.version == 1:
         return packed.means_half[rows].astype(np.float32)
     part = packed.parts[0][rows]
@@ -266,25 +104,10 @@ def _first_three(rotations: U8) -> F32:
 def _smallest_three(rotations: U8) -> F32:
     """All but the largest of x y z w in ten bits each, sign and magnitude, the first of them in the highest bits."""
     words = rotations.view("<u4")[:, 0]
-    values = np.empty((len(words), 4), np.float32)
-    squares = np.zeros(len(words), np.int32)
-    for column, shift in enumerate((20, 10, 0)):
-        part = (words >> np.uint32(shift)).astype(np.int32)
-        size = part & 511
-        squares += size * size
-        values[:, column] = np.where(part & 512, -size, size)
-    values[:, 3] = np.sqrt(np.maximum(0, _LARGEST - squares))
-    # Where w x y z lie among the three and the largest, by which of x y z w that is.
-    order = np.array([[2, 3, 0, 1], [2, 0, 3, 1], [2, 0, 1, 3], [3, 0, 1, 2]])[words >> np.uint32(30)]
-    return normalise_quats(np.take_along_axis(values, order, axis=1))
-
-
-def _with_streams(head: bytes, parts: list[U8]) -> bytes:
-    there = [part.tobytes() for part in parts if part.size]
-    streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data) for data in there]
-    rows = [_STREAM.pack(len(small), len(data)) for small, data in zip(streams, there, strict=True)]
-    table = _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size)
-    return b"".join([head[:-1], bytes([len(streams)]), table, *rows, *streams])
+    fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
+    sizes = fields & 511
+    xyzw = all_three(words >> np.uint32(30), np.where(fields & 512, -sizes, sizes) * _PART)
+    return xyzw[:, [3, 0, 1, 2]]
 
 
 def _fraction(path: Path, scene: Scene) -> int:
@@ -297,7 +120,7 @@ def _fraction(path: Path, scene: Scene) -> int:
         raise InputError(f"{path.name}: positions reach {reach:,g}, and SPZ holds up to {_LARGEST_POSITION:,}")
     middle = int(np.searchsorted(np.cumsum(scales), scales.sum() / 2))
     fine = math.ceil(math.log2(_STEPS) - (middle / 16 - 10) / math.log(2))
-    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else _MOST_BITS
+    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MOST_BITS
     return min(max(fine, _USUAL_BITS), fitting)
 
 
@@ -324,32 +147,20 @@ def _bytes(values: F32) -> U8:
 
 def _three_of(quats: F32) -> U8:
     """The inverse of `_smallest_three`."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    sign = np.sign(np.take_along_axis(xyzw, largest[:, None], axis=1))
-    three = np.rint(np.take_along_axis(xyzw, others, axis=1) * sign * np.float32(math.sqrt(_LARGEST)))
-    fields = np.minimum(np.abs(three), 511).astype("<u4") | np.where(three < 0, np.uint32(512), np.uint32(0))
+    largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
+    steps = np.rint(three / _PART)
+    fields = np.minimum(np.abs(steps), 511).astype(np.uint32) | np.where(steps < 0, np.uint32(512), np.uint32(0))
     words: NDArray[np.uint32] = largest.astype("<u4") << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
     return words[:, None].view(np.uint8)
-
-
-def _is_spz(_path: Path, head: bytes) -> bool:
-    if head[:2] == _GZIP:
-        try:
-            head = zlib.decompressobj(wbits=31).decompress(head, len(_MAGIC))
-        except zlib.error:
-            return False
-    return head[:4] == _MAGIC
 
 
 FORMAT = Format(
     name="spz",
     title="SPZ",
     suffixes=(".spz",),
-    sniff=_is_spz,
+    sniff=is_spz,
     open=_open,
     write=partial(write_spz, version=3),
-    axes=_AXES,
+    axes=AXES,
     carries=frozenset({"antialiased"}),
 )
