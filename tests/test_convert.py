@@ -4,13 +4,18 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import csplat
-from csplat.model import SplatModel
+from csplat import formats
+from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat.scene import scene_of
+from csplat.turning import in_axes
 from csplat_tools.cli.app import app
+from csplat_tools.files.converting import convert_file
 from csplat_tools.files.filters import Filters, isolated
 
 
@@ -152,3 +157,49 @@ def test_what_has_fixed_axes_comes_back_as_it_went(tmp_path, ply):
     assert (np.abs(np.sum(source.quats * found.quats, axis=1)) > 0.999).all()
     call("convert", tmp_path / "a.spz", tmp_path / "c.ply", "--to-axes", "RUB")
     assert np.allclose(read_ply(tmp_path / "c.ply").means, source.means * [1, -1, -1], atol=1e-3)
+
+
+BOTH = [one.name for one in formats.formats() if one.open is not None and one.write is not None]
+
+
+@st.composite
+def scenes(draw):
+    count, degree = draw(st.integers(1, 5)), draw(st.integers(0, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    size = draw(st.sampled_from([1e-3, 1.0, 50.0]))
+    return SplatModel(
+        means=(size * rng.standard_normal((count, 3))).astype(np.float32),
+        quats=normalise_quats(rng.standard_normal((count, 4))),
+        scales=rng.uniform(-6.0, 1.0, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.02, 0.98, count).astype(np.float32),
+        sh0=rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32),
+        shN=rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+    )
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(BOTH), st.sampled_from(BOTH), scenes())
+def test_what_two_formats_call_exact_is_exact_from_one_to_the_other(tmp_path, first, second, model):
+    one, other = formats.named(first), formats.named(second)
+    a, b = tmp_path / f"a{one.suffixes[0]}", tmp_path / f"b{other.suffixes[0]}"
+    formats.write(a, model, first)
+    converted = convert_file(
+        str(a), str(b), read_as=first, write_as=second, filters=Filters(to_axes=other.axes or "RDF")
+    )
+    source, found = (
+        in_axes(scene_of(formats.read(path, name)), "RDF").model() for path, name in ((a, first), (b, second))
+    )
+    assert len(source) == converted.count == len(found)
+    for name in one.exact & other.exact:
+        left, right = getattr(source, name), getattr(found, name)
+        if name == "shN":
+            left = left[:, : right.shape[1]]
+        if name == "quats":
+            left, right = (rows * np.sign(rows[:, :1] + 1e-30) for rows in (left, right))
+        if name == "opacities":
+            assert np.allclose(left, right, rtol=2e-7, atol=0)
+        else:
+            assert (left == right).all(), name
+    places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats have an order of their own
+    assert np.allclose(*places, atol=1e-2 * max(1.0, np.abs(source.means).max()))
+    assert min(source.sh_degree, other.degree) == found.sh_degree
