@@ -81,5 +81,6 @@ FORMAT = Format(
     open=_open,
     write=_write,
     degree=0,
+    splat_bytes=(32.0,),
     exact=frozenset({"means"}),
 )
