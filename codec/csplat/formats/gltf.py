@@ -331,5 +331,6 @@ FORMAT = Format(
     write=_write,
     axes=_AXES,
     exact=frozenset({"means", "quats", "opacities", "sh0", "shN"}),
+    splat_bytes=(60.0, 96.0, 156.0, 240.0),
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
 )
