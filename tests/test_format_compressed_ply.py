@@ -119,8 +119,8 @@ def test_what_does_not_fit_is_refused(tmp_path, data, says):
 
 def test_damage_is_refused_or_read(tmp_path):
     path = tmp_path / "a.ply"
-    damaged = [SMALL[:size] for size in range(0, len(SMALL), 7)]
-    for place in range(len(SMALL)):
+    damaged = [SMALL[:size] for size in range(0, len(SMALL), 17)]
+    for place in range(0, len(SMALL), 3):
         data = bytearray(SMALL)
         data[place] ^= 1 << place % 8
         damaged.append(data)
@@ -131,7 +131,7 @@ def test_damage_is_refused_or_read(tmp_path):
             csplat.read(path, "compressed-ply")
         except InputError as error:
             messages.append(str(error))
-    assert len(messages) > 500
+    assert len(messages) > 150
     assert all(one.startswith("a.ply") for one in messages)
 
 

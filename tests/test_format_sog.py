@@ -272,3 +272,57 @@ def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
         except InputError as error:
             if not str(error).startswith("a: sh0.webp"):
                 raise
+
+
+# Writing -------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
+    model = make_model(1500, 1, antialiased=True)
+    csplat.write(tmp_path / "a.sog", model)
+    back = csplat.read(tmp_path / "a.sog")
+    assert back.antialiased
+    rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
+    assert 1500 == len(set(rows))
+    # Half a step of 65,535 in the logarithms, where a step is largest.
+    logs = np.log1p(np.abs(model.means.astype(float)).max()) / 65535
+    assert np.abs(model.means[rows] - back.means).max() < logs * (1 + np.abs(model.means).max())
+    assert np.abs(model.opacities[rows] - back.opacities).max() <= 0.5 / 255 + 1e-7
+    assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 3e-5
+    for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
+        assert np.sqrt(np.mean((getattr(model, name)[rows] - getattr(back, name)) ** 2)) < most
+
+
+def test_the_same_scene_is_the_same_bytes_in_a_zip_and_in_a_folder(tmp_path, make_model):
+    model = make_model(300, 2, flat=True)
+    for name in ("a.sog", "b.sog", "c/meta.json"):
+        csplat.write(tmp_path / name, model)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == {
+            one.name: one.read_bytes() for one in (tmp_path / "c").iterdir()
+        }
+    assert csplat.read(tmp_path / "c").flat
+
+
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 0), (1, 3), (17, 1)])
+def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree):
+    model = make_model(count, degree)
+    csplat.write(tmp_path / "a.sog", model)
+    back = csplat.read(tmp_path / "a.sog")
+    assert (count, degree if count else 0) == (len(back), back.sh_degree)
+    for name in ("means", "scales", "sh0", "shN") if count else ():
+        wanted, found = (np.sort(getattr(one, name).reshape(count, -1), 0) for one in (model, back))
+        np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
+
+
+def test_splats_in_one_place_are_written(tmp_path, make_model):
+    model = make_model(3, 0)
+    model.means[:] = 2.5
+    csplat.write(tmp_path / "a.sog", model)
+    np.testing.assert_allclose(csplat.read(tmp_path / "a.sog").means, 2.5, rtol=1e-6)
+
+
+def test_streamed_sog_is_not_written(tmp_path, make_model):
+    with pytest.raises(InputError, match="does not write"):
+        csplat.write(tmp_path / "lod-meta.json", make_model(3, 0))

@@ -14,6 +14,7 @@ from csplat.foreign import zip_holds_meta
 from csplat.formats.format import Format
 from csplat.formats.sog_files import Json, Parts, parts_at
 from csplat.formats.sog_read import COEFFICIENTS, Pictures, Unit, degree_of, unit_of
+from csplat.formats.sog_write import write_sog
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
@@ -156,5 +157,6 @@ FORMAT = Format(
     suffixes=(".sog", "meta.json"),
     sniff=_is_sog,
     open=_open,
+    write=write_sog,
     carries=frozenset({"antialiased", "flat"}),
 )
