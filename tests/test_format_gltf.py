@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filed import filed
 
 import csplat
 from csplat.errors import InputError
@@ -62,7 +63,7 @@ def glb(said, data):
 
 
 def read(said, data):
-    return csplat.read(glb(said, data))
+    return filed(glb(said, data))
 
 
 def test_values_are_those_of_the_file():
@@ -135,7 +136,7 @@ def test_a_far_translation_is_an_origin():
 def test_a_scene_comes_back(tmp_path, make_model, degree):
     model = make_model(50, degree, origin=(1.5, -2.0, 0.1), antialiased=True, metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.glb", model)
-    back = csplat.read(tmp_path / "a.glb")
+    back = filed(tmp_path / "a.glb")
     assert ("LUF", True, "CC0") == (back.coordinate_system, back.antialiased, back.metadata["licence"])
     flipped = turned(back, np.diag([-1.0, -1.0, 1.0]))
     assert model.origin == flipped.origin
@@ -149,7 +150,7 @@ def test_a_scene_comes_back(tmp_path, make_model, degree):
 def test_lengths_are_written_in_metres(tmp_path, make_model):
     model = make_model(5, 0, unit_metres=0.5, coordinate_system="LUF")
     csplat.write(tmp_path / "a.glb", model)
-    back = csplat.read(tmp_path / "a.glb")
+    back = filed(tmp_path / "a.glb")
     assert 1.0 == back.unit_metres
     assert (model.means * np.float32(0.5) == back.means).all()
     assert np.abs(model.scales + np.log(0.5) - back.scales).max() < 1e-6
@@ -175,7 +176,7 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
     def read_from(uri):
         said["buffers"][0]["uri"] = uri
         path.write_text(json.dumps(said))
-        return csplat.read(path)
+        return filed(path)
 
     for uri in ("a%20b.bin", "data:application/octet-stream;base64," + base64.b64encode(data).decode()):
         assert TWO["POSITION"].tolist() == read_from(uri).means.tolist()
@@ -295,4 +296,4 @@ def test_files_of_others_are_read():
     found = sorted(Path(os.environ["CSPLAT_PEERS"]).glob("*.glb"))
     assert found
     for path in found:
-        assert len(csplat.read(path))
+        assert len(filed(path))

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 import pytest
 import zstandard
+from filed import filed
 
 import csplat
 from csplat.errors import InputError
@@ -55,7 +56,7 @@ def word(index, *three):
 )
 def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions, rotation, bare):
     data = [positions, b"\x33", bytes([0, 51, 255]), bytes([0, 160, 255]), rotation, bytes([0, 128, 255] * 3)]
-    model = csplat.read(spz(version, data, degree=1, flags=1, bare=bare))
+    model = filed(spz(version, data, degree=1, flags=1, bare=bare))
     assert [[1.5, -2.0, 0.25]] == model.means.tolist()
     assert [[-10.0, 0.0, 5.9375]] == model.scales.tolist()
     assert [[-1.0, 0.0, 127 / 128]] * 3 == model.shN[0].tolist()
@@ -69,7 +70,7 @@ def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions,
 
 @pytest.mark.parametrize("largest", range(4))
 def test_the_component_that_is_left_out_stands_in_its_place(largest):
-    model = csplat.read(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
+    model = filed(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
     three = [sqrt(0.5) / 511 * value for value in (73, 146, -219)]
     xyzw = [*three[:largest], sqrt(1 - np.square(three).sum()), *three[largest:]]
     np.testing.assert_allclose([xyzw[3], *xyzw[:3]], model.quats[0], atol=1e-6)
@@ -78,15 +79,15 @@ def test_the_component_that_is_left_out_stands_in_its_place(largest):
 @pytest.mark.parametrize("version", [3, 4])
 def test_axes_of_an_extension_count_and_others_are_skipped(version):
     data = spz(version, splats(version), flags=2, extensions=AXES)
-    assert "RDF" == csplat.read(data).coordinate_system
-    assert "RUB" == csplat.read(spz(version, splats(version), extensions=AXES)).coordinate_system
+    assert "RDF" == filed(data).coordinate_system
+    assert "RUB" == filed(spz(version, splats(version), extensions=AXES)).coordinate_system
     with pytest.raises(InputError, match="axes number 17"):
-        csplat.read(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
+        filed(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
 
 
 def test_a_file_without_splats_is_read():
-    assert 0 == len(csplat.read(spz(4, [b""] * 6, degree=3)))
-    assert 0 == len(csplat.read(spz(3, [b""] * 6, degree=3)))
+    assert 0 == len(filed(spz(4, [b""] * 6, degree=3)))
+    assert 0 == len(filed(spz(3, [b""] * 6, degree=3)))
 
 
 MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
@@ -112,7 +113,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, says):
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(InputError, match=says):
-        csplat.read(tmp_path / "a.spz")
+        filed(tmp_path / "a.spz")
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -123,7 +124,7 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     def read(data):
         path.write_bytes(data)
         try:
-            csplat.read(path)
+            filed(path)
         except InputError as error:
             return str(error)
         return ""
@@ -149,7 +150,7 @@ def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, nam
     model = csplat.SplatModel(**{**vars(model), "shN": shN, "sh0": np.clip(model.sh0, -3, 3)})
     csplat.write(tmp_path / name, model)
     assert (version, 200, 3, 12, 1) == fields(tmp_path / name)
-    found = csplat.read(tmp_path / name)
+    found = filed(tmp_path / name)
     for array, step in {
         "means": 2**-12,
         "scales": 1 / 16,
@@ -169,7 +170,7 @@ def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
     scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
     model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
     csplat.write(tmp_path / "a.spz", model)
-    found = csplat.read(tmp_path / "a.spz")
+    found = filed(tmp_path / "a.spz")
     assert [-10, 5.9375, 0] == found.scales[0].tolist()
     assert [0, 1] == found.opacities.tolist()
     assert [127 / 128, -1, 127 / 128] == found.shN[0, 0].tolist()
@@ -180,7 +181,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
     def bits(reach, scale):
         means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
         csplat.write(tmp_path / "a.spz", make_model(10, 0, means=means, scales=np.full((10, 3), scale, "f4")))
-        found = csplat.read(tmp_path / "a.spz").means * [1, -1, -1]
+        found = filed(tmp_path / "a.spz").means * [1, -1, -1]
         number = fields(tmp_path / "a.spz")[3]
         np.testing.assert_allclose(found, means, atol=2.0**-number / 2)
         return number
@@ -196,7 +197,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
 def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_model):
     model = make_model(5, 3, means=np.arange(15, dtype="f4").reshape(5, 3))
     csplat.write(tmp_path / "a.spz", model)
-    found = csplat.read(tmp_path / "a.spz")
+    found = filed(tmp_path / "a.spz")
     assert (model.means * [1, -1, -1]).tolist() == found.means.tolist()
     flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of y and z, in the order of the coefficients
     np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)

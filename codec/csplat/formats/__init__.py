@@ -1,6 +1,7 @@
 """Files of splats in any format: `read`, `write`, and what each format can carry.
 
-One module a format; each has a `FORMAT`. What a file is, its content says first, its name second.
+One module a format; each has a `FORMAT`. What a file is, its content says first, its name second. What a format of
+fixed axes holds is turned to x right, y down, z forward, as a PLY is taken to stand: so all scenes lie alike.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_model
 from csplat.ply import lint_ply, read_ply
 from csplat.scene import Scene, scene_of
+from csplat.turning import USUAL, in_axes
 
 __all__ = [
     "Format",
@@ -217,7 +219,8 @@ def _readable(path: Path, format: str | None) -> Format:
 def _opened(found: Format, path: Path) -> Iterator[Scene]:
     assert found.open is not None
     with found.open(path) as scene:
-        yield replace(scene, format=found.name)
+        placed = in_axes(scene, USUAL) if found.axes else scene
+        yield replace(placed, format=found.name)
 
 
 def named(name: str) -> Format:

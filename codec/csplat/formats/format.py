@@ -56,6 +56,7 @@ class Format:
         write: writes it; `None`: it is not written.
         degree: highest SH degree that it holds.
         axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
+            `open` gives the scene along them.
         exact: names of the arrays of a model that come back bit for bit; opacities kept as logits within an ulp.
         splat_bytes: about how many bytes a splat takes at SH degrees 0 to 3; none where that depends on the scene.
         carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,

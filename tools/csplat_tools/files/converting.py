@@ -13,7 +13,6 @@ from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
-from csplat.turning import USUAL
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import SceneOverrides, findings_as_json
 from csplat_tools.files.filters import Filters
@@ -107,8 +106,7 @@ def convert_file(
         told = facts or SceneOverrides()
         scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
         before = scene.facts.coordinate_system
-        filters = _with_usual_axes(filters or Filters(), named(opened.format), writes)
-        scene = filters.applied(scene)
+        scene = (filters or Filters()).applied(scene)
         lost = writes.losses(scene.facts)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
@@ -141,13 +139,6 @@ def format_rows() -> list[tuple[str, ...]]:
         )
         for one in formats()
     ]
-
-
-def _with_usual_axes(filters: Filters, reads: Format, writes: Format) -> Filters:
-    """What comes from a format of fixed axes stands in a PLY and its kin as their programs expect it."""
-    if filters.to_axes is not None or not reads.axes or writes.axes or writes.name == "csplat":
-        return filters
-    return replace(filters, to_axes=USUAL)
 
 
 def _exactness(one: Format) -> str:
