@@ -45,6 +45,7 @@ sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, trai
 docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[docs]'
 	$(BIN)/python tools/docs/make_site.py
+	@echo "open out/site/index.html"
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/pytest -m benchmark

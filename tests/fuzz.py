@@ -1,4 +1,4 @@
-"""Fuzz the decoders and the PLY reader: mutants with an eye for structure, checksums repaired.
+"""Fuzz the decoders and the readers of PLY and other formats: mutants with an eye for structure, checksums repaired.
 
 | target | must |
 |---|---|
@@ -6,6 +6,7 @@
 | js | give the verdict and the arrays of the Python decoder |
 | validator | find something wrong exactly where the decoder refuses |
 | ply | give a sound model or an InputError, as lint says |
+| formats | give a sound model or an InputError |
 
 Anything else, a case that takes more than five seconds of processor time, or memory beyond the limit is a finding: it
 is made smaller and saved below out/fuzz, exit status 1. What reaches edges between lines that nothing reached before
@@ -37,12 +38,13 @@ from collections import Counter
 from pathlib import Path
 
 from csplat_conformance.fuzzing.edges import Edges
+from csplat_conformance.fuzzing.foreign import FormatTarget
 from csplat_conformance.fuzzing.plies import PlyTarget
 from csplat_conformance.fuzzing.targets import DecoderTarget, JsTarget
 from csplat_conformance.fuzzing.validating import ValidatorTarget
 from csplat_conformance.node import missing_javascript
 
-TARGETS = ("decoder", "js", "validator", "ply")
+TARGETS = ("decoder", "js", "validator", "ply", "formats")
 SECONDS_PER_CASE = 5
 HANG_SECONDS = 60  # in native code, where no alarm arrives
 MEMORY_ABOVE_START = 256_000_000  # bytes of resident memory; the limits allow 32 MB of arrays
@@ -110,7 +112,7 @@ def made(name, scratch=None):
     """Return a target."""
     if name == "js":
         return JsTarget(scratch)
-    return {"decoder": DecoderTarget, "validator": ValidatorTarget, "ply": PlyTarget}[name]()
+    return {"decoder": DecoderTarget, "validator": ValidatorTarget, "ply": PlyTarget, "formats": FormatTarget}[name]()
 
 
 def replay(name, paths):

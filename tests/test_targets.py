@@ -233,7 +233,7 @@ def test_a_long_search_says_beforehand_how_long_it_takes(tmp_path, ply, monkeypa
         (["--cameras", "c.json"], 2, "--cameras says nothing without --target-psnr or"),
         (["--max-error", "means=1", "--data", "d"], 2, "--data says nothing without --target-psnr or"),
         (["--size", "9x9", "--target-psnr", "30"], 2, "--size says nothing without --data"),
-        (["--target-size", "10", "--keep-all"], 1, "no file"),
+        (["--target-size", "10", "--keep-all"], 2, "no file"),
         (["--target-psnr", "30", "--target-size", "5kB"], 2, "--target-psnr and --target-size: give one of them"),
         (["--kmeans", "16"], 2, "No such option"),
         (["--prune"], 2, "No such option"),

@@ -276,7 +276,7 @@ def test_a_ply_is_one_whatever_its_name(tmp_path, make_model):
 def test_something_else_is_refused(tmp_path):
     path = tmp_path / "scene.txt"
     path.write_text("no scene")
-    assert "not a PLY" in refused(path)
+    assert "no format that csplat knows" in refused(path)
 
 
 def test_a_taken_port_is_refused(scene_path):

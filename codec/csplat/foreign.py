@@ -28,20 +28,20 @@ __all__ = [
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_GSBOX = "gsbox"
 _CONVERT = "`csplat convert`, or take csplat.read, which reads it"
 _SPLAT_ROW_SIZE = 32
-_PACKED = ("gzip", "zip", "csplat", "compressed PLY", "SOG")
 
 #: By file name, for formats without a magic, or where the magic is missing.
 _BY_SUFFIX = {
-    ".spz": ("SPZ", _SPLAT_TRANSFORM),
+    ".spz": ("SPZ", _CONVERT),
     ".sog": ("SOG", _CONVERT),
-    ".splat": (".splat", _SPLAT_TRANSFORM),
-    ".ksplat": (".ksplat", _SPLAT_TRANSFORM),
-    ".spx": (".spx", "gsbox"),
+    ".splat": (".splat", _CONVERT),
+    ".ksplat": (".ksplat", _CONVERT),
+    ".spx": (".spx", _GSBOX),
     ".lcc": ("LCC", _SPLAT_TRANSFORM),
-    ".glb": ("glTF", "gsbox"),
-    ".gltf": ("glTF", "gsbox"),
+    ".glb": ("glTF", _CONVERT),
+    ".gltf": ("glTF", _CONVERT),
     ".csplat": ("csplat", "`csplat decode`"),
 }
 
@@ -65,7 +65,7 @@ def refuse_foreign(path: Path, head: bytes, size: int) -> None:
     if size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
         raise InputError(
             f"{path.name} is not a PLY; its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that"
-            f" of a .splat file: if it is one, convert it to PLY first, with {_SPLAT_TRANSFORM}"
+            f" of a .splat file: if it is one, convert it to PLY first, with `csplat convert --from splat`"
         )
     raise InputError(f"{path.name} is not a PLY: it begins with {head[:8]!r}; wanted one of Gaussian splats")
 
@@ -78,7 +78,7 @@ def unknown(path: Path, head: bytes) -> InputError:
         head: its first `HEAD_SIZE` bytes; none of a folder.
     """
     if path.is_dir():
-        return InputError(f"{path.name} is a folder, and no scene")
+        return InputError(f"{path} is a folder, and no scene")
     try:
         refuse_known(path, head)
     except InputError as error:
@@ -163,5 +163,5 @@ def zip_holds_meta(path: Path) -> bool:
 
 
 def _refusal(path: Path, what: str, converter: str) -> str:
-    why = "not a plain PLY" if what in _PACKED else "which csplat does not read yet"
+    why = "which csplat does not read" if converter in (_SPLAT_TRANSFORM, _GSBOX) else "not a plain PLY"
     return f"{path.name} is {what}, {why}: convert it to PLY first, with {converter}"

@@ -33,12 +33,14 @@ class Scene:
         blocks: begins at the first splat whenever it is called, and gives all of them in order, in models of `BLOCK`
             splats at most, whose facts are `facts`.
         findings: what was noticed so far; grows while the first blocks are read.
+        format: name of the format that it is read from; "" of a scene in memory.
     """
 
     count: int
     facts: SplatModel
     blocks: Callable[[], Iterator[SplatModel]]
     findings: list[Finding] = field(default_factory=list)
+    format: str = ""
 
     def model(self) -> SplatModel:
         """All of it in memory."""

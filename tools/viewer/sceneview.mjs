@@ -131,9 +131,9 @@ export class SceneView {
     this.shown = this.first;
   }
 
-  /** Whether the file, or who took its pictures, says which way is up. */
+  /** Whether the file says which way is up, or who took its pictures, or it seems plain. */
   get knowsUp() {
-    return this.#namedUp() !== null;
+    return (this.#namedUp() ?? this.seems) !== null;
   }
 
   /** @returns {Vec3 | null} what the file says by itself, whoever took its pictures */

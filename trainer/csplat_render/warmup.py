@@ -50,7 +50,9 @@ def warm_up(
         nonlocal compiles
         compiles = True
         if announce is not None:
-            announce("compiling the renderer for this machine: about a minute; the result is kept for the next time")
+            announce(
+                "compiling a part of the renderer for this machine: a minute at most; it is kept for the next time"
+            )
 
     with on_compiling(say):
         viewmat = np.eye(4)

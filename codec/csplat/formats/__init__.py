@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -16,12 +17,38 @@ from csplat.files import local_file
 from csplat.foreign import HEAD_SIZE, unknown
 from csplat.formats.format import Format
 from csplat.inputs import File
+from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_model
+from csplat.ply import lint_ply, read_ply
 from csplat.scene import Scene, scene_of
 
-__all__ = ["Format", "format_of", "formats", "named_by", "open_scene", "read", "register", "write", "write_scene"]
+__all__ = [
+    "Format",
+    "format_of",
+    "formats",
+    "lint",
+    "named",
+    "named_by",
+    "open_scene",
+    "read",
+    "register",
+    "write",
+    "write_scene",
+]
 
-_MODULES = ("csplat.formats.compressed_ply", "csplat.formats.ply", "csplat.formats.own", "csplat.formats.sog")
+_PLY = "ply"  # its reader needs no second pass where all of a scene is wanted at once
+
+_MODULES = (
+    "csplat.formats.compressed_ply",
+    "csplat.formats.ply",
+    "csplat.formats.own",
+    "csplat.formats.spz",
+    "csplat.formats.spz4",
+    "csplat.formats.splat",
+    "csplat.formats.ksplat",
+    "csplat.formats.sog",
+    "csplat.formats.gltf",
+)
 _registered: list[Format] = []
 
 
@@ -35,12 +62,22 @@ def register(format: Format) -> None:
     _registered[:] = [one for one in _registered if one.name != format.name] + [format]
 
 
-def read(file: File, format: str | None = None) -> SplatModel:
+def read(
+    file: File,
+    format: str | None = None,
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    report: list[Finding] | None = None,
+) -> SplatModel:
     """Read a scene in any format.
 
     Args:
         file: its path, also of a folder; an open binary file; or bytes.
         format: its name, one of `csplat formats`, where its content and its name do not say it.
+        strict: refuse what would be repaired.
+        keep_extra: keep columns that splats do not have.
+        report: findings are appended to this list, repairs among them.
 
     Examples:
         >>> import csplat
@@ -52,8 +89,16 @@ def read(file: File, format: str | None = None) -> SplatModel:
         FormatError: it is a .csplat file that breaks a clause.
         OSError: it cannot be read.
     """
-    with open_scene(file, format) as scene:
-        return scene.model()
+    with local_file(file) as path:
+        found = _readable(path, format)
+        if found.name == _PLY:
+            return read_ply(path, strict=strict, keep_extra=keep_extra, report=report)
+        with _opened(found, path) as scene:
+            model = scene.model()
+            if report is not None:
+                report += scene.findings
+            refuse(scene.findings, strict=strict)
+    return model if keep_extra or not model.extra else replace(model, extra={})
 
 
 @contextmanager
@@ -71,12 +116,30 @@ def open_scene(file: File, format: str | None = None) -> Iterator[Scene]:
         InputError: the file is in no format that is read, or not whole. Blocks raise it, too.
         OSError: it cannot be read.
     """
-    with local_file(file) as path:
-        found = format_of(path) if format is None else _named(format)
-        if found.open is None:
-            raise InputError(f"{path.name} is {found.title}, which csplat does not read")
-        with found.open(path) as scene:
-            yield scene
+    with local_file(file) as path, _opened(_readable(path, format), path) as scene:
+        yield scene
+
+
+def lint(path: Path) -> list[Finding]:
+    """Find out what is wrong with a file of any format, without refusing it.
+
+    Returns:
+        Findings in the order of reading; the last one is an error where `read` would refuse.
+
+    Raises:
+        InputError: it is in no format that is read, or its header cannot be understood.
+        OSError: it cannot be read.
+    """
+    found = _readable(path, None)
+    if found.name == _PLY:
+        return lint_ply(path)
+    with _opened(found, path) as scene:
+        try:
+            for _ in scene.blocks():
+                pass
+        except InputError as error:
+            return [*scene.findings, Finding("malformed", 1, str(error), "error")]
+        return scene.findings
 
 
 def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = None) -> None:
@@ -102,7 +165,7 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None = None) -> None:
     """Write a scene that is read some splats at a time; the rest as of `write`."""
     target = Path(path)
-    found = named_by(target) if format is None else _named(format)
+    found = named_by(target) if format is None else named(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
     found.write(target, scene)
@@ -143,7 +206,26 @@ def named_by(path: Path) -> Format:
     return max(found, key=lambda pair: pair[0])[1]
 
 
-def _named(name: str) -> Format:
+def _readable(path: Path, format: str | None) -> Format:
+    found = format_of(path) if format is None else named(format)
+    if found.open is None:
+        raise InputError(f"{path.name} is {found.title}, which csplat does not read")
+    return found
+
+
+@contextmanager
+def _opened(found: Format, path: Path) -> Iterator[Scene]:
+    assert found.open is not None
+    with found.open(path) as scene:
+        yield replace(scene, format=found.name)
+
+
+def named(name: str) -> Format:
+    """The format of that name.
+
+    Raises:
+        InputError: there is none.
+    """
     for one in formats():
         if one.name == name:
             return one

@@ -11,7 +11,10 @@ from typing import Any, Protocol
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene import Scene
 
-__all__ = ["Format", "Reader", "Writer"]
+__all__ = ["ARRAYS", "Format", "Reader", "Writer"]
+
+#: What each splat has.
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 class Reader(Protocol):
@@ -53,7 +56,8 @@ class Format:
         write: writes it; `None`: it is not written.
         degree: highest SH degree that it holds.
         axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
-        exact: names of the arrays of a model that come back bit for bit.
+        exact: names of the arrays of a model that come back bit for bit; opacities kept as logits within an ulp.
+        splat_bytes: about how many bytes a splat takes at SH degrees 0 to 3; none where that depends on the scene.
         carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,
             `cameras` it has a place for.
     """
@@ -67,7 +71,12 @@ class Format:
     degree: int = 3
     axes: str = ""
     exact: frozenset[str] = frozenset()
+    splat_bytes: tuple[float, ...] = ()
     carries: frozenset[str] = frozenset()
+
+    def expected_bytes(self, facts: SplatModel, count: int) -> int | None:
+        """About how large a file gets; `None` where that depends on the scene."""
+        return round(count * self.splat_bytes[min(facts.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, facts: SplatModel) -> tuple[str, ...]:
         """What of a scene this format has no place for, a few words each; precision is not among them.

@@ -34,6 +34,7 @@ FORMAT = Format(
     sniff=lambda _path, head: head.startswith(MAGIC),
     open=_open,
     write=_write,
+    splat_bytes=(7.0, 8.0, 9.0, 10.0),
     carries=frozenset(
         {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "cameras", "extra", "metadata"}
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from csplat.formats.format import Format
+from csplat.formats.format import ARRAYS, Format
 from csplat.ply import open_ply
 from csplat.ply_write import write_scene_ply
 
@@ -22,6 +22,7 @@ FORMAT = Format(
     sniff=_is_ply,
     open=open_ply,
     write=write_scene_ply,
-    exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
+    splat_bytes=(68.0, 104.0, 164.0, 248.0),
+    exact=frozenset(ARRAYS),
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
 )

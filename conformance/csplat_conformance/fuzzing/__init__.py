@@ -1,4 +1,4 @@
-"""Fuzzing of the decoders and of the PLY reader: what is fed, what must not happen, which lines were reached.
+"""Fuzzing of the decoders and of readers of other formats: what is fed, what must not happen, which lines were reached.
 
 `tests/fuzz.py` is the program. A target makes mutants from a corpus and says of each attempt what became of it;
 `edges` tells which mutants reach what none before them did: they join the corpus.

@@ -20,7 +20,7 @@ from csplat_conformance.fuzzing import ply_mutants
 from csplat_conformance.fuzzing.ply_mutants import Ply, changed
 from csplat_conformance.fuzzing.targets import Case
 
-__all__ = ["PlyTarget"]
+__all__ = ["PlyTarget", "unsound"]
 
 _PACKAGE = Path(csplat.__file__).parent
 
@@ -64,7 +64,7 @@ class PlyTarget:
                 return "refused", ""
             if errors:
                 return "finding", f"read_ply accepts what lint calls {errors[0]}"
-            wrong = _unsound(model)
+            wrong = unsound(model)
             if not wrong and chance % 8 == 1:
                 wrong = self._written(model)
         return ("finding", wrong) if wrong else ("read", "")
@@ -121,7 +121,8 @@ def _linted(path: Path) -> list[str] | None:
         return None
 
 
-def _unsound(model: SplatModel) -> str:
+def unsound(model: SplatModel) -> str:
+    """What is wrong with a model that was read; nothing as a rule."""
     arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
     for name, array in arrays.items():
         if array.dtype != np.float32 or len(array) != len(model.means):

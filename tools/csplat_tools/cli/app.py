@@ -23,6 +23,8 @@ _MODULES = {
     "info": "info",
     "verify": "verify",
     "lint": "lint",
+    "convert": "convert",
+    "formats": "convert",
     "compare": "compare",
     "tradeoff": "tradeoff",
     "render": "render",

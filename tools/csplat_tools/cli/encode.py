@@ -48,7 +48,7 @@ class Goal(Group):
     }
 
     target_psnr: Annotated[
-        float | None,
+        str | None,
         typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Least PSNR against the source's renders."),
     ] = None
     target_size: Annotated[
@@ -96,7 +96,8 @@ class Goal(Group):
         size = None if self.target_size is None else parse_size_bytes(self.target_size)
         loss = None if self.max_loss is None else parse_decibels(self.max_loss)
         bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
-        return Target(self.target_psnr, size, loss, self.keep, bounds)
+        psnr = None if self.target_psnr is None else parse_decibels(self.target_psnr)
+        return Target(psnr, size, loss, self.keep, bounds)
 
 
 @command(
@@ -198,7 +199,7 @@ def encode(
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
     if not out.quiet and len(encoded.source) <= _SPLATS_LOOKED_AT:
-        facts.seeming(seeming_up(encoded.source), out)
+        facts.seeming(seeming_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 

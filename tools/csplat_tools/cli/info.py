@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from csplat.decoder import StatedErrors
-from csplat.errors import counted
+from csplat.errors import InputError, counted
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.extras import need_pictures, prepare_renderer
-from csplat_tools.files.streams import mapped_csplat
+from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, mapped_csplat
+from csplat_tools.inspect.foreign import describe_foreign
 from csplat_tools.inspect.info import AttributeFacts, CodebookFacts, FileFacts, LayerFacts, describe_file
 from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
 
@@ -23,7 +25,7 @@ __all__ = ["info"]
 
 @command(needs={"beside": ("page",)})
 def info(
-    source: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file; or any other of `csplat formats`.")],
     out: Output,
     page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write a page about it.")] = None,
     beside: Annotated[
@@ -51,6 +53,11 @@ def info(
     if beside is not None:
         prepare_renderer(quiet=out.quiet, ssim=True)
         need_pictures()
+    if source != STANDARD_STREAM and not is_csplat(Path(source)):
+        if page is not None:
+            raise InputError(f"{source} is no .csplat file, of which --page tells: `csplat encode` makes one")
+        out.publish(*describe_foreign(source))
+        return
     with mapped_csplat(source) as data:
         facts = describe_file(data)
         if page is not None:

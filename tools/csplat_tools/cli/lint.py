@@ -6,22 +6,22 @@ from typing import Annotated
 
 import typer
 
+from csplat import formats
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat.ply import lint_ply, read_ply
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
-from csplat_tools.files.streams import STANDARD_STREAM, check_name, ply_path, write_model
+from csplat_tools.files.streams import STANDARD_STREAM, check_name, source_path, write_model
 
 __all__ = ["lint"]
 
 
 @command()
 def lint(
-    source: Annotated[str, typer.Argument(metavar="F.ply", help="A 3DGS PLY, or - for standard input.")],
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, a file of `csplat formats`, or -.")],
     out: Output,
     fix: Annotated[
         str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY, where that is safe.")
@@ -45,13 +45,13 @@ def lint(
     out.check(fix, inputs=(source,))
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)
-    with ply_path(source) as path:
-        findings = lint_ply(path)
+    with source_path(source) as path:
+        findings = formats.lint(path)
         if keep_extra:
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
-            write_model(fix, read_ply(path, keep_extra=keep_extra), absolute=False)
+            write_model(fix, formats.read(path, keep_extra=keep_extra), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:

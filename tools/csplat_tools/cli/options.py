@@ -42,7 +42,9 @@ __all__ = [
     "command",
 ]
 
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="A PLY or .csplat file, or - for standard input.")]
+Scene = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
+]
 Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choices.")]
 Threads = Annotated[
     int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 import typer
@@ -18,11 +19,13 @@ from csplat_tools.cli.view_options import SplitWord, Upright, Views
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model, without_bands
-from csplat_tools.files.streams import check_name
+from csplat_tools.files.streams import STANDARD_STREAM, check_name
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
 
 __all__ = ["render"]
+
+_OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,11 @@ def render(
       csplat render scene.ply views --cameras test.json --background white
       csplat render scene.ply small --orbit 8 --size 320x240 --sh-degree 0
     """
-    if (views.cameras, orbit, views.data) == (None, None, None):
-        raise typer.BadParameter("wanted one of --cameras, --orbit and --data")
     film = is_film(output)
+    if (views.cameras, orbit, views.data) == (None, None, None):
+        raise typer.BadParameter("wanted cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
+    if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_FILMS:
+        raise typer.BadParameter(f"OUT is {output}, wanted a folder, or a film: NAME.mp4, .webp, .gif or .png")
     if film and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
     pixels = None if views.size is None else parse_size(views.size)

@@ -40,7 +40,7 @@ def simplify(
         float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats that stay.")
     ] = None,
     target_psnr: Annotated[
-        float | None,
+        str | None,
         typer.Option(
             metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders, by the views that decide."
         ),
@@ -78,7 +78,8 @@ def simplify(
     from csplat_tools.views.timing import pictures_seconds
 
     loss = None if max_loss is None else parse_decibels(max_loss)
-    chosen(Target, psnr=target_psnr, max_loss=loss, keep=keep)  # before anything is read
+    psnr = None if target_psnr is None else parse_decibels(target_psnr)
+    chosen(Target, psnr=psnr, max_loss=loss, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
     out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
@@ -94,7 +95,7 @@ def simplify(
     )
     with out.bar() as progress:
         result = csplat_tools.simplify(
-            model, keep=keep, psnr=target_psnr, loss=loss, views=around, options=options, progress=progress
+            model, keep=keep, psnr=psnr, loss=loss, views=around, options=options, progress=progress
         )
     write_model(output, result.model, absolute=False)
     if source_index is not None:

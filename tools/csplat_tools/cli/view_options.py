@@ -10,10 +10,11 @@ import typer
 
 from csplat.model import SplatModel
 from csplat.upright import Direction
+from csplat_render.standing import seeming_up
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up, up_word
 from csplat_tools.files.convert import SceneOverrides
-from csplat_tools.views import DataOptions, Split, ViewSet, find_view_set
+from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
 __all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual"]
 
@@ -44,18 +45,20 @@ class Upright(Group):
         up = None if self.up is None else parse_up(self.up)
         return SceneOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
 
-    def seeming(self, axis: Direction | None, output: Output) -> Direction | None:
+    def seeming(self, axis: Direction | None, output: Output, *, shown: bool = True) -> Direction | None:
         """What is up where neither the user nor the scene says it; the user hears of it.
 
         Args:
             axis: what `seeming_up` finds.
             output: whether remarks are wanted.
+            shown: whether it stands so in what the command makes.
         """
         if axis is None or (self.up, self.axes) != (None, None):
             return None
         word = up_word(axis)
         output.remark(
-            f"the scene does not say which way is up; {word} seems to be (encode --up {word} writes it into the file)"
+            f"the scene does not say which way is up; {word} seems to be"
+            + (", and is taken for it (encode --up writes it into a file)" if shown else f": --up {word} writes it")
         )
         return axis
 
@@ -136,6 +139,13 @@ class Views(Group):
         """
         found = find_view_set(model, cameras=self.cameras, data=self.photographs(near), background=self.colour, **how)
         output.remark(*found.notes)
+        axis = None if output.quiet or found.name != VIRTUAL else seeming_up(model)
+        if axis is not None:
+            word = up_word(axis)
+            output.remark(
+                f"views are placed as if the scene had -y up, which it does not say; {word} seems to be:"
+                f" `csplat convert IN.ply OUT.ply --up {word}` says so, and other views have another PSNR"
+            )
         return found
 
 

@@ -204,8 +204,8 @@ class Display:
         self._bars.refresh()
 
 
-def format_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Lay out a table as text: the first column to the left, the others to the right.
+def format_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, left: int = 1) -> str:
+    """Lay out a table as text: the first columns to the left, the others to the right.
 
     The same on a terminal and in a pipe, so that it can be searched, cut and compared.
     """
@@ -213,11 +213,11 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str
     widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
     lines = []
     for row in cells:
-        first, *others = (
-            cell.rjust(width) if column else cell.ljust(width)
+        placed = (
+            cell.rjust(width) if column >= left else cell.ljust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
-        lines.append("  ".join((first, *others)).rstrip())
+        lines.append("  ".join(placed).rstrip())
     return "\n".join(lines)
 
 

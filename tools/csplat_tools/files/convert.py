@@ -7,17 +7,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from csplat import formats
 from csplat.decoder import Limits, decode
 from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply import read_ply
 from csplat.upright import Direction, with_up
 from csplat_tools.files.console import Progress
-from csplat_tools.files.scenes import LoadedModel, without_bands
-from csplat_tools.files.streams import mapped_csplat, ply_path, write_array, write_bytes, write_model
+from csplat_tools.files.scenes import LoadedModel, size_of, without_bands
+from csplat_tools.files.streams import mapped_csplat, source_path, write_array, write_bytes, write_model
 
 __all__ = [
     "Encoded",
@@ -133,10 +133,10 @@ def read_source(
     keep_extra: bool = False,
     progress: Progress | None = None,
 ) -> LoadedModel:
-    """Read a PLY, repaired where that is safe.
+    """Read a scene in any format, repaired where that is safe.
 
     Args:
-        file: the PLY: a path, or `-`; an open binary file; or bytes.
+        file: a path, or `-`; an open binary file; or bytes.
         facts: what it does not say.
         strict: refuse what would be repaired.
         keep_extra: carry columns that splats do not have.
@@ -149,9 +149,9 @@ def read_source(
     findings: list[Finding] = []
     report = progress or (lambda _stage, _done: None)
     report("reading", 0.0)
-    with ply_path(file) as local:
-        model = read_ply(local, strict=strict, keep_extra=keep_extra, report=findings)
-        size_bytes, name = local.stat().st_size, local.name
+    with source_path(file) as local:
+        model = formats.read(local, strict=strict, keep_extra=keep_extra, report=findings)
+        size_bytes, name = size_of(local), local.name
     report("reading", 1.0)
     return LoadedModel((facts or SceneOverrides()).applied(model), size_bytes, name=name, findings=tuple(findings))
 

@@ -1,20 +1,21 @@
-"""Scenes of either kind, a PLY or a .csplat file, for commands that look at splats."""
+"""Scenes in any format, for commands that look at splats."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from csplat import formats
 from csplat.decoder import SceneHeader, StatedErrors, decode_scene
 from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply import read_ply
 from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
 
-__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "without_bands"]
+__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "without_bands"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +53,12 @@ class LoadedModel:
         }
 
 
-#: A scene, as functions of this package take it: a model, or a file of either kind.
+#: A scene, as functions of this package take it: a model, or a file in any format.
 SceneLike = SplatModel | LoadedModel | File
 
 
 def load_model(scene: SceneLike) -> LoadedModel:
-    """Read a scene of either kind, a PLY or a .csplat file; which one its first bytes tell.
+    """Read a scene in any format (`csplat formats`); which one its content tells.
 
     Args:
         scene: the file: a path, an open binary file, or bytes; as a path `-` is standard input. What is a model, or
@@ -78,12 +79,21 @@ def load_model(scene: SceneLike) -> LoadedModel:
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
-        size_bytes, name = local.stat().st_size, local.name
+        size_bytes, name = size_of(local), local.name
         if not is_csplat(local):
-            return LoadedModel(read_ply(local), size_bytes, name=name)
+            return LoadedModel(formats.read(local), size_bytes, name=name)
         with mapped_csplat(str(local)) as data:
             decoded = decode_scene(data)
     return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files of a folder."""
+    if path.name.lower() in ("meta.json", "lod-meta.json"):  # of SOG: what it names lies beside it
+        path = path.parent
+    if not path.is_dir():
+        return path.stat().st_size
+    return sum(one.stat().st_size for one in path.rglob("*") if one.is_file())
 
 
 def ply_splat_bytes(sh_degree: int) -> int:

@@ -19,10 +19,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+import csplat_trainer  # noqa: F401  # makes checkpoints of other trainers known as scenes
 from csplat._spec import MAGIC
 from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
 from csplat.foreign import HEAD_SIZE, foreign_name, refuse_known
+from csplat.formats import formats
 from csplat.inputs import File, mapped
 from csplat.model import SplatModel
 from csplat.ply import write_ply
@@ -36,7 +38,7 @@ __all__ = [
     "local_path",
     "mapped_csplat",
     "open_output",
-    "ply_path",
+    "source_path",
     "write_array",
     "write_bytes",
     "write_json",
@@ -133,9 +135,11 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
         return
-    known = foreign_name(target)
-    maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix))
-    if known is None and maker is None and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
+    others = [one for one in formats() if one.write is not None and one.name not in ("ply", "csplat")]
+    converts = any(target.name.lower().endswith(one.suffixes) for one in others)
+    known = None if converts else foreign_name(target)
+    maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
+    if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
         return
     what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
     line = writer if writer.startswith("-") else f"csplat {writer}"
@@ -164,8 +168,8 @@ def local_path(file: File) -> Iterator[Path]:
 
 
 @contextmanager
-def ply_path(file: File) -> Iterator[Path]:
-    """Give the path of a PLY; what is no path of a file goes into a temporary one first.
+def source_path(file: File) -> Iterator[Path]:
+    """Give the path of a scene to be encoded; what is no path of a file goes into a temporary one first.
 
     Raises:
         InputError: it is a .csplat file.
@@ -282,7 +286,12 @@ def _refuse_others(name: str, data: bytes) -> None:
     if data[:4] in _PLY_MAGICS:
         raise InputError(f"{name} is a PLY, wanted a .csplat file: `csplat encode` makes one")
     if not data.startswith(MAGIC) and Path(name).suffix.lower() != ".csplat":
-        refuse_known(Path(name), data[:HEAD_SIZE])
+        try:
+            refuse_known(Path(name), data[:HEAD_SIZE])
+        except InputError:
+            raise InputError(
+                f"{name} is a scene in another format: `csplat encode` makes a .csplat file of it"
+            ) from None
 
 
 def _close(data: mmap) -> None:

@@ -30,7 +30,7 @@ F32 = NDArray[np.float32]
 USUAL_WEIGHTS = "auto"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """What was found out about two scenes.
 
@@ -59,6 +59,9 @@ class Comparison:
     mode: Mode
     notes: tuple[str, ...]
     seconds: float
+
+    def __repr__(self) -> str:
+        return f"Comparison({self.a.size_bytes:,} -> {self.b.size_bytes:,} bytes, {self.quality.psnr:.2f} dB)"
 
     @property
     def ratio(self) -> float:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from csplat import formats
 from csplat.decoder import decode_scene
 from csplat.files import read_array
-from csplat.ply import read_ply
 from csplat_conformance.stated import Proof, Source, prove
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import limits_for
-from csplat_tools.files.streams import mapped_csplat, ply_path
+from csplat_tools.files.streams import mapped_csplat, source_path
 
 __all__ = ["Verified", "verify_file"]
 
@@ -81,7 +81,7 @@ def verify_file(
         if source is None or not validation.conforms:
             return Verified(validation, None)
         scene = decode_scene(data, limits=limits_for(max_splats))
-    with ply_path(source) as ply:
-        model = read_ply(ply, keep_extra=bool(scene.header.extras))
+    with source_path(source) as path_of_source:
+        model = formats.read(path_of_source, keep_extra=bool(scene.header.extras))
     proof = prove(Source.of(model), scene.model, scene.header, scene.stated_errors, rows, progress=progress)
     return Verified(validation, proof)

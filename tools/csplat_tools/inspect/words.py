@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+from csplat.decoder import SceneHeader
+from csplat.model import SplatModel
 from csplat.training import TRAINING, VIEW, TrainedOn
 from csplat.upright import UP, up_of
 from csplat_tools.files.console import format_bytes
 from csplat_tools.inspect.info import AttributeFacts, FileFacts
 
-__all__ = ["coding_words", "headline", "other_metadata", "scene_words"]
+__all__ = ["coding_words", "headline", "other_metadata", "place_words", "scene_words"]
 
 
 def headline(facts: FileFacts) -> str:
@@ -21,17 +26,8 @@ def headline(facts: FileFacts) -> str:
 def scene_words(facts: FileFacts) -> dict[str, str]:
     """The scene, by what is told."""
     header = facts.header
-    flags = [name for name in ("antialiased", "flat") if getattr(header, name)]
-    up = up_of(facts.metadata or {}, header.coordinate_system)
-    words = {
-        "splats": f"{header.splat_count:,}, SH degree {header.sh_degree}",
-        "axes": str(header.coordinate_system),
-        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
-        "unit": "unknown" if header.unit_metres is None else f"{header.unit_metres:g} m",
-        "origin": " ".join(f"{value:.17g}" for value in header.origin),
-        "flags": ", ".join(flags) or "none",
-        "tiles": _tiles(facts),
-    }
+    words = place_words(header, header.splat_count, facts.metadata or {})
+    words["tiles"] = _tiles(facts)
     extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
     if extras:
         words["extra"] = extras
@@ -44,6 +40,26 @@ def scene_words(facts: FileFacts) -> dict[str, str]:
     if view is not None:
         words["first view"] = "a camera of the metadata"
     return words
+
+
+def place_words(said: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
+    """How many splats there are, and how they lie.
+
+    Args:
+        said: what a file says of them.
+        count: N.
+        metadata: of the scene.
+    """
+    flags = [name for name in ("antialiased", "flat") if getattr(said, name)]
+    up = up_of(metadata, said.coordinate_system)
+    return {
+        "splats": f"{count:,}, SH degree {said.sh_degree}",
+        "axes": str(said.coordinate_system),
+        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
+        "unit": "unknown" if said.unit_metres is None else f"{said.unit_metres:g} m",
+        "origin": " ".join(f"{value:.17g}" for value in said.origin),
+        "flags": ", ".join(flags) or "none",
+    }
 
 
 def other_metadata(facts: FileFacts) -> dict[str, object]:

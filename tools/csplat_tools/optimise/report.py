@@ -85,7 +85,7 @@ class Report:
         return (*lines, cost)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Optimised:
     """A file that keeps to a target.
 
@@ -96,6 +96,11 @@ class Optimised:
 
     result: EncodeResult
     report: Report
+
+    def __repr__(self) -> str:
+        said, psnr = self.result.report, self.report.psnr
+        quality = "" if psnr is None else f", {psnr:.2f} dB"
+        return f"Optimised({said.size_bytes:,} bytes, {said.splat_count:,} splats{quality})"
 
     @property
     def data(self) -> bytes:

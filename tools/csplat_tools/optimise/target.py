@@ -85,6 +85,7 @@ class Target:
         return {**said, "max_error": dict(self.max_error)} if self.max_error else said
 
 
+_LEAST_FILE = 64  # bytes of a header
 _ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_loss": "a loss", "keep": "a share of the splats"}
 
 
@@ -99,6 +100,8 @@ def parse_size_bytes(text: str) -> int:
     size = None if found is None or unit is None else float(found[1]) * unit
     if size is None or not 1.0 <= size < 2.0**63:
         raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
+    if size < _LEAST_FILE:
+        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
     return int(size)
 
 

@@ -44,7 +44,7 @@ test('what seems to be up is asked for last, and of the first scene alone', () =
   assert.deepEqual(opened({ axes: 'RUB' }, { seems }).up, [0, 1, 0]);
   const view = opened({}, { seems });
   assert.deepEqual(view.up, seems);
-  assert.ok(!view.knowsUp);
+  assert.ok(view.knowsUp);
   view.begin();
   view.read({ axes: '' }, { metadata: null, cameras: null });
   assert.deepEqual(view.up, [0, -1, 0]);

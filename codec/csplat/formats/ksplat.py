@@ -1,0 +1,205 @@
+""".ksplat 0.1 of mkkellogg/GaussianSplats3D: sections of rows, in floats or in smaller numbers around bucket centres.
+
+Level 0 has float32 throughout. Levels 1 and 2 have positions of 16 bits in a block around the centre of a bucket of
+splats, everything else as float16, but SH as bytes at level 2. SH go up to degree 2. No file says which way is up.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.formats.format import Format
+from csplat.formats.rows import colours_of_bytes, finite_scene, logs_of_scales
+from csplat.inputs import mapped
+from csplat.model import F32, SplatModel, normalise_quats
+from csplat.scene import BLOCK, Scene
+
+__all__ = ["FORMAT"]
+
+Rows = NDArray[Any]
+F64 = NDArray[np.float64]
+
+_HEADER = struct.Struct("<BBxxIIIIHxx12xff")
+_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+_HEADER_SIZE, _SECTION_SIZE = 4096, 1024
+_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
+_COEFFICIENTS = (0, 9, 24)  # of SH, by degree
+_CENTRE_SIZE = 12
+_USUAL_RANGE = 32767  # units of a position from the centre of its block to its face
+_USUAL_SH = 1.5  # bytes of SH reach from -1.5 to 1.5
+_LARGEST = 1e38  # any farther leaves float32
+
+
+@dataclass(frozen=True, eq=False)
+class _Section:
+    """Splats whose rows are of one type.
+
+    Attributes:
+        ends: [buckets] the splat at which each ends.
+        corners: [buckets, 3] what a position of 0 means in each.
+        step: scene units per unit of a position.
+    """
+
+    rows: Rows
+    ends: NDArray[np.int64]
+    corners: F64
+    step: float
+
+
+class _SectionHead(NamedTuple):
+    """The header of a section.
+
+    Attributes:
+        room: for how many splats there are bytes.
+        bucket: splats of a full bucket.
+        block: length of the block around a bucket's centre, scene units.
+        span: units of a position from there to a face; 0: the usual.
+        full, partial: how many buckets are full, and are not.
+    """
+
+    splats: int
+    room: int
+    bucket: int
+    buckets: int
+    block: float
+    centre_size: int
+    span: int
+    size_bytes: int
+    full: int
+    partial: int
+    degree: int
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Scene]:
+    data = mapped(path)
+    if len(data) < _HEADER_SIZE:
+        raise InputError(f"{path.name} ends inside of its header")
+    major, minor, most, _, _, count, level, low, high = _HEADER.unpack_from(data)
+    if (major, minor) != (0, 1):
+        raise InputError(f"{path.name} is .ksplat of version {major}.{minor}, wanted 0.1")
+    if level >= len(_TYPES):
+        raise InputError(f"{path.name} has compression level {level}, wanted at most {len(_TYPES) - 1}")
+    low, high = low or -_USUAL_SH, high or _USUAL_SH
+    if not (abs(low) < _LARGEST and abs(high) < _LARGEST):
+        raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers")
+    sections = list(_sections(path.name, data, level, most))
+    total = sum(len(section.rows) for section in sections)
+    if total != count:
+        raise InputError(f"{path.name} has {total:,} splats in its sections, and its header says {count:,}")
+    widest = max((section.rows.dtype["shN"].shape[0] for section in sections if len(section.rows)), default=0)
+
+    def blocks() -> Iterator[tuple[Rows, ...]]:
+        for section in sections:
+            yield from _placed(section)
+
+    def decoded(rows: Rows, corners: F64, steps: F64) -> SplatModel:
+        return SplatModel(
+            means=(rows["means"] * steps + corners).astype(np.float32),
+            quats=normalise_quats(rows["quats"].astype(np.float32)),
+            scales=logs_of_scales(rows["scales"]),
+            opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
+            sh0=colours_of_bytes(rows["colours"][:, :3]),
+            shN=_rest(rows["shN"], widest, low, high),
+        )
+
+    nothing = np.empty(0, _row_type(level, 0))
+    yield finite_scene(blocks, decoded, decoded(nothing, np.zeros((0, 3)), np.zeros((0, 1))))
+
+
+def _row_type(level: int, degree: int) -> np.dtype[Any]:
+    means, others, rest = _TYPES[level]
+    return np.dtype(
+        [
+            ("means", means, 3),
+            ("scales", others, 3),
+            ("quats", others, 4),
+            ("colours", "u1", 4),
+            ("shN", rest, (_COEFFICIENTS[degree],)),
+        ]
+    )
+
+
+def _sections(name: str, data: Any, level: int, most: int) -> Iterator[_Section]:
+    at = _HEADER_SIZE + most * _SECTION_SIZE
+    if at > len(data):
+        raise InputError(f"{name} says it has {most:,} sections, more than its {len(data):,} bytes can hold")
+    for index in range(most):
+        head = _SectionHead(*_SECTION.unpack_from(data, _HEADER_SIZE + index * _SECTION_SIZE))
+        where = f"{name}, section {index}"
+        if head.degree >= len(_COEFFICIENTS):
+            raise InputError(f"{where}: SH degree {head.degree}, wanted at most {len(_COEFFICIENTS) - 1}")
+        row = _row_type(level, head.degree)
+        centres = at + 4 * head.partial
+        start = centres + head.centre_size * head.buckets
+        at = start + row.itemsize * head.room
+        if at > len(data):
+            raise InputError(f"{where} ends at byte {at:,}, and the file at {len(data):,}")
+        if head.splats > head.room:
+            raise InputError(f"{where}: {head.splats:,} splats in room for {head.room:,}")
+        rows = np.frombuffer(data, row, head.splats, start)
+        if level and head.splats:
+            yield _Section(rows, *_buckets(where, data, head, centres))
+        else:
+            yield _Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0)
+
+
+def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
+    """Where they end, where their corners lie, and the step, as in `_Section`. The lengths of those that are not full
+    stand before the centres of all.
+    """
+    if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
+        raise InputError(f"{where}: {head.full:,} full buckets and {head.partial:,} others, of {head.buckets:,}")
+    lengths = np.frombuffer(data, "<u4", head.partial, centres - 4 * head.partial)
+    ends = np.cumsum(np.concatenate([np.full(head.full, head.bucket, np.int64), lengths]))
+    if not len(ends) or ends[-1] < head.splats:
+        raise InputError(f"{where}: its buckets hold fewer than its {head.splats:,} splats")
+    middles = np.frombuffer(data, "<f4", 3 * head.buckets, centres).reshape(-1, 3).astype(np.float64)
+    span = head.span or _USUAL_RANGE
+    step = head.block / 2 / span
+    if not (np.abs(middles) + 65535 * abs(step) < _LARGEST).all():
+        raise InputError(f"{where}: its buckets do not lie at finite places")
+    return ends, middles - span * step, step
+
+
+def _placed(section: _Section) -> Iterator[tuple[Rows, ...]]:
+    for start in range(0, len(section.rows), BLOCK):
+        rows = section.rows[start : start + BLOCK]
+        bucket = np.searchsorted(section.ends, np.arange(start, start + len(rows)), side="right")
+        yield rows, section.corners[bucket], np.full((len(rows), 1), section.step)
+
+
+def _rest(coded: Rows, widest: int, low: float, high: float) -> F32:
+    """SH, which lie band by band, then channel by channel."""
+    width = coded.shape[1]
+    bands = [np.arange(start, end).reshape(3, -1).T for start, end in pairwise(_COEFFICIENTS) if end <= width]
+    values = coded[:, np.concatenate([np.zeros(0, np.int64), *(band.ravel() for band in bands)])].astype(np.float32)
+    if coded.dtype.kind == "u":
+        values *= np.float32((high - low) / 255)
+        values += np.float32(low)
+    values = values if width == widest else np.pad(values, ((0, 0), (0, widest - width)))
+    return values.reshape(len(coded), widest // 3, 3)
+
+
+def _is_ksplat(_path: Path, head: bytes) -> bool:
+    return head[:4] == b"\0\1\0\0" and len(head) > _HEADER.size and not any(head[_HEADER.size :])
+
+
+FORMAT = Format(
+    name="ksplat",
+    title=".ksplat",
+    suffixes=(".ksplat",),
+    sniff=_is_ksplat,
+    open=_open,
+    degree=2,
+)

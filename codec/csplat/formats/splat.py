@@ -1,0 +1,86 @@
+""".splat of antimatter15/splat: 32 bytes a splat and nothing else: no SH, no axes, no word of what it is.
+
+Position and standard deviations are floats; colour, opacity and rotation bytes. Its name alone tells it apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.formats.format import Format
+from csplat.formats.rows import SH_C0, colours_of_bytes, finite_scene, logs_of_scales
+from csplat.inputs import mapped
+from csplat.model import F32, SplatModel, normalise_quats
+from csplat.scene import BLOCK, Scene
+
+__all__ = ["FORMAT"]
+
+_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
+_LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Scene]:
+    data = mapped(path)
+    if len(data) % _ROW.itemsize:
+        raise InputError(f"{path.name} has {len(data):,} bytes, wanted a multiple of {_ROW.itemsize} (.splat)")
+    rows = np.frombuffer(data, _ROW)
+
+    def blocks() -> Iterator[tuple[NDArray[Any], ...]]:
+        for start in range(0, len(rows), BLOCK):
+            yield (rows[start : start + BLOCK],)
+
+    yield finite_scene(blocks, _decoded, _decoded(rows[:0]))
+
+
+def _decoded(rows: NDArray[Any]) -> SplatModel:
+    return SplatModel(
+        means=rows["means"].astype(np.float32),
+        quats=normalise_quats(np.subtract(rows["quats"], 128, dtype=np.float32)),
+        scales=logs_of_scales(rows["scales"]),
+        opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
+        sh0=colours_of_bytes(rows["colours"][:, :3]),
+    )
+
+
+def _write(path: Path, scene: Scene) -> None:
+    with atomic_writer(path) as stream:
+        for model in scene.blocks():
+            rows = np.empty(len(model), _ROW)
+            rows["means"] = model.means
+            rows["scales"] = np.exp(np.minimum(model.scales, _LARGEST_LOG))
+            rows["colours"][:, :3] = _bytes((model.sh0 * SH_C0 + np.float32(0.5)) * np.float32(255))
+            rows["colours"][:, 3] = _bytes(model.opacities * np.float32(255))
+            rows["quats"] = _bytes(_with_negative_largest(model.quats) * np.float32(128) + np.float32(128))
+            stream.write(rows.tobytes())
+
+
+def _with_negative_largest(quats: F32) -> F32:
+    """The same rotations: -1 has a byte and 1 has none, and some viewers do not normalise."""
+    largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
+    return np.where(largest > 0, -quats, quats)
+
+
+def _bytes(values: F32) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+FORMAT = Format(
+    name="splat",
+    title=".splat",
+    suffixes=(".splat",),
+    sniff=lambda _path, _head: False,
+    open=_open,
+    write=_write,
+    degree=0,
+    splat_bytes=(32.0,),
+    exact=frozenset({"means"}),
+)

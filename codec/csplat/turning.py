@@ -1,0 +1,345 @@
+"""The same scene in other coordinates: turned, mirrored, scaled, moved, stretched.
+
+A mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ does not tell M from -M, one of which is a rotation.
+Its colours follow by the parity of their SH bands. So axes of either handedness can be reached from any others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.errors import InputError
+from csplat.model import F32, UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
+from csplat.scene import Scene
+from csplat.training import VIEW
+from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
+
+__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "stretched", "turned"]
+
+F64 = NDArray[np.float64]
+_Rows = TypeVar("_Rows", F32, F64)
+
+_OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
+#: What the axes of a scene are taken for that does not name them: those of its cameras' makers, COLMAP and OpenCV.
+USUAL = "RDF"
+_ORTHOGONAL = 1e-6  # of the entries of M Mᵀ - 1
+_WHOLE = 1e-9  # entries of a computed rotation that are as near to a whole number are that number
+_DIRECTIONS = 40
+_EVEN = 1e-6  # lengths in three directions that differ by less are one: files have them in float32
+_ROWS = 1024  # that are in float64 at a time: they stay in the cache
+
+
+def axes_rotation(before: str, after: str) -> F64:
+    """The matrix that takes coordinates along some axes to those along others.
+
+    Args:
+        before: directions of +x, +y and +z, three letters as in `SplatModel`.
+        after: the same of the other axes.
+
+    Returns:
+        [3, 3] float64 of 0, 1 and -1; where one of the two is left-handed and the other is not, a mirror.
+
+    Examples:
+        >>> import csplat.turning
+        >>> csplat.turning.axes_rotation("RDF", "LUF").tolist()
+        [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
+
+    Raises:
+        InputError: they are no axes.
+    """
+    check_axes(before)
+    check_axes(after)
+    return np.array([[(old == new) - float(old == _OPPOSITE[new]) for old in before] for new in after]) + 0.0
+
+
+def in_axes(scene: Scene, axes: str) -> Scene:
+    """A scene along the axes that a format has.
+
+    Who names no axes is taken to have x to the right, y down and z forward, and is tilted then, where it says which way
+    is up.
+
+    Args:
+        scene: the scene.
+        axes: directions of +x, +y and +z, three letters.
+    """
+    matrix = _rotation_to(scene.facts, axes)
+
+    def placed(model: SplatModel) -> SplatModel:
+        return replace(turned(model, matrix), coordinate_system=axes)
+
+    def blocks() -> Iterator[SplatModel]:
+        yield from map(placed, scene.blocks())
+
+    same = scene.facts.coordinate_system == axes
+    return scene if same else Scene(scene.count, placed(scene.facts), blocks, scene.findings)
+
+
+def turned(model: SplatModel, rotation: ArrayLike) -> SplatModel:
+    """The same scene turned about its zero, with all that has a direction: rotations, colours, origin, up, cameras.
+
+    Where the matrix only permutes and flips axes, means, rotations and scales are exact, and SH as well where z stays
+    on its line: turned back the arrays are the same, bit for bit.
+
+    Args:
+        model: the scene, or some of its splats.
+        rotation: [3, 3] orthogonal, applied to columns; of a mirror cameras see mirror images of their pictures.
+
+    Returns:
+        The scene. Axes that lie along no axes any more are not named; what was up by them stands in the metadata.
+
+    Raises:
+        InputError: the matrix is not orthogonal.
+    """
+    matrix = np.asarray(rotation, np.float64)
+    if matrix.shape != (3, 3) or not (np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all():
+        raise InputError(f"the rotation is {matrix.tolist()}, wanted an orthogonal matrix [3, 3]")
+    quats, scales = _turned_shapes(model, matrix)
+    x, y, z = _applied(matrix, np.array(model.origin)).tolist()
+    doubles = None if model.means_double is None else _applied(matrix, model.means_double)
+    return replace(
+        model,
+        means=_applied(matrix, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
+        quats=quats,
+        scales=scales,
+        shN=_turned_sh(model.shN, matrix),
+        origin=(x, y, z),
+        means_double=doubles,
+        **_turned_facts(model, matrix),
+    )
+
+
+def scaled(model: SplatModel, factor: float) -> SplatModel:
+    """The same scene in units that are so many times as short: all its lengths are multiplied.
+
+    Raises:
+        InputError: the factor is not above 0, or something leaves float32.
+    """
+    if not 0.0 < factor < np.inf:
+        raise InputError(f"the factor is {factor}, wanted one above 0")
+    with np.errstate(over="ignore"):
+        origin = np.array(model.origin) * factor
+        doubles = None if model.means_double is None else model.means_double * factor
+        means = model.means.astype(np.float64) * factor if doubles is None else doubles - origin
+        x, y, z = origin.tolist()
+        return replace(
+            model,
+            means=means.astype(np.float32),
+            scales=(model.scales.astype(np.float64) + np.log(factor)).astype(np.float32),
+            origin=(x, y, z),
+            means_double=doubles,
+            unit_metres=None if model.unit_metres is None else model.unit_metres / factor,
+            **_with_cameras(model, lambda camera: _scaled_camera(camera, factor)),
+        )
+
+
+def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
+    """The same scene under any linear map: turned, and scaled in three directions, of which each may be another's.
+
+    Args:
+        model: the scene, or some of its splats; its colours turn. Where lengths change by direction, cameras are lost.
+        matrix: [3, 3], applied to columns, not flat.
+
+    Raises:
+        InputError: something leaves float32.
+    """
+    left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
+    model = turned(model, _snapped(left @ right))
+    factor = float(lengths.mean())
+    if np.ptp(lengths) < _EVEN * factor:
+        return model if abs(factor - 1.0) < _WHOLE else scaled(model, factor)
+    stretch: F64 = (left * lengths) @ left.T
+    x, y, z = (stretch @ model.origin).tolist()
+    doubles = None if model.means_double is None else _applied(stretch, model.means_double)
+    with np.errstate(over="ignore"):
+        root = stretch @ _matrices(model.quats) * np.exp(model.scales.astype(np.float64))[:, None]
+        turns, axes, _ = np.linalg.svd(root)
+        turns[:, :, 2] *= np.linalg.det(turns)[:, None]
+        return replace(
+            model,
+            means=_applied(stretch, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
+            quats=normalise_quats(_quat_of(turns)),
+            scales=np.log(np.maximum(axes, np.finfo(np.float32).tiny)).astype(np.float32),
+            origin=(x, y, z),
+            means_double=doubles,
+            cameras=None,
+            metadata={name: said for name, said in model.metadata.items() if name != VIEW},
+        )
+
+
+def moved(model: SplatModel, offset: Direction) -> SplatModel:
+    """The same scene elsewhere: its origin moves, to which means and cameras are relative."""
+    x, y, z = (a + b for a, b in zip(model.origin, offset, strict=True))
+    if model.means_double is None:
+        return replace(model, origin=(x, y, z))
+    doubles = model.means_double + np.array(offset)
+    return replace(model, origin=(x, y, z), means=(doubles - (x, y, z)).astype(np.float32), means_double=doubles)
+
+
+def _rotation_to(facts: SplatModel, axes: str) -> F64:
+    known = facts.coordinate_system != UNSPECIFIED
+    matrix = axes_rotation(facts.coordinate_system if known else USUAL, axes)
+    up, wanted = up_of(facts.metadata), up_of_axes(axes)
+    if known or up is None or wanted is None:
+        return matrix
+    tilted: F64 = _tilt(_applied(matrix, np.array(up)), np.array(wanted)) @ matrix
+    return tilted
+
+
+def _tilt(start: F64, end: F64) -> F64:
+    """The smallest rotation that takes one unit vector to another."""
+    axis, cosine = np.cross(start, end), float(start @ end)
+    if cosine < -1.0 + 1e-12:  # half a turn, about the axis that is farthest from them
+        axis = np.eye(3)[int(np.abs(start).argmin())]
+        axis -= start * (axis @ start)
+        return _snapped(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    left, _, right = np.linalg.svd(np.eye(3) + cross + cross @ cross / (1.0 + cosine))
+    return _snapped(left @ right)  # orthogonal, also where the vectors were unit to six digits
+
+
+def _applied(matrix: F64, rows: _Rows) -> _Rows:
+    """A square matrix times each row; bits stay as they are where it only permutes and flips."""
+    order = np.abs(matrix).argmax(axis=1)
+    signs: F64 = matrix[np.arange(len(matrix)), order]
+    if (np.abs(signs) == 1.0).all() and np.count_nonzero(matrix) == len(matrix):
+        picked = rows if (order == np.arange(len(order))).all() else rows[..., order]
+        return np.multiply(picked, signs, dtype=rows.dtype)
+    out = np.empty_like(rows)
+    with np.errstate(over="ignore"):  # the model refuses what is infinite
+        for start in range(0, len(rows), _ROWS):
+            part = slice(start, start + _ROWS)
+            out[part] = rows[part].astype(np.float64) @ matrix.T
+    return out
+
+
+def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
+    """Rotations and scales: either the axes of the splats are permuted with those of the scene, or both turn."""
+    proper = matrix * np.sign(np.linalg.det(matrix))
+    order = np.abs(matrix).argmax(axis=1)
+    whole = np.count_nonzero(matrix) == 3
+    # M R S Rᵀ Mᵀ = (M R Mᵀ) (M S Mᵀ) (M R Mᵀ)ᵀ, and M S Mᵀ is diagonal. The third scale of discs stays the third.
+    if whole and not (model.flat and order[2] != 2):
+        turn = np.eye(4)
+        turn[1:, 1:] = np.rint(proper)
+        return _applied(turn, model.quats), model.scales[:, order]
+    return normalise_quats(_applied(_product(_quat_of(proper)), model.quats)), model.scales
+
+
+def _quat_of(matrix: F64) -> F64:
+    """Quaternions of rotations [..., 3, 3]: eigenvectors of largest eigenvalues (Bar-Itzhack 2000), at any angle."""
+    a, b, c, d, e, f, g, h, i = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 9), -1, 0)
+    lower = np.zeros((*matrix.shape[:-2], 4, 4))
+    entries = (a + e + i, h - f, a - e - i, c - g, b + d, e - a - i, d - b, c + g, f + h, i - a - e)
+    for row, column, entry in zip(*np.tril_indices(4), entries, strict=True):
+        lower[..., row, column] = entry
+    quats: F64 = np.linalg.eigh(lower)[1][..., 3]
+    return quats
+
+
+def _matrices(quats: F32) -> F64:
+    w, x, y, z = normalise_quats(quats).astype(np.float64).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _product(quat: F64) -> F64:
+    """The matrix that multiplies quaternions by one from the left."""
+    w, x, y, z = quat
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+
+def _turned_sh(shN: F32, matrix: F64) -> F32:
+    """Colours at M v become what they were at v, band by band: bands do not mix."""
+    index = np.arange(_DIRECTIONS) + 0.5
+    height, angle = 1.0 - 2.0 * index / _DIRECTIONS, index * np.pi * (3.0 - np.sqrt(5.0))  # a Fibonacci lattice
+    ring = np.sqrt(1.0 - height * height)
+    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+    there, before = _bands(directions), _bands(directions @ matrix)  # rows: v there is Mᵀ v before
+    out = np.empty_like(shN)
+    for band in range(1, sh_degree_of(shN.shape[1]) + 1):
+        part = slice(band**2 - 1, (band + 1) ** 2 - 1)
+        turn = _snapped(np.linalg.lstsq(there[band - 1], before[band - 1], rcond=None)[0])
+        shape = len(shN), 2 * band + 1, 3
+        channels = np.kron(turn, np.eye(3)).astype(np.float64)  # all three at once
+        out[:, part] = _applied(channels, shN[:, part].reshape(len(shN), channels.shape[0])).reshape(shape)
+    return out
+
+
+def _snapped(matrix: NDArray[Any]) -> F64:
+    whole = np.rint(matrix)
+    snapped: F64 = np.where(np.abs(matrix - whole) < _WHOLE, whole, matrix)
+    return snapped
+
+
+def _bands(directions: F64) -> list[F64]:
+    """Values of the basis of bands 1, 2 and 3 in unit directions, in the order and with the signs of INRIA and gsplat.
+
+    A factor that all functions of a band have is left out.
+    """
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    first = [-y, z, -x]
+    second = [2.0 * x * y, -2.0 * y * z, (2.0 * zz - xx - yy) / 3.0**0.5, -2.0 * x * z, xx - yy]
+    third = [
+        -y * (3.0 * xx - yy),
+        24.0**0.5 * x * y * z,
+        -(0.6**0.5) * y * (4.0 * zz - xx - yy),
+        0.4**0.5 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -(0.6**0.5) * x * (4.0 * zz - xx - yy),
+        6.0**0.5 * z * (xx - yy),
+        -x * (xx - 3.0 * yy),
+    ]
+    return [np.stack(band, axis=1) for band in (first, second, third)]
+
+
+def _turned_facts(model: SplatModel, matrix: F64) -> dict[str, Any]:
+    """Axes, metadata and cameras."""
+    letters = model.coordinate_system
+    fields = _with_cameras(model, lambda camera: _turned_camera(camera, matrix))
+    up = up_of(model.metadata)
+    if letters != UNSPECIFIED:
+        whole = np.count_nonzero(matrix) == 3
+        up = up_of_axes(letters) if up is None and not whole else up
+        pairs = zip(np.abs(matrix).argmax(axis=1), matrix.sum(axis=1), strict=True)
+        named = "".join(letters[old] if sign > 0.0 else _OPPOSITE[letters[old]] for old, sign in pairs)
+        fields["coordinate_system"] = named if whole else UNSPECIFIED
+    if up is not None:
+        fields["metadata"] = {**fields.get("metadata", model.metadata), UP: list(unit_up((matrix @ up).tolist()))}
+    return fields
+
+
+def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+    """Fields of a model whose cameras are changed; a view that is no camera stays as it is."""
+    fields: dict[str, Any] = {}
+    if model.cameras:
+        fields["cameras"] = [change(camera) for camera in model.cameras]
+    if VIEW in model.metadata:
+        with suppress(TypeError, ValueError, KeyError, IndexError):
+            fields["metadata"] = {**model.metadata, VIEW: change(model.metadata[VIEW])}
+    return fields
+
+
+def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
+    view, K = np.array(camera["viewmat"], np.float64), np.array(camera["K"], np.float64)
+    view[:3, :3] = view[:3, :3] @ matrix.T
+    if np.linalg.det(matrix) < 0.0:  # left and right change places, so that it stays a rotation
+        view[0] *= -1.0
+        K[0, 2] = camera["W"] - K[0, 2]
+    return {**camera, "viewmat": view.tolist(), "K": K.tolist()}
+
+
+def _scaled_camera(camera: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    view = np.array(camera["viewmat"], np.float64)
+    view[:3, 3] *= factor
+    near = {"near": camera["near"] * factor} if "near" in camera else {}
+    return {**camera, "viewmat": view.tolist(), **near}

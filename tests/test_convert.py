@@ -1,0 +1,205 @@
+"""`csplat convert` and `csplat formats`: any format to any other, what is changed on the way, what is lost."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import csplat
+from csplat import formats
+from csplat.model import SplatModel, normalise_quats
+from csplat.ply import read_ply, write_ply
+from csplat.scene import scene_of
+from csplat.turning import in_axes
+from csplat_tools.cli.app import app
+from csplat_tools.files.converting import convert_file
+from csplat_tools.files.filters import Filters, isolated
+
+
+def call(*words, status=0):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert status == result.exit_code, (result.output, result.exception)
+    return result
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    write_ply(tmp_path / "in.ply", make_model(200, 2))
+    return tmp_path / "in.ply"
+
+
+def test_a_ply_becomes_a_csplat_file_and_back(tmp_path, ply):
+    said = json.loads(call("convert", ply, tmp_path / "a.csplat", "--json").stdout)
+    assert ("ply", "csplat", 200, 2) == (said["source_format"], said["format"], said["splats"], said["sh_degree"])
+    assert ((tmp_path / "a.csplat").stat().st_size, []) == (said["size_bytes"], said["lost"])
+    assert {"means", "shN"} <= set(said["rounded"])
+    call("convert", tmp_path / "a.csplat", tmp_path / "b.ply")
+    assert (csplat.decode(tmp_path / "a.csplat").means == read_ply(tmp_path / "b.ply").means).all()
+
+
+def test_what_is_lost_is_said_refused_and_foretold(tmp_path, ply):
+    out = tmp_path / "out.csplat"
+    assert "lost on the way: precision of means" in call("convert", ply, out, "--dry-run").stderr
+    refused = call("convert", ply, out, "--no-loss", status=1).stderr
+    assert "does not keep all of" in refused
+    assert not out.exists()
+    assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
+    expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
+    assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("a.xyz",), "no format has that ending"),
+        (("-",), "standard output"),
+        (("a.ply", "--to", "zzz"), "wanted one of "),
+        (("a.ply", "--rotate", "1,2"), "wanted 3 numbers"),
+        (("a.ply", "--crop-sphere", "0,0,0,-1"), "radius"),
+        (("a.ply", "--scale", "0"), "above 0"),
+        (("a.ply", "--to-axes", "XYZ"), "axes are"),
+        (("in.ply", "--force"), "is the input"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(tmp_path, ply, monkeypatch, words, says):
+    monkeypatch.chdir(tmp_path)
+    before = ply.read_bytes()
+    result = CliRunner().invoke(app, ["convert", "in.ply", *words])
+    assert result.exit_code in (1, 2)
+    assert says in result.stderr
+    assert before == ply.read_bytes()
+    assert ["in.ply"] == [one.name for one in tmp_path.iterdir()]
+
+
+def test_a_scene_is_changed_in_the_order_that_help_says(tmp_path, ply):
+    call(
+        "convert", ply, tmp_path / "out.ply", "--rotate", "0,0,90", "--scale", "2", "--translate", "1,0,0",
+        "--crop-box", "-1,-1,-1,3,1,1", "--sh-degree", "1",
+    )  # fmt: skip
+    source, found = read_ply(ply), read_ply(tmp_path / "out.ply")
+    turned = np.stack([-source.means[:, 1], source.means[:, 0], source.means[:, 2]], axis=1)
+    wanted = (2.0 * turned + np.array([1.0, 0.0, 0.0])).astype(np.float32)
+    inside = ((wanted >= [-1, -1, -1]) & (wanted <= [3, 1, 1])).all(axis=1)
+    assert 0 < inside.sum() < 200
+    assert np.allclose(wanted[inside], found.means, atol=1e-5)
+    assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
+    assert 1 == found.sh_degree
+
+
+def test_a_sphere_is_kept_around_the_places_that_people_see(make_model):
+    model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
+    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).applied(scene_of(model))
+    assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
+
+
+def test_axes_are_turned_and_said(tmp_path, ply):
+    call("convert", ply, tmp_path / "a.ply", "--to-axes", "RUB")
+    call("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--to-axes", "RDF")
+    source, there, back = read_ply(ply), read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
+    assert ("RUB", "RDF") == (there.coordinate_system, back.coordinate_system)
+    assert (source.means * np.float32([1, -1, -1]) == there.means).all()
+    assert all((getattr(source, name) == getattr(back, name)).all() for name in ("means", "quats", "shN"))
+
+
+def lonely(seed=0):
+    """A ball of fine splats; three that float, of which one is so large that it has company."""
+    rng = np.random.default_rng(seed)
+    points = rng.standard_normal((3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return np.concatenate([points, [[3, 0, 0], [0, 50.0, 0], [2.5, 0, 0]]]), np.r_[np.full(3002, 0.03), 1.0]
+
+
+def test_splats_without_company_float():
+    points, sizes = lonely()
+    assert [3000, 3001] == np.flatnonzero(isolated(points, sizes)).tolist()
+    assert not isolated(points[:5], sizes[:5]).any()
+    assert not isolated(np.zeros((20, 3)), np.ones(20)).any()
+
+
+def test_floaters_are_dropped():
+    points, sizes = lonely()
+    n = len(points)
+    model = SplatModel(
+        means=points.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        scales=np.log(np.tile(sizes[:, None], 3)).astype(np.float32),
+        opacities=np.full(n, 0.9, np.float32),
+        sh0=np.zeros((n, 3), np.float32),
+    )
+    left = Filters(drop_floaters=True).applied(scene_of(model))
+    assert 3001 == left.count == len(left.model())
+
+
+def test_formats_are_listed():
+    rows = json.loads(call("formats", "--json").stdout)
+    assert {"ply", "csplat"} <= {row["format"] for row in rows}
+    assert ".ply" in call("formats").stdout
+
+
+def test_info_and_lint_take_any_format(tmp_path, ply):
+    told = call("info", ply).stdout
+    assert "200, SH degree 2" in told
+    assert told.startswith("PLY, ")
+    assert 200 == json.loads(call("info", ply, "--json").stdout)["splats"]
+    assert "nothing found" in call("lint", ply).stdout
+    assert "E_INPUT" in call("info", ply, "--page", tmp_path / "p.html", status=1).stderr
+
+
+def test_what_has_fixed_axes_comes_back_as_it_went(tmp_path, ply):
+    there = json.loads(call("convert", ply, tmp_path / "a.spz", "--json").stdout)
+    back = json.loads(call("convert", tmp_path / "a.spz", tmp_path / "b.ply", "--json").stdout)
+    assert (["unspecified", "RUB"], ["RUB", "RDF"]) == (there["axes"], back["axes"])
+    source, found = read_ply(ply), read_ply(tmp_path / "b.ply")
+    assert np.allclose(source.means, found.means, atol=1e-3)
+    assert (np.abs(np.sum(source.quats * found.quats, axis=1)) > 0.999).all()
+    call("convert", tmp_path / "a.spz", tmp_path / "c.ply", "--to-axes", "RUB")
+    assert np.allclose(read_ply(tmp_path / "c.ply").means, source.means * [1, -1, -1], atol=1e-3)
+
+
+BOTH = [one.name for one in formats.formats() if one.open is not None and one.write is not None]
+
+
+@st.composite
+def scenes(draw):
+    count, degree = draw(st.integers(1, 5)), draw(st.integers(0, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    size = draw(st.sampled_from([1e-3, 1.0, 50.0]))
+    return SplatModel(
+        means=(size * rng.standard_normal((count, 3))).astype(np.float32),
+        quats=normalise_quats(rng.standard_normal((count, 4))),
+        scales=rng.uniform(-6.0, 1.0, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.02, 0.98, count).astype(np.float32),
+        sh0=rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32),
+        shN=rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+    )
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(BOTH), st.sampled_from(BOTH), scenes())
+def test_what_two_formats_call_exact_is_exact_from_one_to_the_other(tmp_path, first, second, model):
+    one, other = formats.named(first), formats.named(second)
+    a, b = tmp_path / f"a{one.suffixes[0]}", tmp_path / f"b{other.suffixes[0]}"
+    formats.write(a, model, first)
+    converted = convert_file(
+        str(a), str(b), read_as=first, write_as=second, filters=Filters(to_axes=other.axes or "RDF")
+    )
+    source, found = (
+        in_axes(scene_of(formats.read(path, name)), "RDF").model() for path, name in ((a, first), (b, second))
+    )
+    assert len(source) == converted.count == len(found)
+    for name in one.exact & other.exact:
+        left, right = getattr(source, name), getattr(found, name)
+        if name == "shN":
+            left = left[:, : right.shape[1]]
+        if name == "quats":
+            left, right = (rows * np.sign(rows[:, :1] + 1e-30) for rows in (left, right))
+        if name == "opacities":
+            assert np.allclose(left, right, rtol=2e-7, atol=0)
+        else:
+            assert (left == right).all(), name
+    places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats have an order of their own
+    assert np.allclose(*places, atol=1e-2 * max(1.0, np.abs(source.means).max()))
+    assert min(source.sh_degree, other.degree) == found.sh_degree

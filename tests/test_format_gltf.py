@@ -1,0 +1,298 @@
+"""glTF with splats: files made byte by byte, what comes back, and what is refused."""
+
+import base64
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import formats, gltf_file
+from csplat.model import SplatModel
+from csplat.turning import turned
+
+ARRAYS = ("means", "quats", "opacities", "sh0", "shN")
+PREFIX = "KHR_gaussian_splatting"
+TYPES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "f4": 5126}
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+FORMAT = next(one for one in formats() if one.name == "gltf")
+TWO = {
+    "POSITION": np.array([[1, 2, 3], [-1, 0, 0.5]], "<f4"),
+    f"{PREFIX}:ROTATION": np.array([[0, 0, 0, 1], [1, 0, 0, 0]], "<f4"),  # x y z w
+    f"{PREFIX}:SCALE": np.array([[1, 2, 0.5], [0, 1, 1]], "<f4"),
+    f"{PREFIX}:OPACITY": np.array([[0.25], [1]], "<f4"),
+    f"{PREFIX}:SH_DEGREE_0_COEF_0": np.array([[0.1, 0.2, 0.3], [0, 0, 0]], "<f4"),
+}
+BAND = {f"{PREFIX}:SH_DEGREE_1_COEF_{m}": np.full((2, 3), m + 1, "<f4") for m in range(3)}
+
+
+def document(arrays, **root):
+    """The JSON of a file that shows these arrays in one mesh, and its buffer."""
+    data, views, accessors = b"", [], []
+    for array in arrays.values():
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append({
+            "bufferView": len(accessors), "componentType": TYPES[array.dtype.str[1:]],
+            "normalized": array.dtype.kind != "f", "count": len(array), "type": KINDS[array.shape[1]],
+        })  # fmt: skip
+        data += array.tobytes() + bytes(-array.nbytes % 4)
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    attributes = {name: index for index, name in enumerate(arrays)}
+    said = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": attributes, "extensions": {PREFIX: splats}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    return {**said, **root}, data
+
+
+def glb(said, data):
+    text = json.dumps(said, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def read(said, data):
+    return csplat.read(glb(said, data))
+
+
+def test_values_are_those_of_the_file():
+    model = read(*document(TWO | BAND))
+    assert "LUF" == model.coordinate_system
+    assert TWO["POSITION"].tolist() == model.means.tolist()
+    assert [[1, 0, 0, 0], [0, 1, 0, 0]] == model.quats.tolist()
+    assert np.log(np.float32([1, 2, 0.5])).tolist() == model.scales[0].tolist()
+    assert -88 < model.scales[1, 0] < -87  # of 0
+    assert [0.25, 1] == model.opacities.tolist()
+    assert TWO[f"{PREFIX}:SH_DEGREE_0_COEF_0"].tolist() == model.sh0.tolist()
+    assert [[[1] * 3, [2] * 3, [3] * 3]] * 2 == model.shN.tolist()
+
+
+def test_whole_numbers_are_shares_of_the_largest():
+    arrays = TWO | {
+        "POSITION": np.array([[-32768, -32767, 0], [32767, 1, 2]], "<i2"),
+        f"{PREFIX}:ROTATION": np.array([[0, 0, 0, 127], [-127, 0, 0, 0]], "<i1"),
+        f"{PREFIX}:SCALE": np.array([[255, 51, 0], [1, 1, 1]], "<u1"),
+        f"{PREFIX}:OPACITY": np.array([[65535], [13107]], "<u2"),
+    }
+    said, data = document(arrays)
+    model = read(said, data)
+    assert [-1, -1, 0] == model.means[0].tolist()
+    assert np.float32(1 / 32767) == model.means[1, 1]
+    assert [[1, 0, 0, 0], [0, -1, 0, 0]] == model.quats.tolist()
+    assert np.allclose([0, np.log(0.2)], model.scales[0, :2])
+    assert np.allclose([1, 0.2], model.opacities)
+    said["accessors"][0]["normalized"] = False
+    assert [-32768, -32767, 0] == read(said, data).means[0].tolist()
+
+
+def test_rows_may_lie_apart():
+    apart = np.zeros((2, 5), "<f4")
+    apart[:, 1:4] = TWO["POSITION"]
+    said, data = document(TWO)
+    said["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 40, "byteStride": 20})
+    said["accessors"][0] |= {"bufferView": len(said["bufferViews"]) - 1, "byteOffset": 4}
+    said["buffers"][0]["byteLength"] += 40
+    assert TWO["POSITION"].tolist() == read(said, data + apart.tobytes()).means.tolist()
+
+
+def test_nodes_place_what_they_show():
+    nodes = [
+        {"children": [1], "translation": [10, 0, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
+        {"mesh": 0, "scale": [2, 2, 2], "children": [2]},
+        {"mesh": 0, "matrix": [0.5, 0, 0, 0, 0, 0.5, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1]},
+    ]
+    model = read(*document(TWO | BAND, nodes=nodes))
+    x, y, z = TWO["POSITION"].T
+    assert np.allclose(np.stack([10 - 2 * y, 2 * x, 2 * z], 1), model.means[:2])
+    assert np.allclose(np.stack([10 - y, x + 2, 2 * z], 1), model.means[2:])
+    assert np.allclose([[2, 4, 1], [1, 2, 1]], np.sort(np.exp(model.scales[[0, 2]]), axis=1)[:, [1, 2, 0]])
+    assert np.allclose([3, 2, -1], model.shN[0, :, 0])  # -y z -x of the colours turn with them
+
+
+def test_without_scenes_all_nodes_are_shown():
+    said, data = document(TWO, nodes=[{"mesh": 0}, {"children": [0], "translation": [1, 0, 0]}])
+    del said["scenes"]
+    assert [2, 0] == read(said, data).means[:, 0].tolist()
+
+
+def test_a_far_translation_is_an_origin():
+    model = read(*document(TWO, nodes=[{"mesh": 0, "translation": [4e6, 1.25, -3e5]}]))
+    assert (4e6, 1.25, -3e5) == model.origin
+    assert TWO["POSITION"].tolist() == model.means.tolist()
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_scene_comes_back(tmp_path, make_model, degree):
+    model = make_model(50, degree, origin=(1.5, -2.0, 0.1), antialiased=True, metadata={"licence": "CC0"})
+    csplat.write(tmp_path / "a.glb", model)
+    back = csplat.read(tmp_path / "a.glb")
+    assert ("LUF", True, "CC0") == (back.coordinate_system, back.antialiased, back.metadata["licence"])
+    flipped = turned(back, np.diag([-1.0, -1.0, 1.0]))
+    assert model.origin == flipped.origin
+    assert all((getattr(model, name) == getattr(flipped, name)).all() for name in ARRAYS)
+    assert np.abs(model.scales - flipped.scales).max() < 1e-6
+    csplat.write(tmp_path / "b.glb", back)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    assert ARRAYS == tuple(name for name in ARRAYS if name in FORMAT.exact)
+
+
+def test_lengths_are_written_in_metres(tmp_path, make_model):
+    model = make_model(5, 0, unit_metres=0.5, coordinate_system="LUF")
+    csplat.write(tmp_path / "a.glb", model)
+    back = csplat.read(tmp_path / "a.glb")
+    assert 1.0 == back.unit_metres
+    assert (model.means * np.float32(0.5) == back.means).all()
+    assert np.abs(model.scales + np.log(0.5) - back.scales).max() < 1e-6
+
+
+def test_points_have_the_colours_of_their_splats(tmp_path):
+    sh0 = (np.float32([[0.0, 0.5, 1.0]]) - 0.5) / np.float32(0.28209479)
+    one = SplatModel(
+        np.zeros((1, 3), np.float32), np.float32([[1, 0, 0, 0]]), np.zeros((1, 3), np.float32), np.float32([0.2]), sh0
+    )
+    csplat.write(tmp_path / "a.glb", one)
+    assert bytes([0, 55, 255, 51]) in (tmp_path / "a.glb").read_bytes()
+
+
+def test_buffers_may_be_text_or_files_beside_it(tmp_path):
+    said, data = document(TWO)
+    path = tmp_path / "in" / "a.gltf"
+    path.parent.mkdir()
+    (path.parent / "a b.bin").write_bytes(data)
+    (tmp_path / "out.bin").write_bytes(data)
+    (path.parent / "link.bin").symlink_to(tmp_path / "out.bin")
+
+    def read_from(uri):
+        said["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(said))
+        return csplat.read(path)
+
+    for uri in ("a%20b.bin", "data:application/octet-stream;base64," + base64.b64encode(data).decode()):
+        assert TWO["POSITION"].tolist() == read_from(uri).means.tolist()
+    for uri in ("../out.bin", "link.bin", str(tmp_path / "out.bin"), "http://a/b.bin", "no.bin", "", ".", "a\0b",
+                "%2e%2e/out.bin", "data:,xx", "data:;base64,?", "x" * 5000):  # fmt: skip
+        with pytest.raises(InputError, match=r"a\.gltf, buffers/0/uri: "):
+            read_from(uri)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "says"),
+    [
+        ("asset/version", "1.0", "wanted 2.0"),
+        ("asset", 3, "no asset"),
+        ("asset/extras", {"csplat": ["csplat origin 1"]}, "origin"),
+        ("extensionsRequired", [["x"], "EXT_meshopt_compression"], "EXT_meshopt_compression is not understood"),
+        ("meshes/0/primitives/0/extensions", {}, "no splats"),
+        (f"meshes/0/primitives/0/extensions/{PREFIX}/kernel", "sphere", "kernel: found 'sphere'"),
+        (f"meshes/0/primitives/0/extensions/{PREFIX}/colorSpace", "lin_rec709_display", "colorSpace: found"),
+        (f"meshes/0/primitives/0/extensions/{PREFIX}/extensions", {"packed": {}}, "packed is not understood"),
+        ("meshes/0/primitives/0/attributes/POSITION", 99, "accessors/99: there is none"),
+        ("meshes/0/primitives/0/attributes/POSITION", 3, "wanted 3 numbers"),
+        ("meshes/0/primitives/0/attributes", {"POSITION": 0}, "there is no KHR_gaussian_splatting:ROTATION"),
+        (f"meshes/0/primitives/0/attributes/{PREFIX}:SH_DEGREE_1_COEF_1", 0, "SH_DEGREE_1_COEF_0"),
+        ("accessors/0/count", 10**12, "are there"),
+        ("accessors/0/count", 1, "POSITION 1"),
+        ("accessors/0/count", -1, "whole number"),
+        ("accessors/0/count", True, "found True"),
+        ("accessors/0/byteOffset", 2**52, "are there"),
+        ("accessors/0/componentType", [], "componentType: found"),
+        ("accessors/0/type", {}, "type: found"),
+        ("accessors/0/sparse", {}, "sparse"),
+        ("bufferViews/0/byteLength", 10**9, "of a buffer"),
+        ("bufferViews/0/byteStride", 4, "every 4"),
+        ("bufferViews/0/extensions", {"EXT_meshopt_compression": {}}, "packed buffers"),
+        ("bufferViews/0/buffer", 7, "buffers/7: there is none"),
+        ("buffers/0/byteLength", 10**9, "truncated"),
+        ("buffers/0/uri", [], "uri: found"),
+        ("nodes/0/children", [0], "more than one parent"),
+        ("nodes/0/scale", [1, 0, 1], "flattens"),
+        ("nodes/0/scale", [1e200, 1e200, 1e200], "leaves float32"),
+        ("nodes/0/children", [1], "splats 0 to 1: "),
+        ("nodes/0/rotation", [0, 0, 0, 0], "unit quaternion"),
+        ("nodes/0/matrix", [1, 2], "wanted 16 numbers"),
+        ("nodes/0/translation", [1, 2, float("nan")], "wanted 3 numbers"),
+        ("scenes/0/nodes", [[]], "there is none"),
+        ("scenes/0/nodes", "abc", "nodes: found"),
+        ("scene", 5, "scenes/5"),
+        ("nodes", [{"children": list(range(1, 99))}, *[{"mesh": 0}] * 98], "more than it has bytes"),
+        ("meshes/0/primitives", [0] * 5, "found 0"),
+    ],
+)  # fmt: skip
+def test_what_breaks_a_rule_is_refused_by_its_place(place, value, says):
+    said, data = document(TWO)
+    said["nodes"].append({"mesh": 0, "translation": [1, 2, 1e39]})
+    *above, key = place.split("/")
+    holder = said
+    for step in above:
+        holder = holder[int(step) if isinstance(holder, list) else step]
+    if isinstance(holder, list):
+        holder[int(key)] = value
+    else:
+        holder[key] = value
+    with pytest.raises(InputError, match=rf"^data.*{says}") as caught:
+        read(said, data)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mesh_that_is_shown_very_often_is_refused():
+    said, data = document(TWO)
+    said["meshes"].append({"primitives": [{}] * 200})
+    said |= {"nodes": [{"mesh": 1}] * 200, "scenes": [{"nodes": list(range(200))}]}
+    with pytest.raises(InputError, match="number 16385"):
+        read(said, data)
+
+
+@pytest.mark.parametrize("name", list(TWO))
+def test_values_that_are_not_finite_are_refused(name):
+    array = TWO[name].copy()
+    array[1, 0] = np.nan
+    with pytest.raises(InputError, match=r"data, splats 0 to 1: .* NaN"):
+        read(*document(TWO | {name: array}))
+
+
+def test_damage_is_refused_or_read(monkeypatch):
+    whole = glb(*document(TWO))
+
+    def refused(data):
+        monkeypatch.setattr(gltf_file, "mapped", lambda _path: data)
+        try:
+            with FORMAT.open(Path("a.glb")) as scene:
+                scene.model()
+        except InputError as error:
+            return "a.glb" in str(error)
+        return False
+
+    assert not refused(whole)
+    assert all(refused(whole[:size]) for size in range(len(whole)))
+    for at in range(len(whole)):
+        refused(whole[:at] + bytes([whole[at] ^ (1 << at % 8)]) + whole[at + 1 :])
+    for text in (b"[" * 100_000, b"{}", b"null", b'{"asset":{"version":"2.0"}}', b"9" * 5000, b"\xff"):
+        assert refused(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
+
+
+def test_refuses_to_write_what_is_no_glb(tmp_path, make_model):
+    with pytest.raises(InputError, match=r"name it a\.glb"):
+        csplat.write(tmp_path / "a.gltf", make_model(2, 0))
+    with pytest.raises(InputError, match="no empty meshes"):
+        csplat.write(tmp_path / "a.glb", make_model(0, 0))
+    assert [] == list(tmp_path.iterdir())
+
+
+def test_files_of_others_are_read():
+    """`splat-transform train1000.ply train1000.glb` makes one."""
+    if "CSPLAT_PEERS" not in os.environ:
+        pytest.skip("CSPLAT_PEERS names no folder of others' files")
+    found = sorted(Path(os.environ["CSPLAT_PEERS"]).glob("*.glb"))
+    assert found
+    for path in found:
+        assert len(csplat.read(path))

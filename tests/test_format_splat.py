@@ -1,0 +1,65 @@
+""".splat: rows of 32 bytes, read and written."""
+
+import struct
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import open_scene
+from csplat.scene import BLOCK
+
+ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
+
+
+def test_a_row_means_what_the_format_says(tmp_path):
+    (tmp_path / "a.splat").write_bytes(ROW + ROW[:-4] + b"\x80" * 4)
+    model = csplat.read(tmp_path / "a.splat")
+    assert [1.5, -2, 3e9] == model.means[0].tolist()
+    np.testing.assert_allclose([0, np.log(0.5), np.log(1e-20)], model.scales[0], rtol=1e-6)
+    assert [[0, -1, 0, 0], [1, 0, 0, 0]] == model.quats.tolist()
+    assert model.opacities[0] == np.float32(0.4)
+    np.testing.assert_allclose(np.array([-0.5, 0.5, -0.3]) / 0.28209479, model.sh0[0], rtol=1e-6)
+    assert (0, "unspecified") == (model.sh_degree, model.coordinate_system)
+
+
+def test_what_is_written_comes_back(tmp_path, make_model):
+    model = make_model(BLOCK + 5, 0, sh0=np.random.default_rng(0).uniform(-1.7, 1.7, (BLOCK + 5, 3)).astype("f4"))
+    csplat.write(tmp_path / "a.splat", model)
+    with open_scene(tmp_path / "a.splat") as scene:
+        assert [BLOCK, 5] == [len(block) for block in scene.blocks()]
+        found = scene.model()
+    assert (model.means == found.means).all()
+    np.testing.assert_allclose(found.scales, model.scales, atol=1e-6)
+    np.testing.assert_allclose(found.opacities, model.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found.sh0, model.sh0, atol=0.5 / 255 / 0.28209 + 1e-6)
+    turned = 2 * np.arccos(np.minimum(1, np.abs(np.einsum("ij,ij->i", found.quats.astype(float), model.quats))))
+    assert np.degrees(turned.max()) < 1
+    assert (tmp_path / "a.splat").stat().st_size == 32 * len(model)
+
+
+def test_the_identity_and_values_beyond_the_range_have_bytes(tmp_path, make_model):
+    quats, scales = np.array([[1, 0, 0, 0]], "f4"), np.array([[100, 0, -100]], "f4")
+    csplat.write(tmp_path / "a.splat", make_model(1, 0, quats=quats, scales=scales, sh0=np.array([[9, -9, 0]], "f4")))
+    data = (tmp_path / "a.splat").read_bytes()
+    assert bytes([0, 128, 128, 128]) == data[28:]
+    assert [255, 0, 128] == list(data[24:27])
+    np.testing.assert_allclose(csplat.read(tmp_path / "a.splat").scales, [[88, 0, np.log(1e-20)]], rtol=1e-6)
+
+
+def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path):
+    bad = struct.pack("<f", np.nan) + ROW[4:], ROW[:12] + struct.pack("<f", np.inf) + ROW[16:]
+    (tmp_path / "a.splat").write_bytes(ROW + b"".join(bad) + ROW)
+    with open_scene(tmp_path / "a.splat") as scene:
+        assert 2 == scene.count == len(scene.model())
+        assert [("nonfinite-rows", 2)] == [(one.id, one.count) for one in scene.findings]
+    (tmp_path / "a.splat").write_bytes(bad[0])
+    with pytest.raises(InputError, match="none is left"):
+        csplat.read(tmp_path / "a.splat")
+
+
+def test_a_cut_row_is_refused(tmp_path):
+    (tmp_path / "a.splat").write_bytes(ROW[:-1])
+    with pytest.raises(InputError, match=r"a\.splat has 31 bytes, wanted a multiple of 32"):
+        csplat.read(tmp_path / "a.splat")

@@ -1,0 +1,204 @@
+"""SPZ: every version read from bytes written by hand, every broken file refused."""
+
+import gzip
+import struct
+from math import sqrt
+
+import numpy as np
+import pytest
+import zstandard
+
+import csplat
+from csplat.errors import InputError
+
+WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
+AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4, 6)
+
+
+def spz(version, parts, *, degree=0, bits=8, flags=0, count=None, extensions=b"", bare=False):
+    """A file of an SPZ version with these bytes for positions, alphas, colours, scales, rotations, SH."""
+    count = len(parts[1]) if count is None else count
+    head = struct.pack("<4sIIBBB", b"NGSP", version, count, degree, bits, flags)
+    if version < 4:
+        whole = head + b"\0" + b"".join(parts) + extensions
+        return whole if bare else gzip.compress(whole, mtime=0)
+    packed = [zstandard.compress(part) for part in parts if part]
+    table = b"".join(
+        struct.pack("<QQ", len(small), len(part)) for small, part in zip(packed, filter(None, parts), strict=True)
+    )
+    return head + struct.pack("<BI12x", len(packed), 32 + len(extensions)) + extensions + table + b"".join(packed)
+
+
+def splats(version, count=2, degree=0):
+    """Bytes of random splats."""
+    rng = np.random.default_rng(version)
+    widths = (*WIDTHS[version], 3 * ((degree + 1) ** 2 - 1))
+    parts = [rng.integers(0, 256, count * width, np.uint8).tobytes() for width in widths]
+    return [bytes(len(parts[0])), *parts[1:]] if version == 1 else parts
+
+
+def word(index, *three):
+    """Three components of a rotation in units of sqrt(1/2) / 511, and which of x y z w is left out."""
+    fields = [abs(one) | (512 if one < 0 else 0) for one in three]
+    return struct.pack("<I", index << 30 | fields[0] << 20 | fields[1] << 10 | fields[2])
+
+
+@pytest.mark.parametrize(
+    ("version", "positions", "rotation", "bare"),
+    [
+        (1, np.array([1.5, -2.0, 0.25], "<f2").tobytes(), bytes([255, 0, 0]), False),
+        (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), True),
+        (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), False),
+        (3, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(3, 511, -511, 0), False),
+        (4, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(0, 511, 0, -511), False),
+    ],
+)
+def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions, rotation, bare):
+    data = [positions, b"\x33", bytes([0, 51, 255]), bytes([0, 160, 255]), rotation, bytes([0, 128, 255] * 3)]
+    model = csplat.read(spz(version, data, degree=1, flags=1, bare=bare))
+    assert [[1.5, -2.0, 0.25]] == model.means.tolist()
+    assert [[-10.0, 0.0, 5.9375]] == model.scales.tolist()
+    assert [[-1.0, 0.0, 127 / 128]] * 3 == model.shN[0].tolist()
+    assert model.opacities == np.float32(0.2)
+    np.testing.assert_allclose([[-0.5 / 0.15, -0.3 / 0.15, 0.5 / 0.15]], model.sh0, rtol=1e-6)
+    half = sqrt(0.5)
+    wanted = {3: [0, half, -half, 0], 4: [-half, 0, half, 0]}.get(version, [0, sqrt(1 / 3), -sqrt(1 / 3), -sqrt(1 / 3)])
+    np.testing.assert_allclose([wanted], model.quats, atol=4e-4)  # the root of what rounding leaves of 0
+    assert ("RUB", True) == (model.coordinate_system, model.antialiased)
+
+
+@pytest.mark.parametrize("largest", range(4))
+def test_the_component_that_is_left_out_stands_in_its_place(largest):
+    model = csplat.read(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
+    three = [sqrt(0.5) / 511 * value for value in (73, 146, -219)]
+    xyzw = [*three[:largest], sqrt(1 - np.square(three).sum()), *three[largest:]]
+    np.testing.assert_allclose([xyzw[3], *xyzw[:3]], model.quats[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_axes_of_an_extension_count_and_others_are_skipped(version):
+    data = spz(version, splats(version), flags=2, extensions=AXES)
+    assert "RDF" == csplat.read(data).coordinate_system
+    assert "RUB" == csplat.read(spz(version, splats(version), extensions=AXES)).coordinate_system
+    with pytest.raises(InputError, match="axes number 17"):
+        csplat.read(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
+
+
+def test_a_file_without_splats_is_read():
+    assert 0 == len(csplat.read(spz(4, [b""] * 6, degree=3)))
+    assert 0 == len(csplat.read(spz(3, [b""] * 6, degree=3)))
+
+
+MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (spz(4, splats(4, degree=3), degree=4), "SH degree 4, wanted at most 3"),
+        (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
+        (gzip.compress(spz(4, splats(4))), "version 4, wanted 1 to 4"),
+        (gzip.compress(b"NGSX" + bytes(40)), "begins with b'NGSX'"),
+        (spz(3, splats(3), bits=31), "31 fractional bits"),
+        (spz(3, splats(3), flags=0x80), "levels of detail"),
+        (spz(3, splats(3), count=2**32 - 1), "4,294,967,295 splats, more than"),
+        (spz(4, splats(4), count=3), r"streams of \[18, 2, 6, 6, 8\] bytes, wanted \[27, 3, 9, 9, 12\]"),
+        (MANY, "4,194,304 splats, more than"),
+        (spz(4, splats(4)) + b"\0", "its table says"),
+        (spz(3, splats(3), extensions=bytes(1 << 21)), "goes on after its last splat"),
+        (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
+    ],
+)
+def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, says):
+    (tmp_path / "a.spz").write_bytes(data)
+    with pytest.raises(InputError, match=says):
+        csplat.read(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_a_damaged_file_is_refused_or_read(tmp_path, version):
+    whole = spz(version, splats(version, degree=1), degree=1, flags=2, extensions=AXES)
+    path = tmp_path / "a.spz"
+
+    def read(data):
+        path.write_bytes(data)
+        try:
+            csplat.read(path)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    assert not read(whole)
+    assert all(read(whole[:size]) for size in range(0, len(whole), 3))
+    assert read(whole[:-1])
+    for at in range(len(whole)):
+        says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
+        assert not says or ("a.spz" in says and "\n" not in says)
+
+
+def fields(path):
+    """Version, count, degree, fractional bits and flags of a file."""
+    data = path.read_bytes()
+    return struct.unpack_from("<IIBBB", gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data, 4)
+
+
+@pytest.mark.parametrize(("name", "version"), [("a.spz", 3), ("a.v4.spz", 4)])
+def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, name, version):
+    model = make_model(200, 3, coordinate_system="RUB", antialiased=True)
+    shN = np.clip(model.shN / 3, -1, 0.97)
+    model = csplat.SplatModel(**{**vars(model), "shN": shN, "sh0": np.clip(model.sh0, -3, 3)})
+    csplat.write(tmp_path / name, model)
+    assert (version, 200, 3, 12, 1) == fields(tmp_path / name)
+    found = csplat.read(tmp_path / name)
+    for array, step in {
+        "means": 2**-12,
+        "scales": 1 / 16,
+        "opacities": 1 / 255,
+        "sh0": 1 / 38.25,
+        "shN": 1 / 32,
+    }.items():
+        np.testing.assert_allclose(getattr(found, array), getattr(model, array), atol=step / 2 + 1e-6, rtol=0)
+    turned = 2 * np.arccos(np.minimum(1, np.abs(np.einsum("ij,ij->i", found.quats.astype(float), model.quats))))
+    assert np.degrees(turned.max()) < 0.3
+    csplat.write(tmp_path / f"again.{name}", found)
+    assert (tmp_path / name).read_bytes() == (tmp_path / f"again.{name}").read_bytes()
+
+
+def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
+    model = make_model(2, 1, sh0=np.array([[9, -9, 0]] * 2, "f4"), shN=np.full((2, 3, 3), [2, -2, 0.99], "f4"))
+    scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
+    model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
+    csplat.write(tmp_path / "a.spz", model)
+    found = csplat.read(tmp_path / "a.spz")
+    assert [-10, 5.9375, 0] == found.scales[0].tolist()
+    assert [0, 1] == found.opacities.tolist()
+    assert [127 / 128, -1, 127 / 128] == found.shN[0, 0].tolist()
+    np.testing.assert_allclose(found.sh0[0, :2], [0.5 / 0.15, -0.5 / 0.15], rtol=1e-6)
+
+
+def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_path, make_model):
+    def bits(reach, scale):
+        means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
+        csplat.write(tmp_path / "a.spz", make_model(10, 0, means=means, scales=np.full((10, 3), scale, "f4")))
+        found = csplat.read(tmp_path / "a.spz").means * [1, -1, -1]
+        number = fields(tmp_path / "a.spz")[3]
+        np.testing.assert_allclose(found, means, atol=2.0**-number / 2)
+        return number
+
+    assert [12, 12, 16, 11, 0, 14] == [
+        bits(*one) for one in [(1, 0), (2047, 0), (1, -7.5), (2049, 0), (8e6, 0), (500, -9)]
+    ]
+    with pytest.raises(InputError, match="positions reach 9e\\+06, and SPZ holds up to 8,388,607"):
+        bits(9e6, 0)
+    assert 12 == bits(0, 0)
+
+
+def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_model):
+    model = make_model(5, 3, means=np.arange(15, dtype="f4").reshape(5, 3))
+    csplat.write(tmp_path / "a.spz", model)
+    found = csplat.read(tmp_path / "a.spz")
+    assert (model.means * [1, -1, -1]).tolist() == found.means.tolist()
+    flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of y and z, in the order of the coefficients
+    np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)
+    csplat.write(tmp_path / "b.spz", make_model(5, 3, means=model.means, coordinate_system="RDF"))
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()

@@ -1,0 +1,120 @@
+# torch may be absent:
+# pyright: reportMissingImports=false
+"""Checkpoints of gsplat's simple_trainer and of nerfstudio's splatfacto, read as scenes.
+
+Both are pickles of torch; nothing in them is run: `weights_only` admits tensors, containers and plain numbers alone.
+What they do not say, such as whether a scene was trained antialiased, stands in the files of their trainers.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from csplat.bridges import from_gsplat
+from csplat.errors import InputError, missing
+from csplat.formats import Format
+from csplat.model import SplatModel
+from csplat.scene import Scene, scene_of
+
+__all__ = ["FORMAT"]
+
+_SH_C0 = 0.28209479177387814
+_SPLATFACTO = "gauss_params."  # in the names of splatfacto's tensors, after those of what holds the model
+_NAMES = {
+    "means": "means",
+    "quats": "quats",
+    "scales": "scales",
+    "opacities": "opacities",
+    "features_dc": "sh0",
+    "features_rest": "shN",
+}
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Scene]:
+    yield scene_of(_read(path))
+
+
+def _read(path: Path) -> SplatModel:
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise InputError(f"{path.name} is a checkpoint of torch: {missing(error, extra='train')}") from None
+    try:
+        with _plain_numbers(torch):
+            # Mapped: of a checkpoint of splatfacto two thirds are Adam's memory.
+            said = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- an unpickler raises whatever a damaged file makes of it
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path.name} cannot be read by torch.load: {reason}") from None
+    try:
+        return _model_of(said, path.stat().st_size)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+
+
+def _plain_numbers(torch: Any) -> Any:
+    """Let numbers of NumPy through, which the schedules of splatfacto leave among learning rates."""
+    if tuple(map(int, torch.__version__.split(".")[:2])) < (2, 6):
+        return nullcontext()  # it has no names for what older versions of NumPy wrote
+    make = np.float64(0.0).__reduce__()[0]
+    kinds = [type(np.dtype(kind)) for kind in (np.float64, np.float32)]
+    return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
+
+
+def _model_of(said: object, size: int) -> SplatModel:
+    if not isinstance(said, Mapping):
+        raise InputError(f"it holds a {type(said).__name__}, wanted a checkpoint of gsplat or splatfacto")
+    if isinstance(said.get("splats"), Mapping):
+        return _bounded(said["splats"], size)
+    pipeline = said.get("pipeline")
+    parts = pipeline.items() if isinstance(pipeline, Mapping) else ()
+    found = {str(name).rpartition(_SPLATFACTO)[2]: value for name, value in parts if _SPLATFACTO in str(name)}
+    if not found:
+        names = ", ".join(map(str, list(said)[:5]))
+        raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
+    model = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size)
+    if model.sh_degree or "features_rest" not in found:
+        return model
+    # Without SH splatfacto trains logits of colours.
+    colours = 1.0 / (1.0 + np.exp(-model.sh0.astype(np.float64)))
+    return replace(model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32))
+
+
+def _bounded(splats: Mapping[str, Any], size: int) -> SplatModel:
+    """A model of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
+    for name in _NAMES.values():
+        numbers = getattr(splats.get(name), "numel", None)
+        if name in splats and (numbers is None or numbers() > size):
+            raise InputError(f"{name} is no tensor that the file can hold")
+    return from_gsplat(splats)
+
+
+def _is_checkpoint(path: Path, head: bytes) -> bool:
+    """Whether a file is a zip as `torch.save` writes it, of which `head` is the beginning."""
+    if not head.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith("/data.pkl") for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError):
+        return False
+
+
+FORMAT = Format(
+    name="checkpoint",
+    title="a checkpoint of gsplat or splatfacto",
+    suffixes=(".pt", ".ckpt"),
+    sniff=_is_checkpoint,
+    open=_open,
+    exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
+)
