@@ -7,7 +7,7 @@ stand in the comments of its header, as those of a plain PLY do.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -162,7 +162,7 @@ def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
-    fields: Mapping[str, Any] = element.dtype.fields or {}
+    fields: Any = element.dtype.fields or {}
     for column in wanted:
         if column not in fields or fields[column][0] != np.dtype(kind):
             raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: no compressed PLY")
@@ -233,8 +233,8 @@ def _write(path: Path, scene: Scene) -> None:
 def _kept(model: SplatModel) -> tuple[F32, F32, F32, U32, U32, U8]:
     """What is wanted of a block: float32 means, log scales and colours, packed rotations and alphas, bytes of SH."""
     largest, three = smallest_three(model.quats)
-    steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.uint32)
-    rotation = largest.astype(np.uint32) << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.int64)
+    rotation = (largest << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]).astype(np.uint32)
     sh = np.clip(np.floor(model.shN.transpose(0, 2, 1) * np.float32(32) + np.float32(128)), 0, 255).astype(np.uint8)
     return (
         model.means,
