@@ -123,7 +123,7 @@ def test_damage_is_refused_or_read(tmp_path):
     for place in range(0, len(SMALL), 3):
         data = bytearray(SMALL)
         data[place] ^= 1 << place % 8
-        damaged.append(data)
+        damaged.append(bytes(data))
     messages = []
     for data in damaged:
         path.write_bytes(data)

@@ -247,7 +247,7 @@ def test_damage_is_refused_or_read(tmp_path):
     for place in range(0, len(whole), 7):
         data = bytearray(whole)
         data[place] ^= 1 << place % 8
-        damaged.append(data)
+        damaged.append(bytes(data))
     messages = []
     for data in damaged:
         (tmp_path / "a.sog").write_bytes(data)
