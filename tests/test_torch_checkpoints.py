@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import csplat
-import csplat_trainer  # noqa: F401 -- makes them known
 from csplat.bridges import to_gsplat
 from csplat.errors import InputError
 

@@ -187,7 +187,7 @@ def _rotation_to(facts: SplatModel, axes: str) -> F64:
     up, wanted = up_of(facts.metadata), up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix
-    tilted: F64 = _tilt(_applied(matrix, np.array(up)), np.array(wanted)) @ matrix
+    tilted: F64 = _tilt(_applied(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix
     return tilted
 
 
@@ -207,10 +207,11 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
     """A square matrix times each row; bits stay as they are where it only permutes and flips."""
     order = np.abs(matrix).argmax(axis=1)
     signs: F64 = matrix[np.arange(len(matrix)), order]
+    out = np.empty_like(rows)
     if (np.abs(signs) == 1.0).all() and np.count_nonzero(matrix) == len(matrix):
         picked = rows if (order == np.arange(len(order))).all() else rows[..., order]
-        return np.multiply(picked, signs, dtype=rows.dtype)
-    out = np.empty_like(rows)
+        np.multiply(picked, signs.astype(rows.dtype), out=out)
+        return out
     with np.errstate(over="ignore"):  # the model refuses what is infinite
         for start in range(0, len(rows), _ROWS):
             part = slice(start, start + _ROWS)

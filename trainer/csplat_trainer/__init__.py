@@ -4,8 +4,7 @@
     >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
 
 The names load their modules when first used. `train` and `finetune` work with numba alone; torch is wanted by
-`autograd`, `perceptual` and `cuda`, and by `csplat.read` of checkpoints of gsplat and splatfacto, which are made known
-here.
+`autograd`, `perceptual` and `cuda`, and by `torch_checkpoints`: `csplat.read` of what gsplat and splatfacto leave.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from csplat import lazy_exports
-from csplat.formats import register
-from csplat_trainer.torch_checkpoints import FORMAT
 
 if TYPE_CHECKING:
     from csplat_trainer.data import DataSet, load
@@ -48,5 +45,4 @@ _MODULE_OF = {
     "load": "csplat_trainer.data",
     "train": "csplat_trainer.loop",
 }
-register(FORMAT)  # a format, so that `csplat.read` knows it; torch is imported when one is read
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

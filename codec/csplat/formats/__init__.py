@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -51,12 +51,18 @@ _MODULES = (
     "csplat.formats.sog",
     "csplat.formats.gltf",
 )
+#: Of packages that stand on this one, by their names: nothing here knows them, and they may be absent.
+_ABOVE = ("csplat_trainer.torch_checkpoints",)
 _registered: list[Format] = []
 
 
 def formats() -> tuple[Format, ...]:
     """All formats that are known, those of this package first."""
-    return (*(import_module(name).FORMAT for name in _MODULES), *_registered)
+    found = [import_module(name).FORMAT for name in _MODULES]
+    for name in _ABOVE:
+        with suppress(ModuleNotFoundError):
+            found.append(import_module(name).FORMAT)
+    return (*found, *_registered)
 
 
 def register(format: Format) -> None:

@@ -19,7 +19,6 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-import csplat_trainer  # noqa: F401  # makes checkpoints of other trainers known as scenes
 from csplat._spec import MAGIC
 from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
