@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from csplat.formats import read, write
     from csplat.model import SplatModel
     from csplat.ply import lint_ply, read_ply, write_ply
+    from csplat.upright import with_up
 
 __version__ = "0.1.0"
 
@@ -59,6 +60,7 @@ __all__ = [
     "read_header",
     "read_ply",
     "to_gsplat",
+    "with_up",
     "write",
     "write_ply",
 ]
@@ -111,6 +113,7 @@ _MODULE_OF = {
     "read": "csplat.formats",
     "read_ply": "csplat.ply",
     "to_gsplat": "csplat.bridges",
+    "with_up": "csplat.upright",
     "write": "csplat.formats",
     "write_ply": "csplat.ply",
 }

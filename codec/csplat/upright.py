@@ -77,6 +77,11 @@ def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: s
             given.
         coordinate_system: as in `SplatModel`; `None`: what it says. An `up` that was there goes, where none is given.
 
+    Examples:
+        >>> import csplat
+        >>> csplat.with_up(csplat.read_ply("scene.ply"), (0, 0, 1)).metadata["up"]
+        [0.0, 0.0, 1.0]
+
     Raises:
         InputError: one of them says nothing.
     """

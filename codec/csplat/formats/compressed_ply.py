@@ -286,6 +286,7 @@ FORMAT = Format(
     suffixes=(".compressed.ply",),
     sniff=_is_compressed,
     open=_open,
+    splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
 )
