@@ -43,7 +43,7 @@ def make_page(tradeoff: Tradeoff) -> str:
 def _head(tradeoff: Tradeoff, title: str) -> str:
     setting = tradeoff.setting
     count = f"{len(setting.source):,} splats, SH degree {setting.source.sh_degree}"
-    facts = f"{count}, {format_bytes(setting.source_bytes)} as a PLY; {views_line(tradeoff)}."
+    facts = f"{count}, {format_bytes(setting.source_bytes)} in the file; {views_line(tradeoff)}."
     return f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(facts)}</p>'
 
 

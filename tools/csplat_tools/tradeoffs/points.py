@@ -141,7 +141,7 @@ class Point:
 
     @property
     def ratio(self) -> float:
-        """How many times the file is smaller than the PLY."""
+        """How many times the file is smaller than the source."""
         return self.source_bytes / self.size_bytes
 
     @property

@@ -49,7 +49,7 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
         Column("bytes", "Size of the file.", lambda one: one.size_bytes, 0),
         Column("bytes/splat", "Size of the file over the number of splats of the source: comparable between scenes.",
                lambda one: one.bytes_per_source_splat, 2),
-        Column("smaller", "How many times the file is smaller than the PLY.", lambda one: one.ratio, 1),
+        Column("smaller", "How many times the file is smaller than the source.", lambda one: one.ratio, 1),
         Column("PSNR", "How near pictures of the file come to pictures of the source, in dB, more is better: at 30"
                " people see a difference, at 40 they hardly do. Of the squared error pooled over all views.",
                lambda one: one.psnr, 2),
