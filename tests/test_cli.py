@@ -517,6 +517,14 @@ def test_a_csplat_is_not_encoded_and_a_ply_not_decoded(tmp_path, ply, csplat_fil
         assert "csplat encode" in refused(*words)
 
 
+def test_without_an_output_the_file_lies_beside_its_source(tmp_path, ply):
+    call("encode", ply)
+    call("export-html", tmp_path / "scene.csplat")
+    assert {"scene.ply", "scene.csplat", "scene.html"} <= {one.name for one in tmp_path.iterdir()}
+    assert "scene.ply exists" in refused("decode", tmp_path / "scene.csplat")
+    assert "wanted one output" in refused("encode", "-", status=2)
+
+
 def test_formats_that_are_not_read_are_named_with_a_converter(tmp_path):
     path = tmp_path / "a.lcc"
     path.write_bytes(bytes(60))

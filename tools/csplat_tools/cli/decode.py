@@ -15,10 +15,10 @@ from csplat_tools.files.streams import check_name
 __all__ = ["decode"]
 
 
-@command()
+@command(beside=".ply")
 def decode(
     source: Annotated[str, typer.Argument(metavar="IN.csplat", help="A .csplat file, or - for standard input.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The file to write, or -.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The file to write, or -; IN.ply by default.")],
     upright: Upright,
     out: Output,
     sh_degree: ShDegree = None,

@@ -101,6 +101,7 @@ class Goal(Group):
 
 
 @command(
+    beside=".csplat",
     one_of=(
         ("prune_unseen", *_RENDERED),
         ("prune_unseen", "max_error"),
@@ -118,8 +119,8 @@ class Goal(Group):
     settings=(ENCODER,),
 )
 def encode(
-    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A 3DGS PLY, or - for standard input.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -.")],
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, other `csplat formats`, or -.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="What to write, or -; else IN.csplat.")],
     encoding: Encoding,
     goal: Goal,
     facts: Facts,

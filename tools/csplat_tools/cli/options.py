@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import fields
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
@@ -25,6 +26,7 @@ from csplat_tools.cli.console import guarded
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.settings import Settings, describe_settings, read_settings
 from csplat_tools.files.console import progress_bar, say
+from csplat_tools.files.streams import STANDARD_STREAM
 
 __all__ = [
     "Checkpoint",
@@ -87,6 +89,7 @@ def command(
     needs: Mapping[str, tuple[str, ...]] | None = None,
     settings: Sequence[str] = (),
     serves: bool = False,
+    beside: str | None = None,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
 
@@ -97,6 +100,7 @@ def command(
         settings: dataclasses of which `--set` takes what has no option, as `module:name`; they come as a parameter
             `settings` of type `Settings`.
         serves: it goes on until it is ended: nobody waits for it.
+        beside: without an output it writes one beside the source, with this ending.
     """
 
     def made(function: Callable[..., None]) -> Callable[..., None]:
@@ -117,7 +121,7 @@ def command(
             if settings:
                 given["settings"] = read_settings(given["settings"] or (), settings, options)
             if _ALIAS in given:
-                given["output"] = _one_output(given["output"], given.pop(_ALIAS))
+                given["output"] = _one_output(given["output"], given.pop(_ALIAS), given.get("source"), beside)
             values = {
                 name: kind(**{one.name: given.pop(one.name) for one in fields(kind)}) for name, kind in groups.items()
             }
@@ -206,7 +210,10 @@ def _own(one: inspect.Parameter) -> list[inspect.Parameter]:
     return [output, inspect.Parameter(_ALIAS, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=alias)]
 
 
-def _one_output(output: str | None, alias: str | None) -> str:
+def _one_output(output: str | None, alias: str | None, source: str | None, beside: str | None) -> str:
+    """The output; where none is given the name of the source with another ending, if the command has one."""
+    if (output, alias) == (None, None) and beside is not None and source not in (None, STANDARD_STREAM):
+        return str(Path(source).with_suffix(beside))
     if (output is None) == (alias is None):
         raise typer.BadParameter("wanted one output: OUT, or -o OUT")
     return output or alias or ""

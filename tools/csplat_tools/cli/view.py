@@ -73,10 +73,10 @@ def view(
                 out.remark("")  # behind the ^C of the terminal
 
 
-@command()
+@command(beside=".html")
 def export_html(
     source: Scene,
-    output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -.")],
+    output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -; SCENE.html by default.")],
     upright: Upright,
     out: Output,
     preset: Preset = "balanced",
