@@ -51,6 +51,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/pytest -m benchmark
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
+	$(BENCH).codec.formats
 	$(BENCH).rendering
 	$(BENCH).rendering.removal pass
 	$(BENCH).rendering.removal removal --gone 20,40,60,80
@@ -64,7 +65,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).distortion.operating
 	$(BENCH).study
 
-fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, PLY reader
+fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400
 
 clean: ## remove what the commands above made
