@@ -133,6 +133,14 @@ def test_floaters_are_dropped():
     assert 3001 == left.count == len(left.model())
 
 
+def test_a_folder_of_sog_is_made(tmp_path, ply):
+    call("convert", ply, tmp_path / "new" / "meta.json")
+    assert 200 == len(csplat.read(tmp_path / "new"))
+    assert "exists: --force" in call("convert", ply, tmp_path / "new" / "meta.json", status=1).stderr
+    call("convert", ply, tmp_path / "no" / "such" / "meta.json", status=1)
+    assert not (tmp_path / "no").exists()
+
+
 def test_formats_are_listed():
     rows = json.loads(call("formats", "--json").stdout)
     assert {"ply", "csplat"} <= {row["format"] for row in rows}

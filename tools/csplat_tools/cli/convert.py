@@ -113,8 +113,10 @@ def convert(
     """
     if output == STANDARD_STREAM:
         raise typer.BadParameter("OUT cannot be standard output: name a file")
+    folder = Path(output).parent
+    made_anew = Path(output).name == "meta.json" and not folder.exists()  # SOG as a folder
     if not dry_run and not Path(output).is_dir():
-        out.check(output, inputs=(source,))
+        out.check(str(folder) if made_anew else output, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
             source, output, read_as=read_as, write_as=write_as, facts=upright.upright(),
