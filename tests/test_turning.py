@@ -135,6 +135,17 @@ def test_lengths_change_together(make_model):
         assert 0.1 * factor == after.cameras[0]["near"]
 
 
+def test_cameras_see_a_scene_where_it_was_moved_to(make_model):
+    model = make_model(5, 0, cameras=[CAMERA], metadata={"view": CAMERA})
+    after = moved(model, (1.0, -2.0, 0.5))
+    for before, now in ((CAMERA, after.cameras[0]), (CAMERA, after.metadata["view"])):
+        seen = [
+            one.means @ np.array(camera["viewmat"])[:3, :3].T + np.array(camera["viewmat"])[:3, 3]
+            for one, camera in ((model, before), (after, now))
+        ]
+        assert np.allclose(*seen, atol=1e-5)
+
+
 def test_refuses_what_is_no_turn(make_model):
     for matrix in (np.ones((3, 3)), np.eye(4), 2 * np.eye(3), np.full((3, 3), np.nan)):
         with pytest.raises(InputError, match="wanted an orthogonal matrix"):

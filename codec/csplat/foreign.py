@@ -79,12 +79,12 @@ def unknown(path: Path, head: bytes) -> InputError:
     """
     if path.is_dir():
         return InputError(f"{path} is a folder, and no scene")
+    if not head:
+        return InputError(f"{path.name} is empty")
     try:
         refuse_known(path, head)
     except InputError as error:
         return error
-    if not head:
-        return InputError(f"{path.name} is empty")
     return InputError(f"{path.name} is in no format that csplat knows: it begins with {head[:8]!r}")
 
 

@@ -194,11 +194,7 @@ def _model(arrays: Arrays, placed: tuple[F32, tuple[float, float, float], F64 | 
         sh0=arrays.sh0,
         shN=arrays.shN,
         origin=origin,
-        coordinate_system=facts.coordinate_system,
-        unit_metres=facts.unit_metres,
-        antialiased=facts.antialiased,
-        flat=facts.flat or len(opened.columns.scales) == 2,
-        metadata=facts.metadata,
+        **{**facts.fields(), "flat": facts.flat or len(opened.columns.scales) == 2},
         extra=arrays.extra,
         means_double=doubles,
     )

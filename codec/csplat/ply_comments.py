@@ -39,6 +39,11 @@ class SceneFacts:
     flat: bool = False
     metadata: dict[str, Any] = field(default_factory=dict)
 
+    def fields(self) -> dict[str, Any]:
+        """What a `SplatModel` takes of it as it is: all but the origin."""
+        names = ("coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
+        return {name: getattr(self, name) for name in names}
+
 
 def parse_comments(comments: Sequence[str]) -> SceneFacts:
     """Read the comment lines of a header, without the word `comment`.

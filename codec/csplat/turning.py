@@ -173,12 +173,12 @@ def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
 
 
 def moved(model: SplatModel, offset: Direction) -> SplatModel:
-    """The same scene elsewhere: its origin moves, to which means and cameras are relative."""
-    x, y, z = (a + b for a, b in zip(model.origin, offset, strict=True))
-    if model.means_double is None:
-        return replace(model, origin=(x, y, z))
-    doubles = model.means_double + np.array(offset)
-    return replace(model, origin=(x, y, z), means=(doubles - (x, y, z)).astype(np.float32), means_double=doubles)
+    """The same splats elsewhere: their means move, and not the origin, for which few formats have a place."""
+    step = np.array(offset, np.float64)
+    doubles = None if model.means_double is None else model.means_double + step
+    means = model.means + step if doubles is None else doubles - np.array(model.origin)
+    cameras = _with_cameras(model, lambda camera: _moved_camera(camera, step))
+    return replace(model, means=means.astype(np.float32), means_double=doubles, **cameras)
 
 
 def _rotation_to(facts: SplatModel, axes: str) -> F64:
@@ -337,6 +337,12 @@ def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
         view[0] *= -1.0
         K[0, 2] = camera["W"] - K[0, 2]
     return {**camera, "viewmat": view.tolist(), "K": K.tolist()}
+
+
+def _moved_camera(camera: Mapping[str, Any], step: F64) -> dict[str, Any]:
+    view = np.array(camera["viewmat"], np.float64)
+    view[:3, 3] -= view[:3, :3] @ step
+    return {**camera, "viewmat": view.tolist()}
 
 
 def _scaled_camera(camera: Mapping[str, Any], factor: float) -> dict[str, Any]:

@@ -33,7 +33,6 @@ __all__ = [
     "named_by",
     "open_scene",
     "read",
-    "register",
     "write",
     "write_scene",
 ]
@@ -53,7 +52,6 @@ _MODULES = (
 )
 #: Of packages that stand on this one, by their names: nothing here knows them, and they may be absent.
 _ABOVE = ("csplat_trainer.torch_checkpoints",)
-_registered: list[Format] = []
 
 
 def formats() -> tuple[Format, ...]:
@@ -62,12 +60,7 @@ def formats() -> tuple[Format, ...]:
     for name in _ABOVE:
         with suppress(ModuleNotFoundError):
             found.append(import_module(name).FORMAT)
-    return (*found, *_registered)
-
-
-def register(format: Format) -> None:
-    """Make another format known; one of the same name gives way."""
-    _registered[:] = [one for one in _registered if one.name != format.name] + [format]
+    return tuple(found)
 
 
 def read(

@@ -105,11 +105,7 @@ def _open(path: Path) -> Iterator[Scene]:
         facts = SplatModel(
             **_unpacked(np.zeros(0, vertex.dtype), bounds[:0], None, rest),
             origin=said.origin or (0.0, 0.0, 0.0),
-            coordinate_system=said.coordinate_system,
-            unit_metres=said.unit_metres,
-            antialiased=said.antialiased,
-            flat=said.flat,
-            metadata=said.metadata,
+            **said.fields(),
         )
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None

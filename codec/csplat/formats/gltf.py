@@ -78,15 +78,7 @@ def _open(path: Path) -> Iterator[Scene]:
             origin = parts[0].translation
         x, y, z = origin.tolist()
         nothing = _block(parts[0], slice(0, 0), degree)
-        facts = replace(
-            nothing,
-            origin=(x, y, z),
-            coordinate_system=_AXES,
-            unit_metres=said.unit_metres,
-            antialiased=said.antialiased,
-            flat=said.flat,
-            metadata=said.metadata,
-        )
+        facts = replace(nothing, origin=(x, y, z), **{**said.fields(), "coordinate_system": _AXES})
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import random
-import tempfile
 import warnings
 import zipfile
 import zlib
@@ -19,7 +18,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.formats import formats, read, write
 from csplat.model import SplatModel, normalise_quats
-from csplat_conformance.fuzzing.plies import unsound
+from csplat_conformance.fuzzing.plies import FileTarget, unsound
 from csplat_conformance.fuzzing.targets import Case
 
 __all__ = ["FormatTarget", "Seed"]
@@ -53,16 +52,12 @@ class Seed:
         return cls(ending.decode("ascii", "replace").replace("/", "_").replace("\0", "_"), content)
 
 
-class FormatTarget:
+class FormatTarget(FileTarget):
     """`csplat.read` of formats that are not ours: a sound model or an InputError. Cases begin with their ending."""
 
     name = "formats"
     suffix = ".case"
     watched: Sequence[Path] = tuple(sorted(_PACKAGE.glob("formats/*.py")))
-
-    def __init__(self) -> None:
-        memory = Path("/dev/shm")  # noqa: S108 - a folder of our own is made in it; a disk costs most of the time
-        self._folder = tempfile.TemporaryDirectory(prefix="csplat-fuzz-", dir=memory if memory.is_dir() else None)
 
     def seeds(self, paths: Iterable[Path]) -> list[Seed]:
         """Return small scenes in every format that is written to one file, and the given files."""
@@ -106,18 +101,6 @@ class FormatTarget:
             for start in reversed(range(0, len(seed.content), piece)):
                 less = Seed(seed.ending, seed.content[:start] + seed.content[start + piece :])
                 seed = seed if (yield less.data) is None else less
-
-    def memory(self) -> str:
-        """Nothing runs elsewhere."""
-        return ""
-
-    def coverage(self) -> str:
-        """Nothing runs elsewhere."""
-        return ""
-
-    def close(self) -> None:
-        """Remove the scratch folder."""
-        self._folder.cleanup()
 
 
 def _inside(rng: random.Random, data: bytes) -> bytes:

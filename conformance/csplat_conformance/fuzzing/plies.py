@@ -20,12 +20,32 @@ from csplat_conformance.fuzzing import ply_mutants
 from csplat_conformance.fuzzing.ply_mutants import Ply, changed
 from csplat_conformance.fuzzing.targets import Case
 
-__all__ = ["PlyTarget", "unsound"]
+__all__ = ["FileTarget", "PlyTarget", "unsound"]
 
 _PACKAGE = Path(csplat.__file__).parent
 
 
-class PlyTarget:
+class FileTarget:
+    """What targets share that read files of a folder of their own; nothing of them runs elsewhere."""
+
+    def __init__(self) -> None:
+        memory = Path("/dev/shm")  # noqa: S108 - a folder of our own is made in it; a disk costs most of the time
+        self._folder = tempfile.TemporaryDirectory(prefix="csplat-fuzz-", dir=memory if memory.is_dir() else None)
+
+    def memory(self) -> str:
+        """No limit that another process could pass."""
+        return ""
+
+    def coverage(self) -> str:
+        """None of another process."""
+        return ""
+
+    def close(self) -> None:
+        """Remove the scratch folder."""
+        self._folder.cleanup()
+
+
+class PlyTarget(FileTarget):
     """`read_ply` and `lint_ply`: a sound model or an InputError, and the two agree."""
 
     name = "ply"
@@ -33,8 +53,7 @@ class PlyTarget:
     watched: Sequence[Path] = tuple(sorted([*_PACKAGE.glob("ply*.py"), _PACKAGE / "lint.py", _PACKAGE / "foreign.py"]))
 
     def __init__(self) -> None:
-        memory = Path("/dev/shm")  # noqa: S108 - a folder of our own is made in it; a disk costs most of the time
-        self._folder = tempfile.TemporaryDirectory(prefix="csplat-fuzz-", dir=memory if memory.is_dir() else None)
+        super().__init__()
         self._file = Path(self._folder.name) / "case.ply"
 
     def seeds(self, paths: Iterable[Path]) -> list[Ply]:
@@ -96,18 +115,6 @@ class PlyTarget:
             for start in reversed(range(0, len(ply.body), piece)):
                 smaller = Ply(ply.lines, ply.body[:start] + ply.body[start + piece :], ply.newline)
                 ply = ply if (yield smaller.data) is None else smaller
-
-    def memory(self) -> str:
-        """Nothing runs elsewhere."""
-        return ""
-
-    def coverage(self) -> str:
-        """Nothing runs elsewhere."""
-        return ""
-
-    def close(self) -> None:
-        """Remove the scratch folder."""
-        self._folder.cleanup()
 
 
 # What must hold ------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat.scene import Scene
-from csplat.turning import in_axes, scaled, turned
+from csplat.turning import in_axes, moved, scaled, turned
 from csplat_tools.files.scenes import without_bands
 
 __all__ = ["Filters", "isolated"]
@@ -59,7 +59,7 @@ class Filters:
             scene = _changed(scene, lambda model: scaled(model, factor))
         if self.translate is not None:
             offset = self.translate
-            scene = _changed(scene, lambda model: _moved(model, offset))
+            scene = _changed(scene, lambda model: moved(model, offset))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
             scene = _kept(scene, lambda model: _inside_box(model, corners))
@@ -111,13 +111,6 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     x, y, z = (cells[:, k] + (1 << 20) for k in range(3))
     key: NDArray[np.int64] = (x << 42) | (y << 21) | z
     return key
-
-
-def _moved(model: SplatModel, offset: tuple[float, float, float]) -> SplatModel:
-    """Add to the means, not to the origin, for which few formats have a place."""
-    doubles = None if model.means_double is None else model.means_double + np.array(offset)
-    means = model.means + np.array(offset) if doubles is None else doubles - np.array(model.origin)
-    return replace(model, means=means.astype(np.float32), means_double=doubles)
 
 
 def _changed(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
