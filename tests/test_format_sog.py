@@ -150,6 +150,15 @@ def levels(tmp_path, **changes):
     return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
 
 
+def test_a_part_without_a_level_has_its_nearest(tmp_path):
+    one = {"1": {"file": 0, "offset": 0, "count": 5}}
+    two = {"0": {"file": 1, "offset": 1, "count": 3}}
+    path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
+    for level in (0, 1):
+        with open_scene(path, level=level) as scene:
+            assert [0] * 5 + [1] * 3 + [3] * 5 == scene.model().sh0[:, 0].tolist()
+
+
 def test_of_levels_the_finest_is_the_scene(tmp_path):
     path = levels(tmp_path)
     for place in (path, path / "lod-meta.json"):
@@ -159,6 +168,12 @@ def test_of_levels_the_finest_is_the_scene(tmp_path):
             assert [0] * 5 + [1] * 3 + [3] * 5 == model.sh0[:, 0].tolist()
             assert not model.shN[:5].any()
             assert model.shN[5:8].any()
+            assert (13, 10) == scene.levels
+        with open_scene(place, level=1) as scene:
+            assert [2] * 5 + [3] * 5 == scene.model().sh0[:, 0].tolist()
+            assert (13, 10) == scene.levels
+    with pytest.raises(InputError, match="levels are 0 to 1"), open_scene(path, level=2):
+        pass
     (path / "env" / "meta.json").unlink()
     with pytest.raises(InputError, match=r"there is no env/meta\.json"):
         csplat.read(path)
@@ -168,6 +183,7 @@ def test_of_levels_the_finest_is_the_scene(tmp_path):
     ("changes", "says"),
     [
         ({"version": 2}, "version 2 of streamed"),
+        ({"tree": {"lods": 3}}, "no object"),
         ({"filenames": ["../a", "b", "c"]}, "outside"),
         ({"filenames": []}, "integer from 0"),
         ({"tree": {"children": 3}}, "no list"),

@@ -16,7 +16,7 @@ import numpy as np
 from csplat.lint import Finding
 from csplat.model import SplatModel
 
-__all__ = ["BLOCK", "Scene", "scene_of"]
+__all__ = ["BLOCK", "Scene", "joined", "scene_of"]
 
 #: Splats of a block, at most.
 BLOCK = 65_536
@@ -34,6 +34,7 @@ class Scene:
             splats at most, whose facts are `facts`.
         findings: what was noticed so far; grows while the first blocks are read.
         format: name of the format that it is read from; "" of a scene in memory.
+        levels: splats of each level, the finest first, of a file that has the scene several times; this is one of them.
     """
 
     count: int
@@ -41,10 +42,11 @@ class Scene:
     blocks: Callable[[], Iterator[SplatModel]]
     findings: list[Finding] = field(default_factory=list)
     format: str = ""
+    levels: tuple[int, ...] = ()
 
     def model(self) -> SplatModel:
         """All of it in memory."""
-        return _joined(self.facts, list(self.blocks()))
+        return joined(self.facts, list(self.blocks()))
 
 
 def scene_of(model: SplatModel) -> Scene:
@@ -57,7 +59,8 @@ def scene_of(model: SplatModel) -> Scene:
     return Scene(len(model), model.select(slice(0, 0)), blocks)
 
 
-def _joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
+def joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
+    """Blocks of a scene, one after the other."""
     if len(blocks) < 2:
         return blocks[0] if blocks else facts
     arrays: dict[str, Any] = {

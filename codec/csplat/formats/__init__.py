@@ -103,12 +103,13 @@ def read(
 
 
 @contextmanager
-def open_scene(file: File, format: str | None = None) -> Iterator[Scene]:
+def open_scene(file: File, format: str | None = None, *, level: int = 0) -> Iterator[Scene]:
     """Open a scene in any format, to be read some splats at a time.
 
     Args:
         file: as of `read`.
         format: as of `read`.
+        level: of a file that has the scene several times; 0 is the finest.
 
     Yields:
         The scene; its blocks can be read as long as the context lasts.
@@ -117,7 +118,7 @@ def open_scene(file: File, format: str | None = None) -> Iterator[Scene]:
         InputError: the file is in no format that is read, or not whole. Blocks raise it, too.
         OSError: it cannot be read.
     """
-    with local_file(file) as path, _opened(_readable(path, format), path) as scene:
+    with local_file(file) as path, _opened(_readable(path, format), path, level) as scene:
         yield scene
 
 
@@ -215,9 +216,11 @@ def _readable(path: Path, format: str | None) -> Format:
 
 
 @contextmanager
-def _opened(found: Format, path: Path) -> Iterator[Scene]:
+def _opened(found: Format, path: Path, level: int = 0) -> Iterator[Scene]:
     assert found.open is not None
-    with found.open(path) as scene:
+    if level and found.open_level is None:
+        raise InputError(f"{path.name} is {found.title}, which has no levels, and level {level} is wanted")
+    with found.open_level(path, level) if found.open_level is not None else found.open(path) as scene:
         placed = in_axes(scene, USUAL) if found.axes else scene
         yield replace(placed, format=found.name)
 

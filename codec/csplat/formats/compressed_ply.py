@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
+from csplat.formats.curve import along_curve
 from csplat.formats.format import Format
-from csplat.formats.packing import all_three, morton_order, smallest_three
+from csplat.formats.packing import all_three, smallest_three
 from csplat.model import F32, SplatModel
 from csplat.ply_comments import format_comments, parse_comments
 from csplat.scene import BLOCK, Scene
@@ -205,48 +206,46 @@ def _sh_values() -> F32:
 
 
 def _write(path: Path, scene: Scene) -> None:
-    """Write all of a scene along a Z curve. 41 bytes of a splat are kept, one more for each coefficient of SH."""
+    """Write all of a scene along a Z curve."""
     rest = 3 * scene.facts.shN.shape[1]
-    parts = [_kept(model) for model in scene.blocks()] or [_kept(scene.facts)]
-    means, scales, colours, rotation, alpha, sh = (np.concatenate(one) for one in zip(*parts, strict=True))
-    del parts
-    order = morton_order(means)
-    words = np.empty((len(order), 4), "<u4")
-    words[:, 1] = rotation[order]
-    bounds = []
-    for column, values, bits in ((0, means, (11, 10, 11)), (2, scales, (11, 10, 11)), (3, colours, (8, 8, 8))):
-        words[:, column], low, high = _packed(values[order], bits)
-        bounds += [low, high]
-    words[:, 3] |= alpha[order]
-    with atomic_writer(path) as stream:
-        stream.write(_written_header(scene.facts, len(order), rest))
-        stream.write(np.concatenate(bounds, 1).astype("<f4").tobytes())
-        stream.write(words.tobytes())
-        for start in range(0, len(order) if rest else 0, BLOCK):
-            stream.write(sh[order[start : start + BLOCK]].tobytes())
+    header = _written_header(scene.facts, scene.count, rest)
+    sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_WORDS) * scene.count
+    places = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
+    with atomic_writer(path) as stream, along_curve(scene, path.parent) as ordered:
+        stream.write(header)
+        for model in ordered.blocks():
+            bounds, words = _words(model)
+            for index, part in enumerate((bounds.astype("<f4"), words, _sh_codes(model))):
+                stream.seek(places[index])
+                places[index] += stream.write(part.tobytes())
 
 
-def _kept(model: SplatModel) -> tuple[F32, F32, F32, U32, U32, U8]:
-    """What is wanted of a block: float32 means, log scales and colours, packed rotations and alphas, bytes of SH."""
+def _words(model: SplatModel) -> tuple[F32, U32]:
+    """The bounds of the chunks of a block [C, 18] and the words of its splats [N, 4]."""
     largest, three = smallest_three(model.quats)
     steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.int64)
-    rotation = (largest << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]).astype(np.uint32)
-    sh = np.clip(np.floor(model.shN.transpose(0, 2, 1) * np.float32(32) + np.float32(128)), 0, 255).astype(np.uint8)
-    return (
-        model.means,
-        np.clip(model.scales, -_LARGEST_LOG, _LARGEST_LOG),
-        (model.sh0 * _SH_C0 + 0.5).astype(np.float32),
-        rotation,
-        np.rint(model.opacities * np.float32(255)).astype(np.uint32),
-        sh.reshape(len(model), 3 * model.shN.shape[1]),
-    )
+    words = np.empty((len(model), 4), "<u4")
+    words[:, 1] = largest << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    bounds = []
+    for column, values, bits in (
+        (0, model.means, (11, 10, 11)),
+        (2, np.clip(model.scales, -_LARGEST_LOG, _LARGEST_LOG), (11, 10, 11)),
+        (3, (model.sh0 * _SH_C0 + 0.5).astype(np.float32), (8, 8, 8)),
+    ):
+        words[:, column], low, high = _packed(values, bits)
+        bounds += [low, high]
+    words[:, 3] |= np.rint(model.opacities * np.float32(255)).astype(np.uint32)
+    return np.concatenate(bounds, 1), words
+
+
+def _sh_codes(model: SplatModel) -> U8:
+    codes: U8 = np.floor(model.shN.transpose(0, 2, 1) * np.float32(32) + np.float32(128)).clip(0, 255).astype(np.uint8)
+    return codes
 
 
 def _packed(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
     """Pack three columns into the upper bits of words. Also the least and the largest of each chunk, [C, 3]."""
     count = len(values)
-    if not count:
-        return np.zeros(0, np.uint32), values, values
     starts = np.arange(0, count, _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     span = (high.astype(np.float64) - low).clip(min=np.finfo(np.float32).tiny)

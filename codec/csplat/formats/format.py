@@ -30,6 +30,14 @@ class Reader(Protocol):
         ...
 
 
+class LevelReader(Protocol):
+    """Opens a file of a scene that it has several times."""
+
+    def __call__(self, path: Path, level: int, /) -> AbstractContextManager[Scene]:
+        """As `Reader`: 0 is the finest level, that of `Reader`, and 1 the next coarser one."""
+        ...
+
+
 class Writer(Protocol):
     """Writes a file, or the files of a folder."""
 
@@ -53,6 +61,7 @@ class Format:
         suffixes: of file names, the usual one first; with their dots, in small letters.
         sniff: whether a file is of this format, by its content: path, and the first bytes of it (none of a folder).
         open: reads it; `None`: it is not read.
+        open_level: reads a level of it; `None`: scenes have one level.
         write: writes it; `None`: it is not written.
         degree: highest SH degree that it holds.
         axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
@@ -68,6 +77,7 @@ class Format:
     suffixes: tuple[str, ...]
     sniff: Callable[[Path, bytes], bool]
     open: Reader | None = None
+    open_level: LevelReader | None = None
     write: Writer | None = None
     degree: int = 3
     axes: str = ""

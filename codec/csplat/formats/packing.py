@@ -1,4 +1,4 @@
-"""What formats that pack splats do alike: rotations as three numbers, an order in which neighbours stay together."""
+"""What formats that pack splats do alike: rotations as three numbers."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.morton import morton_codes
 from csplat.model import F32, normalise_quats
 
-__all__ = ["all_three", "morton_order", "smallest_three"]
+__all__ = ["all_three", "smallest_three"]
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
@@ -49,21 +48,3 @@ def all_three(largest: NDArray[Any], three: F32) -> F32:
         quats[here[:, None], others] = three[here]
         quats[here, index] = left[here]
     return normalise_quats(quats)
-
-
-def morton_order(means: F32) -> NDArray[np.int64]:
-    """The rows along a Z curve through the box of all.
-
-    Args:
-        means: [N, 3].
-
-    Returns:
-        [N]; equal places in their old order.
-    """
-    if not len(means):
-        return np.zeros(0, np.int64)
-    low = means.min(0).astype(np.float64)
-    span = means.max(0) - low
-    span[span == 0] = 1.0
-    steps = np.minimum((means - low) / span * (1 << 21), (1 << 21) - 1)  # of equal parts, as splat-transform has them
-    return np.argsort(morton_codes(steps.astype(np.int64).T), kind="stable")

@@ -22,6 +22,7 @@ from csplat.scene import Scene
 __all__ = ["FORMAT"]
 
 _MOST = 1 << 40
+_Range = tuple[int, int, int]  # number of a file, first splat and the one behind the last
 
 
 def _is_sog(path: Path, head: bytes) -> bool:
@@ -33,12 +34,14 @@ def _is_sog(path: Path, head: bytes) -> bool:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
+def _open(path: Path, level: int = 0) -> Iterator[Scene]:
     parts, name = parts_at(path)
     meta = parts.json(name)
     if "lodLevels" in meta or "tree" in meta:
-        yield _streamed(parts, meta)
+        yield _streamed(parts, meta, level)
         return
+    if level:
+        parts.refuse(f"it has no levels, and level {level} is wanted")
     unit = unit_of(parts, name)
     pictures = Pictures.of(unit)
     degree = COEFFICIENTS.index(pictures.palette.shape[1])
@@ -72,9 +75,13 @@ def _findings(pictures: Pictures) -> list[Finding]:
     return [Finding("zero-quats", pictures.zeros, text, "repair")]
 
 
-def _streamed(parts: Parts, meta: Json) -> Scene:
-    """The finest level of streamed SOG, and its surroundings; a file of it is open at a time."""
-    ranges = _finest(parts, meta)
+def _streamed(parts: Parts, meta: Json, level: int) -> Scene:
+    """A level of streamed SOG, and its surroundings; a file of it is open at a time."""
+    names, leaves = _leaves(parts, meta)
+    last = max([max(one) for one in leaves], default=0)
+    if level > last:
+        parts.refuse(f"level {level} is wanted, its levels are 0 to {last}")
+    ranges = _ranges(parts, names, [_at(one, level) for one in leaves])
     if "environment" in meta:
         ranges[meta["environment"].text()] = None
     units: list[tuple[Unit, list[tuple[int, int]]]] = []
@@ -110,35 +117,49 @@ def _streamed(parts: Parts, meta: Json) -> Scene:
                 if chosen.any():
                     yield model if chosen.all() else model.select(chosen)
 
-    return Scene(sum(stop - start for _, taken in units for start, stop in taken), facts, blocks, findings)
+    count = sum(stop - start for _, taken in units for start, stop in taken)
+    inside = [sum(stop - start for _, start, stop in (_at(leaf, one) for leaf in leaves)) for one in range(last + 1)]
+    around = count - inside[level]
+    return Scene(count, facts, blocks, findings, levels=tuple(one + around for one in inside))
 
 
-def _finest(parts: Parts, meta: Json) -> dict[str, list[tuple[int, int]] | None]:
-    """Which splats of which file the finest level has: ranges that do not overlap, in their order."""
+def _leaves(parts: Parts, meta: Json) -> tuple[list[str], list[dict[int, _Range]]]:
+    """The names of the files, and of each part of the scene the splats of its levels."""
     if "version" in meta and meta["version"].whole(1 << 30) != 1:
         parts.refuse(f"it is of version {meta['version'].value} of streamed SOG, wanted 1")
     names = [one.text() for one in meta["filenames"].list()]
-    levels: dict[int, list[tuple[int, int, int]]] = {}
+    leaves: list[dict[int, _Range]] = []
     nodes = [meta["tree"]]
     while nodes:
         node = nodes.pop()
-        if "children" in node:
-            nodes += reversed(node["children"].list())
-        lods = node["lods"].value if "lods" in node else {}
+        if "lods" not in node:
+            nodes += reversed(node["children"].list()) if "children" in node else []
+            continue
+        lods = node["lods"].value
         if not isinstance(lods, dict):
             parts.refuse(f"{node.place} lods is no object")
+        leaf: dict[int, _Range] = {}
         for level, value in lods.items():
             reference = Json(parts, f"{node.place} lods", value)
             file = reference["file"].whole(len(names) - 1)
             start = reference["offset"].whole(_MOST)
-            stop = start + reference["count"].whole(_MOST)
-            if not (level.isdecimal() and level.isascii() and len(level) < 9):
+            if not (level.isdecimal() and level.isascii() and len(level) < 3):
                 parts.refuse(f"{level[:20]!r} is no level")
-            if stop > start:
-                levels.setdefault(int(level), []).append((file, start, stop))
+            leaf[int(level)] = file, start, start + reference["count"].whole(_MOST)
+        leaves += [leaf] if leaf else []
+    return names, leaves
+
+
+def _at(leaf: dict[int, _Range], level: int) -> _Range:
+    """What a part of the scene has at a level; or else at the next coarser one; or at its coarsest."""
+    return leaf[min((one for one in leaf if one >= level), default=max(leaf))]
+
+
+def _ranges(parts: Parts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
+    """Which splats of which file are wanted: ranges that do not overlap, in their order."""
     found: dict[str, list[tuple[int, int]] | None] = {}
     before = (-1, 0, 0)
-    for one in sorted(levels[min(levels)]) if levels else []:
+    for one in sorted(one for one in wanted if one[2] > one[1]):
         file, start, stop = one
         if file == before[0] and start < before[2]:
             parts.refuse(f"splats {start:,} to {before[2]:,} of {names[file][:80]} are wanted twice")
@@ -157,6 +178,7 @@ FORMAT = Format(
     suffixes=(".sog", "meta.json"),
     sniff=_is_sog,
     open=_open,
+    open_level=_open,
     write=write_sog,
     carries=frozenset({"antialiased", "flat"}),
 )

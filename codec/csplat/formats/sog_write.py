@@ -6,24 +6,28 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.kmeans import cluster
+from csplat.encoder.kmeans import assign, cluster
 from csplat.errors import InputError, missing
 from csplat.files import atomic_writer
-from csplat.formats.packing import morton_order, smallest_three
+from csplat.formats.curve import along_curve
+from csplat.formats.packing import smallest_three
 from csplat.formats.sog_read import ENTRIES, LEAST_TAG
 from csplat.model import F32, SplatModel
-from csplat.scene import Scene
+from csplat.scene import Scene, joined
 
 __all__ = ["write_sog"]
 
 U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
 F64 = NDArray[np.float64]
 
 _LEAST_WEIGHT = 1e-3
@@ -35,6 +39,9 @@ _NORM = 1000  # lattice steps of a long vector of SH: searches are exact up to t
 _NEAR = 4  # groups of palette entries that are searched: of 181 for 60,000 splats
 _ITERATIONS = 2  # more gain 0.03 dB, in three times the time
 _LARGEST_PALETTE = 1 << 16
+_PIXELS_AT_ONCE = 1 << 23  # of WebPs that are written side by side, each in 70 bytes a pixel
+_SAMPLE = 1 << 20  # splats that codebooks and palette are made of
+_CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
 def write_sog(path: Path, scene: Scene) -> None:
@@ -46,81 +53,116 @@ def write_sog(path: Path, scene: Scene) -> None:
     """
     if path.name.lower() == "lod-meta.json":
         raise InputError(f"{path.name} would be streamed SOG, which csplat does not write: end it in .sog")
-    files = _files(scene.model())
-    if path.name.lower().endswith("meta.json"):
+    is_folder = path.name.lower().endswith("meta.json")
+    if is_folder:
         path.parent.mkdir(exist_ok=True)
-        for name, data in files.items():  # meta.json is the last
-            with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
-                stream.write(data)
-        return
-    with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+    with along_curve(scene, path.parent) as ordered:
+        if is_folder:
+            for name, data in _files(ordered):  # meta.json is the last
+                with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
+                    stream.write(data)
+            return
+        with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
+            for name, data in _files(ordered):
+                archive.writestr(zipfile.ZipInfo(name, _DATE), data)
 
 
-def _files(model: SplatModel) -> dict[str, bytes]:
-    """The parts by name, in their order."""
-    count = len(model)
+def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
+    """Each part, by name. Kept are the pixels, 4 bytes a splat in each of 5 or 6 pictures."""
+    count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
     height = max(1, math.ceil(count / width / 4)) * 4
     if max(width, height) > _LARGEST_SIDE:
         raise InputError(f"{count:,} splats are more than the pictures of SOG hold")
-    order = morton_order(model.means)
-    model = model.select(order)
-    weights = _weights(model)
-
-    def square(*columns: NDArray[Any]) -> U8:
-        pixels = np.zeros((width * height, 4), np.uint8)
-        pixels[:, 3] = 255
-        table = np.column_stack(columns)
-        pixels[:count, : table.shape[1]] = table
-        return pixels.reshape(height, width, 4)
-
-    logs = np.sign(model.means) * np.log1p(np.abs(model.means.astype(np.float64)))
-    low, high = (logs.min(0), logs.max(0)) if count else (np.zeros(3), np.zeros(3))
-    places = np.rint((logs - low) * (65535 / np.where(high > low, high - low, 1.0))).astype(np.uint16)
-    largest, three = smallest_three(model.quats)
-    turned = np.clip(np.rint((three * np.float32(2**0.5) + 1) * np.float32(127.5)), 0, 255)
+    low, high, sample = _sampled(scene)
+    weigh = _Weights(float(np.median(_area(sample))) if count else 0.0)
     # By their roots: of few values each tail is seen somewhere (donut has 60.6 dB, by the weights themselves 53.1).
-    scales, scale_codes = _codebook(model.scales, np.sqrt(weights))
-    colours, colour_codes = _codebook(model.sh0, np.sqrt(weights))
+    roots = np.sqrt(weigh(sample))
+    scales, colours = _codebook(sample.scales, roots), _codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
-    if model.antialiased or model.flat:
-        meta["model"] = "antialiased" if model.antialiased else "2dgs"
+    if scene.facts.antialiased or scene.facts.flat:
+        meta["model"] = "antialiased" if scene.facts.antialiased else "2dgs"
     meta |= {
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": _short(scales), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": _short(colours), "files": ["sh0.webp"]},
     }
-    pictures = {
-        "means_l.webp": square(places & 255),
-        "means_u.webp": square(places >> 8),
-        "quats.webp": square(turned, largest + LEAST_TAG),
-        "scales.webp": square(scale_codes),
-        "sh0.webp": square(colour_codes, np.rint(model.opacities * np.float32(255))),
-    }
-    if model.sh_degree and count:
-        values, entries, labels = _palette(model.shN, weights)
-        pictures["shN_centroids.webp"] = entries
-        pictures["shN_labels.webp"] = square(labels & 255, labels >> 8)
+
+    def square(table: NDArray[Any]) -> U8:
+        pixels = np.zeros((height * width, 4), np.uint8)
+        pixels[:, 3] = 255
+        pixels[:count, : table.shape[1]] = table
+        return pixels.reshape(height, width, 4)
+
+    codes = {name: np.empty((count, channels), np.uint8) for name, channels in _CHANNELS.items()}
+    for rows, model in _numbered(scene):
+        places = np.rint((_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
+        largest, three = smallest_three(model.quats)
+        codes["means_l.webp"][rows], codes["means_u.webp"][rows] = places % 256, places // 256
+        codes["quats.webp"][rows, :3] = np.clip(np.rint((three * np.float32(2**0.5) + 1) * np.float32(127.5)), 0, 255)
+        codes["quats.webp"][rows, 3] = largest + LEAST_TAG
+        codes["scales.webp"][rows] = _nearest(scales, model.scales)
+        codes["sh0.webp"][rows, :3] = _nearest(colours, model.sh0)
+        codes["sh0.webp"][rows, 3] = np.rint(model.opacities * np.float32(255))
+    if scene.facts.sh_degree and count:
+        values, entries, labels = _palette(scene, sample, weigh)
+        codes["shN_labels.webp"] = labels[:, None].astype("<u2").view(np.uint8)
         meta["shN"] = {
             "count": len(entries) * ENTRIES,
-            "bands": model.sh_degree,
+            "bands": scene.facts.sh_degree,
             "codebook": _short(values),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with ThreadPoolExecutor() as pool:
-        files = dict(zip(pictures, pool.map(_webp, pictures.values()), strict=True))
-    return {**files, "meta.json": json.dumps(meta, separators=(",", ":")).encode()}
+        yield "shN_centroids.webp", _webp(entries)
+    with ThreadPoolExecutor(max(1, min(len(codes), _PIXELS_AT_ONCE // (width * height)))) as pool:
+        yield from zip(codes, pool.map(lambda name: _webp(square(codes[name])), codes), strict=True)
+    yield "meta.json", json.dumps(meta, separators=(",", ":")).encode()
 
 
-def _weights(model: SplatModel) -> F32:
-    """How much of a picture a splat may be: opacity times the area of its largest side."""
-    sides = np.sort(model.scales, 1)[:, 1:].sum(1, dtype=np.float64)
-    area = np.exp(sides - (np.median(sides) if len(sides) else 0.0)).clip(1e-2, 1e2)
-    weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
-    return weights
+def _numbered(scene: Scene) -> Iterator[tuple[slice, SplatModel]]:
+    """Each block, and which splats of the scene it has."""
+    start = 0
+    for model in scene.blocks():
+        yield slice(start, start + len(model)), model
+        start += len(model)
+
+
+def _sampled(scene: Scene) -> tuple[F64, F64, SplatModel]:
+    """Bounds of the logarithms of all positions; and splats at equal steps along the curve, or all that are few."""
+    step = -(-scene.count // _SAMPLE) or 1
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    taken = []
+    for rows, model in _numbered(scene):
+        logs = _logs(model.means)
+        low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
+        taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
+    if not taken:
+        return np.zeros(3), np.zeros(3), scene.facts
+    return low, high, joined(scene.facts, taken)
+
+
+def _logs(means: F32) -> F64:
+    logs: F64 = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    return logs
+
+
+def _area(model: SplatModel) -> F64:
+    """The logarithm of that of the largest side."""
+    area: F64 = np.sort(model.scales, 1)[:, 1:].sum(1, dtype=np.float64)
+    return area
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """How much of a picture splats may be: opacity times area, which is 1 at the median of the scene."""
+
+    middle: float
+
+    def __call__(self, model: SplatModel) -> F32:
+        area = np.exp(_area(model) - self.middle).clip(1e-2, 1e2)
+        weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
+        return weights
 
 
 def _short(values: F32) -> list[float]:
@@ -128,7 +170,7 @@ def _short(values: F32) -> list[float]:
     return [float(str(one)) for one in values]
 
 
-def _codebook(columns: F32, weights: F32) -> tuple[F32, U8]:
+def _codebook(columns: F32, weights: F32) -> F32:
     """256 values that stand for all, by Lloyd's algorithm on the sorted values: exact, and cheap for any number.
 
     Args:
@@ -136,11 +178,11 @@ def _codebook(columns: F32, weights: F32) -> tuple[F32, U8]:
         weights: [N].
 
     Returns:
-        [256] float32, ascending; and the code of each value, [N, C].
+        [256] float32, ascending.
     """
     flat = columns.ravel()
     if not len(flat):
-        return np.zeros(_CODES, np.float32), np.zeros(columns.shape, np.uint8)
+        return np.zeros(_CODES, np.float32)
     order = np.argsort(flat, kind="stable")
     values = flat[order].astype(np.float64)
     weight = np.repeat(weights.astype(np.float64), columns.shape[1])[order]
@@ -156,38 +198,56 @@ def _codebook(columns: F32, weights: F32) -> tuple[F32, U8]:
         inside = np.diff(mass[ends])
         np.divide(np.diff(moment[ends]), inside, out=codes, where=inside > 0)
         codes.sort()
-    codebook = codes.astype(np.float32)
+    codebook: F32 = codes.astype(np.float32)
     first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0)
     if len(first) <= _CODES:
         codebook = np.pad(values[first], (0, _CODES - len(first)), "edge").astype(np.float32)
-    found = np.searchsorted((codebook[1:].astype(np.float64) + codebook[:-1]) / 2, columns)
-    return codebook, found.astype(np.uint8)
+    return codebook
 
 
-def _palette(shN: F32, weights: F32) -> tuple[F32, U8, NDArray[np.uint16]]:
+def _nearest(codebook: F32, columns: F32) -> U8:
+    """The code of each value."""
+    codes = np.searchsorted((codebook[1:].astype(np.float64) + codebook[:-1]) / 2, columns)
+    return codes.astype(np.uint8)
+
+
+def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8, U32]:
     """Vectors of SH that stand for those of all splats.
 
     Returns:
         The codebook of their coefficients; the picture of the palette; the label of each splat.
     """
-    count, coefficients = shN.shape[:2]
-    rows = shN.reshape(count, -1)
-    lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
-    step = max(float(np.quantile(lengths, 0.999)) / _NORM, 1e-6)
-    limit = 2 * _NORM / rows.shape[1] ** 0.5
-    points = np.rint(np.clip(rows / np.float32(step), -limit, limit)).astype(np.int16)
-    size = min(_LARGEST_PALETTE, 1 << max(10, count.bit_length() - 1))  # as splat-transform has it
-    entries, labels = cluster(points, weights, size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR)
-    total = np.bincount(labels, weights, len(entries))
-    centres = np.stack([np.bincount(labels, weights * column, len(entries)) / total for column in rows.T], 1)
+    coefficients = scene.facts.shN.shape[1]
+    lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
+    step = np.float32(max(float(np.quantile(lengths, 0.999)) / _NORM, 1e-6))
+    limit = 2 * _NORM / (3 * coefficients) ** 0.5
+
+    def points(model: SplatModel) -> NDArray[np.int16]:
+        found: NDArray[np.int16] = np.rint((model.shN.reshape(len(model), -1) / step).clip(-limit, limit)).astype(
+            np.int16
+        )
+        return found
+
+    size = min(_LARGEST_PALETTE, 1 << max(10, scene.count.bit_length() - 1))  # as splat-transform has it
+    entries, labels = cluster(points(sample), weigh(sample), size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR)
+    if len(labels) < scene.count:
+        labels = np.concatenate([assign(points(model), entries, near_groups=_NEAR) for model in scene.blocks()])
+    total, sums = np.zeros(len(entries)), np.zeros((3 * coefficients, len(entries)))
+    for rows, model in _numbered(scene):
+        weights = weigh(model)
+        total += np.bincount(labels[rows], weights, len(entries))
+        for index, column in enumerate(model.shN.reshape(len(model), -1).T):
+            sums[index] += np.bincount(labels[rows], weights * column, len(entries))
+    centres = np.divide(sums, total, out=sums, where=total > 0).T
     order = np.argsort(np.einsum("nd,nd->n", centres, centres), kind="stable")
-    rank = np.empty(len(order), np.uint16)
+    rank = np.empty(len(order), np.uint32)
     rank[order] = np.arange(len(order))
-    values, codes = _codebook(centres[order].astype(np.float32), total[order].astype(np.float32))
+    columns = centres[order].astype(np.float32)
+    values = _codebook(columns, total[order].astype(np.float32))
     height = -(-len(order) // ENTRIES)
     pixels = np.zeros((height * ENTRIES, coefficients, 4), np.uint8)
     pixels[:, :, 3] = 255
-    pixels[: len(order), :, :3] = codes.reshape(-1, coefficients, 3)
+    pixels[: len(order), :, :3] = _nearest(values, columns).reshape(-1, coefficients, 3)
     return values, pixels.reshape(height, ENTRIES * coefficients, 4), rank[labels]
 
 

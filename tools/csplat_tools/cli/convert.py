@@ -96,6 +96,9 @@ def convert(
     write_as: Annotated[
         str | None, typer.Option("--to", metavar="FORMAT", hidden=True, help="Of OUT, if its name does not say it.")
     ] = None,
+    level: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Of streamed SOG: 0 is the finest level, which is read by default.")
+    ] = 0,
     no_loss: Annotated[bool, typer.Option("--no-loss", help="Refuse where anything would be lost.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be lost and how large it gets.")] = False,
 ) -> None:
@@ -119,7 +122,7 @@ def convert(
         out.check(str(folder) if made_anew else output, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
-            source, output, read_as=read_as, write_as=write_as, facts=upright.upright(),
+            source, output, read_as=read_as, write_as=write_as, level=level, facts=upright.upright(),
             filters=changes.filters(sh_degree), no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.findings(made.findings)

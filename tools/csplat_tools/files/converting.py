@@ -75,6 +75,7 @@ def convert_file(
     *,
     read_as: str | None = None,
     write_as: str | None = None,
+    level: int = 0,
     facts: SceneOverrides | None = None,
     filters: Filters | None = None,
     no_loss: bool = False,
@@ -89,6 +90,7 @@ def convert_file(
             settled before.
         read_as: the name of the source's format, where its content does not say it.
         write_as: the name of the target's.
+        level: of a source that has the scene several times; 0 is the finest.
         facts: what the source does not say.
         filters: what becomes of the scene on the way.
         no_loss: refuse where anything is lost.
@@ -102,7 +104,7 @@ def convert_file(
     writes = named_by(Path(target)) if write_as is None else named(write_as)
     if writes.write is None:
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
-    with local_path(source) as local, open_scene(local, read_as) as opened:
+    with local_path(source) as local, open_scene(local, read_as, level=level) as opened:
         told = facts or SceneOverrides()
         scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
         before = scene.facts.coordinate_system

@@ -36,6 +36,7 @@ def describe_foreign(source: str) -> tuple[dict[str, Any], str]:
             "size_bytes": size,
             "bytes_per_splat": per_splat,
             "splats": count,
+            "levels": list(scene.levels),
             "sh_degree": facts.sh_degree,
             "coordinate_system": facts.coordinate_system,
             "origin": list(facts.origin),
@@ -48,6 +49,8 @@ def describe_foreign(source: str) -> tuple[dict[str, Any], str]:
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
         words = place_words(facts, count, facts.metadata)
+        if scene.levels:
+            words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
         if facts.extra:
             words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
         if facts.metadata:
