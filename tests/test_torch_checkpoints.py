@@ -70,7 +70,7 @@ def test_what_is_no_scene_is_refused(torch, make_model, tmp_path):
         ({"splats": endless}, "NaN or infinite"),
         ({"splats": {"means": splats["means"]}}, "no quats"),
         ({"splats": {**splats, "sh0": torch.zeros(5, 2)}}, "sh0 has shape"),
-        ({"splats": print}, r"a\.pt cannot be read by torch\.load: "),
+        ({"splats": print}, r"a\.pt holds objects of a program"),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": torch.zeros(3, 3)}), "scales"),
     ):
         (tmp_path / "a.pt").write_bytes(saved(torch, said))

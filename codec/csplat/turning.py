@@ -100,7 +100,7 @@ def turned(model: SplatModel, rotation: ArrayLike) -> SplatModel:
     if matrix.shape != (3, 3) or not (np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all():
         raise InputError(f"the rotation is {matrix.tolist()}, wanted an orthogonal matrix [3, 3]")
     quats, scales = _turned_shapes(model, matrix)
-    x, y, z = _applied(matrix, np.array(model.origin)).tolist()
+    x, y, z = (_applied(matrix, np.array(model.origin)) + 0.0).tolist()  # no negative zeros
     doubles = None if model.means_double is None else _applied(matrix, model.means_double)
     return replace(
         model,

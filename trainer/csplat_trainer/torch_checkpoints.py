@@ -8,6 +8,8 @@ What they do not say, such as whether a scene was trained antialiased, stands in
 
 from __future__ import annotations
 
+import pickle
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -48,14 +50,17 @@ def _read(path: Path) -> SplatModel:
     except ModuleNotFoundError as error:
         raise InputError(f"{path.name} is a checkpoint of torch: {missing(error, extra='train')}") from None
     try:
-        with _plain_numbers(torch):
+        with _plain_numbers(torch), warnings.catch_warnings(action="ignore"):
             # Mapped: of a checkpoint of splatfacto two thirds are Adam's memory.
             said = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 -- an unpickler raises whatever a damaged file makes of it
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path.name} cannot be read by torch.load: {reason}") from None
+        if isinstance(error, pickle.UnpicklingError) and "eights only" in str(error):
+            reason = "holds objects of a program, which could do anything: save tensors alone, as state_dict gives them"
+        else:  # what torch says of it goes on for twenty lines
+            reason = "is no whole checkpoint of torch: copy it again, or save its splats as PLY where it was trained"
+        raise InputError(f"{path.name} {reason}") from None
     try:
         return _model_of(said, path.stat().st_size)
     except InputError as error:

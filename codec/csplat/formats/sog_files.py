@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -185,15 +184,13 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
         InputError: it is damaged or of another size; or Pillow is absent.
     """
     try:
-        from PIL import Image
+        from PIL.WebPImagePlugin import WebPImageFile  # Image.open loads all formats that Pillow knows
     except ModuleNotFoundError as error:
         raise missing(error, "Pillow") from None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is looked at here
-            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
-                if not fits(*image.size):
-                    parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which is not what was declared")
-                return np.asarray(image.convert("RGBA"))
-    except (*DAMAGED, Image.DecompressionBombError) as error:
+        with WebPImageFile(io.BytesIO(data)) as image:
+            if not fits(*image.size):
+                parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which is not what was declared")
+            return np.asarray(image.convert("RGBA"))
+    except DAMAGED as error:
         parts.refuse(f"{name} is no whole WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")

@@ -182,7 +182,7 @@ def _read_extensions(packed: Packed, data: bytes) -> None:
 def _taken(name: str, stream: BinaryIO, size: int) -> bytes:
     data = stream.read(size)
     if len(data) < size:
-        raise InputError(f"{name} ends too early")
+        raise InputError(f"{name} is no SPZ, or ends too early")
     return data
 
 
