@@ -56,14 +56,14 @@ def write_spz(path: Path, scene: Scene, *, version: int) -> None:
     scene = in_axes(scene, AXES)
     flags = ANTIALIASED if scene.facts.antialiased else 0
     packed = Packed(path.name, version, scene.count, scene.facts.sh_degree, _fraction(path, scene), flags)
-    packed.parts = [np.empty((scene.count, width), np.uint8) for width in packed.widths]
+    room = packed.room()
     start = 0
     for block in scene.blocks():
         rows = slice(start, start + len(block))
         for part, codes in zip(packed.parts, _encoded(block, packed.bits), strict=True):
             part[rows] = codes
         start = rows.stop
-    write_packed(path, packed)
+    write_packed(path, packed, room)
 
 
 def _decoded(packed: Packed, rows: slice) -> SplatModel:

@@ -78,6 +78,16 @@ class Packed:
         rest = 3 * ((self.degree + 1) ** 2 - 1)
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, rest
 
+    def room(self) -> U8:
+        """Make the parts, one after the other behind a header: the bytes of versions 1 to 3."""
+        ends = _HEADER.size + np.cumsum((0, *self.widths)) * self.count
+        data = np.empty(ends[-1], np.uint8)
+        self.parts = [
+            data[start:end].reshape(self.count, width)
+            for (start, end), width in zip(pairwise(ends), self.widths, strict=True)
+        ]
+        return data
+
     @property
     def means_half(self) -> NDArray[np.float16]:
         """The positions of version 1."""
@@ -125,13 +135,7 @@ def _header(path: Path, stream: BinaryIO) -> Packed:
 
 def _read_arrays(packed: Packed, path: Path, stream: BinaryIO) -> None:
     """Versions 1 to 3: one attribute after the other, then extensions."""
-    data = np.empty(packed.count * sum(packed.widths), np.uint8)
-    _fill(path.name, stream, data)
-    ends = np.cumsum((0, *packed.widths)) * packed.count
-    packed.parts = [
-        data[start:end].reshape(packed.count, width)
-        for (start, end), width in zip(pairwise(ends), packed.widths, strict=True)
-    ]
+    _fill(path.name, stream, packed.room()[_HEADER.size :])
     tail = stream.read(_EXTENSION_BYTES + 1)  # to the end, where gzip has its checksum
     if len(tail) > _EXTENSION_BYTES:
         raise InputError(f"{path.name} goes on after its last splat")
@@ -195,27 +199,27 @@ def _fill(name: str, stream: Any, data: U8) -> None:
         at += got
 
 
-def write_packed(path: Path, packed: Packed) -> None:
+def write_packed(path: Path, packed: Packed, room: U8) -> None:
     """Write version 3 or 4, without extensions.
+
+    Args:
+        path: of the file.
+        packed: what it says.
+        room: that of the parts, which are filled; takes the header, too.
 
     Raises:
         OSError: the file cannot be written.
     """
-    head = _HEADER.pack(_MAGIC, packed.version, packed.count, packed.degree, packed.bits, packed.flags, 0)
-    if packed.version < 4:
-        data = bytes(deflate.gzip_compress(b"".join([head, *(part.tobytes() for part in packed.parts)]), _GZIP_LEVEL))
-    else:
-        data = _with_streams(head, packed.parts)
+    there = [part for part in packed.parts if part.size] if packed.version > 3 else []
+    head = _HEADER.pack(_MAGIC, packed.version, packed.count, packed.degree, packed.bits, packed.flags, len(there))
     with atomic_writer(path) as stream:
-        stream.write(data)
-
-
-def _with_streams(head: bytes, parts: list[U8]) -> bytes:
-    there = [part.tobytes() for part in parts if part.size]
-    streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data) for data in there]
-    rows = [_STREAM.pack(len(small), len(data)) for small, data in zip(streams, there, strict=True)]
-    table = _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size)
-    return b"".join([head[:-1], bytes([len(streams)]), table, *rows, *streams])
+        if packed.version < 4:
+            room[: len(head)] = np.frombuffer(head, np.uint8)
+            stream.write(deflate.gzip_compress(room, _GZIP_LEVEL))
+            return
+        streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in there]
+        rows = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, there, strict=True)]
+        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *rows, *streams])
 
 
 def is_spz(_path: Path, head: bytes) -> bool:
