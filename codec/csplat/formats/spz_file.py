@@ -44,6 +44,7 @@ _SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # by number, t
 _EXTENSION_BYTES = 1 << 20  # at most
 _RATIO = 1032  # of deflate, at most; programs of the format refuse more of Zstandard, too
 _GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
+_PIECE = 1 << 18
 
 
 @dataclass(eq=False)
@@ -193,7 +194,7 @@ def _taken(name: str, stream: BinaryIO, size: int) -> bytes:
 def _fill(name: str, stream: Any, data: U8) -> None:
     at = 0
     while at < len(data):
-        got = stream.readinto(data[at:])
+        got = stream.readinto(data[at : at + _PIECE])  # of all gzip would make a copy
         if not got:
             raise InputError(f"{name} ends too early: {at:,} of {len(data):,} bytes are there")
         at += got
