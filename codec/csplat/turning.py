@@ -240,7 +240,7 @@ def _quat_of(matrix: F64) -> F64:
     for row, column, entry in zip(*np.tril_indices(4), entries, strict=True):
         lower[..., row, column] = entry
     quats: F64 = np.linalg.eigh(lower)[1][..., 3]
-    return quats
+    return np.where(quats[..., :1] < 0.0, -quats, quats)  # the solver's signs differ from machine to machine
 
 
 def _matrices(quats: F32) -> F64:
