@@ -219,6 +219,21 @@ def test_the_facts_of_a_scene_survive_a_ply(tmp_path, make_model):
     for name in ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "metadata"):
         assert getattr(model, name) == getattr(again, name)
     assert_same_scene(model, again)
+    assert {"comment SplatRenderMode: mip", "comment SplatRenderMode: 2dgs"} < set(header_of(tmp_path / "a.ply"))
+
+
+def test_what_others_say_of_antialiasing_is_understood(tmp_path, make_model):
+    write_ply(tmp_path / "a.ply", make_model(2, 0, antialiased=True))
+    for says, antialiased, flat in [
+        ("antialiased 1", True, False),
+        ("antialiased 0", False, False),
+        ("SplatRenderMode: default", False, False),
+        ("splatrendermode: 2DGS", False, True),
+        ("csplat antialiased", True, False),
+    ]:
+        data = (tmp_path / "a.ply").read_bytes().replace(b"SplatRenderMode: mip", says.encode())
+        found = read_ply(data)
+        assert (antialiased, flat, {}) == (found.antialiased, found.flat, found.metadata)
 
 
 def test_absolute_positions_are_doubles_and_lead_back(tmp_path, make_model):

@@ -3,8 +3,9 @@
 PLY has no place for what a scene needs beyond its columns, so it goes into header comments:
 `csplat origin X Y Z` (x, y, z are relative to it), `csplat absolute_origin X Y Z` (x, y, z are
 absolute, in doubles), `csplat coordinate_system RDF`, `csplat up X Y Z`, `csplat unit_metres U`,
-`csplat antialiased`, `csplat flat`, `csplat licence TEXT`, `csplat training {JSON}` and `csplat view {JSON}`
-(what the scene was trained on and where it is shown from first, as `csplat.training` has them in the metadata).
+`csplat licence TEXT`, `csplat training {JSON}` and `csplat view {JSON}` (what the scene was trained on and where it is
+shown from first, as `csplat.training` has them in the metadata). That it is antialiased or flat stands in the words of
+others, `SplatRenderMode: mip` or `2dgs`.
 """
 
 from __future__ import annotations

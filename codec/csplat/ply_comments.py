@@ -17,7 +17,14 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
-_MODE = "SplatRenderMode:"  # as Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs)
+#: How Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs), and Postshot the former: words in lower case.
+_MODES = {
+    ("splatrendermode:", "default"): "",
+    ("splatrendermode:", "mip"): "antialiased",
+    ("splatrendermode:", "2dgs"): "flat",
+    ("antialiased", "0"): "",
+    ("antialiased", "1"): "antialiased",
+}
 
 
 @dataclass
@@ -56,13 +63,14 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
     others: list[str] = []
     for comment in comments:
         words = comment.split()
+        mode = _MODES.get(tuple(comment.lower().split()))
         if words[:2] == [_PREFIX, TRAINING]:
             facts.metadata[TRAINING] = _training(comment).as_json()
         elif words[:2] == [_PREFIX, VIEW]:
             facts.metadata[VIEW] = _view(comment)
-        elif words[:1] == [_MODE] and words[1:] in (["default"], ["mip"], ["2dgs"]):
-            facts.antialiased |= words[1] == "mip"
-            facts.flat |= words[1] == "2dgs"
+        elif mode is not None:
+            facts.antialiased |= mode == "antialiased"
+            facts.flat |= mode == "flat"
         elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
             others.append(comment)
     if others:
@@ -91,10 +99,10 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
         lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in up)}")
     if model.unit_metres is not None:
         lines.append(f"{_PREFIX} unit_metres {model.unit_metres!r}")
-    if model.antialiased:
-        lines.append(f"{_PREFIX} antialiased")
     if model.flat:
-        lines.append(f"{_PREFIX} flat")
+        lines.append("SplatRenderMode: 2dgs")
+    if model.antialiased:
+        lines.append("SplatRenderMode: mip")
     licence = model.metadata.get("licence")
     if isinstance(licence, str):
         lines.append(f"{_PREFIX} licence {' '.join(licence.split())}")
