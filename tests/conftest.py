@@ -20,6 +20,16 @@ pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
 
 SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
 
+#: Programs and files of others: CONTRIBUTING.md says how to fill it.
+PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
+
+
+def of_peers(name: str) -> Path:
+    """A file or folder of others; a test is skipped where it is absent."""
+    if not (PEERS / name).exists():
+        pytest.skip(f"{name} is absent ({PEERS}); CSPLAT_PEERS names the folder of others, see CONTRIBUTING.md")
+    return PEERS / name
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what takes `data_dir`, so that `-m shared_data` and `-m "not shared_data"` choose."""

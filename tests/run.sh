@@ -17,9 +17,10 @@ main() {
     step "vectors and annexes" "$DEV/python" -m csplat_conformance.recipes --check
     if have node "pyright and the JavaScript tests"; then
         step "types (pyright)" "$DEV/pyright"
-        if have npm "the types of the JavaScript"; then
+        if have npm "the types of the JavaScript, and SPZ's own library"; then
             step "types of the decoder (tsc)" npm run --silent --prefix codec/js types
             step "types of the viewer (tsc)" npm run --silent --prefix codec/js types -- --project ../../tools/viewer
+            step "SPZ's own library" npm install --silent --no-audit --no-fund --prefix out/peers @adobe/spz@0.2.3
         fi
         step "JavaScript" javascript_tests
         if have chromium "the decoder in a browser"; then

