@@ -18,7 +18,7 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
 #: How Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs), and Postshot the former, in lower case.
-_MODES = {
+_MODES: dict[tuple[str, ...], str] = {
     ("splatrendermode:", "default"): "",
     ("splatrendermode:", "mip"): "antialiased",
     ("splatrendermode:", "2dgs"): "flat",
