@@ -91,6 +91,14 @@ def test_axes_of_an_extension_count_and_others_are_skipped(version):
         filed(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
 
 
+def test_a_file_of_two_gzip_members_is_read():
+    whole, bare = (filed(spz(3, splats(3), bare=bare)) for bare in (False, True))
+    data = spz(3, splats(3), bare=True)
+    halves = filed(gzip.compress(data[:50]) + gzip.compress(data[50:]))
+    for model in (bare, halves):
+        assert all((getattr(whole, name) == getattr(model, name)).all() for name in ("means", "quats", "scales", "sh0"))
+
+
 def test_a_file_without_splats_is_read():
     assert 0 == len(filed(spz(4, [b""] * 6, degree=3)))
     assert 0 == len(filed(spz(3, [b""] * 6, degree=3)))

@@ -79,6 +79,8 @@ def test_axes_there_and_back_are_the_same_bits(make_model, degree):
         assert all(getattr(model, name).tobytes() == getattr(back, name).tobytes() for name in exact)
         assert np.abs(model.shN - back.shN).max(initial=0.0) < 2e-6
         assert model.origin == back.origin
+    for matrix in (ANY, -ANY):  # of the two quaternions of a rotation the one that was there
+        assert np.abs(model.quats - turned(turned(model, matrix), matrix.T).quats).max() < 1e-6
 
 
 def test_letters_follow_a_scene(make_model):
