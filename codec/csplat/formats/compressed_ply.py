@@ -266,8 +266,6 @@ def _written_header(facts: SplatModel, count: int, rest: int) -> bytes:
         "format binary_little_endian 1.0",
         *(f"comment {line}" for line in format_comments(facts, absolute=False)),
     ]
-    if facts.antialiased or facts.flat:
-        lines.append(f"comment SplatRenderMode: {'mip' if facts.antialiased else '2dgs'}")
     lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _WORDS)]
     if rest:
