@@ -17,7 +17,7 @@ from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
 from csplat_render.judge import Judge
 
-__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "transform"]
+__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "npm_install", "transform"]
 
 #: Longest run of another program.
 CAP_SECONDS = 600
@@ -56,25 +56,32 @@ def find_splat_transform(folder: Path) -> tuple[list[str] | None, str]:
     """
     script = folder / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     if not script.exists() or _node(folder) is None:
-        npm = shutil.which("npm")
-        if npm is None:
-            return None, "npm is not installed"
         linux = sys.platform == "linux" and platform.machine() == "x86_64"
-        packages = [_PACKAGE, _NODE_PACKAGE] if linux and _node(folder) is None else [_PACKAGE]
-        folder.mkdir(parents=True, exist_ok=True)
-        tell(f"installing into {folder}: {' '.join(packages)}")
-        command = [npm, "install", "--prefix", str(folder), "--no-audit", "--no-fund", *packages]
-        try:
-            subprocess.run(command, capture_output=True, timeout=CAP_SECONDS, check=True)
-        except subprocess.TimeoutExpired:
-            return None, "npm install took too long"
-        except subprocess.CalledProcessError as error:
-            return None, f"npm install failed: {_last_line(error)}"
+        failed = npm_install(folder, [_PACKAGE, _NODE_PACKAGE] if linux and _node(folder) is None else [_PACKAGE])
+        if failed:
+            return None, failed
     node = _node(folder)
     if node is None:
         return None, f"no node of version {_NODE_MAJOR} or newer"
     package = json.loads((script.parents[1] / "package.json").read_text())
     return [node, str(script)], f"splat-transform {package['version']}"
+
+
+def npm_install(folder: Path, packages: Sequence[str]) -> str:
+    """Install npm packages into a folder; gives the reason where that fails, else nothing."""
+    npm = shutil.which("npm")
+    if npm is None:
+        return "npm is not installed"
+    folder.mkdir(parents=True, exist_ok=True)
+    tell(f"installing into {folder}: {' '.join(packages)}")
+    command = [npm, "install", "--prefix", str(folder), "--no-audit", "--no-fund", *packages]
+    try:
+        subprocess.run(command, capture_output=True, timeout=CAP_SECONDS, check=True)
+    except subprocess.TimeoutExpired:
+        return "npm install took too long"
+    except subprocess.CalledProcessError as error:
+        return f"npm install failed: {_last_line(error)}"
+    return ""
 
 
 def _node(folder: Path) -> str | None:

@@ -11,8 +11,6 @@ Wants Chromium and playwright; firefox-esr; WebKitWebDriver with MiniBrowser (De
 from __future__ import annotations
 
 import base64
-import functools
-import http.server
 import json
 import os
 import shutil
@@ -37,7 +35,7 @@ from csplat.decoder import decode
 from csplat.errors import InputError
 from csplat_bench.common.command import listed, run, tell
 from csplat_bench.common.report import table
-from csplat_bench.viewer.page import open_page
+from csplat_bench.viewer.page import open_page, serve
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
@@ -107,18 +105,13 @@ def _opened(
 @contextmanager
 def _places(source: Path) -> Iterator[dict[str, str]]:
     """Where the scene can be opened: names and addresses."""
-    quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
     with tempfile.TemporaryDirectory() as folder, open_scene(str(source), preset="fast") as scene:
         page = Path(folder, "page.html")
         page.write_bytes(export_page(scene.read(), scene.name).page)
-        files = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(quiet, directory=folder))
-        with open_server(scene) as server, files:
-            for one in (server, files):
-                threading.Thread(target=one.serve_forever, daemon=True).start()
-            http_url = f"http://127.0.0.1:{files.server_address[1]}/page.html"
-            yield {"csplat view": server.url, "page, folder": page.as_uri(), "page, HTTP": http_url}
+        with open_server(scene) as server, serve(folder) as address:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            yield {"csplat view": server.url, "page, folder": page.as_uri(), "page, HTTP": f"{address}page.html"}
             server.shutdown()
-            files.shutdown()
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
 import statistics
 import threading
 from collections.abc import Iterator
@@ -17,7 +19,7 @@ from csplat_render.virtual import virtual_cameras
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
 
-__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn", "open_page"]
+__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn", "open_page", "serve"]
 
 WIDTH, HEIGHT = 640, 480
 
@@ -97,6 +99,16 @@ def open_page(chromium: str, *, gpu: bool) -> Iterator[Any]:
         page.set_default_timeout(_PATIENCE)
         yield page
         browser.close()
+
+
+@contextmanager
+def serve(folder: str | Path) -> Iterator[str]:
+    """Serve the files of a folder, also those that links in it point to; yields its address."""
+    quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
 
 
 def drawn(page: Any, file: File, runs: int) -> Drawn:

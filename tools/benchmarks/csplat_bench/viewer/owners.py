@@ -1,0 +1,293 @@
+"""Look at what csplat writes in the programs that other formats are made for: three.js, PlayCanvas, Babylon.js.
+
+    python -m csplat_bench.viewer.owners --out pictures
+    python -m csplat_bench.viewer.owners --scenes lego60k --engines three --formats gltf,spz
+
+Writes a scene in every format, lets the engines' own loaders read it in Chromium, and compares pictures with those of
+csplat's rasteriser of the PLY, from where SH shows most of eight places around the scene: dB. `by its rules` is the
+same with the engine's own rules of colours in ours; `next best` is then the likest of ours without SH, mirrored, and
+on its head. `stands` is how the engine's world, whose y is up, holds the scene. --out keeps the pictures, and all of a
+scene on one sheet. Status 1 where a wrong picture is nearer, or none came. Wants Chromium, playwright, npm.
+"""
+
+from __future__ import annotations
+
+import io
+import json as format_json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.formats import named, write
+from csplat.formats.format import Format
+from csplat.model import UNSPECIFIED, SplatModel
+from csplat.ply import read_ply
+from csplat.scene import scene_of
+from csplat.turning import USUAL, in_axes
+from csplat.upright import up_of_axes
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
+from csplat_bench.common.peers import npm_install
+from csplat_bench.common.report import table, tell_machine, write_json
+from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
+from csplat_bench.viewer.page import open_page, serve
+from csplat_render import Camera, render
+from csplat_render.harmonics import sh_basis
+from csplat_render.jit import python
+from csplat_render.metrics import psnr
+from csplat_render.paths import orbit_cameras
+from csplat_tools.files.pictures import write_png
+
+Picture = NDArray[np.float32]
+
+_DEGREE = 3
+_OURS = "csplat"  # among the formats of pictures
+_PLACES, _WIDTH, _HEIGHT = 8, 320, 240  # SwiftShader takes its time
+_PATIENCE = 120.0  # seconds
+_PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
+_PACKAGES = {
+    "three": "0.187", "playcanvas": "2.23", "@babylonjs/core": "9", "@babylonjs/loaders": "9", "@adobe/spz": "0.2",
+}  # fmt: skip
+_IMPORTS = {
+    "three": "three/build/three.webgpu.js", "three/webgpu": "three/build/three.webgpu.js",
+    "three/tsl": "three/build/three.tsl.js", "three/addons/": "three/examples/jsm/",
+    "playcanvas": "playcanvas/build/playcanvas.mjs",
+    "@babylonjs/core/": "@babylonjs/core/", "@babylonjs/loaders/": "@babylonjs/loaders/",
+}  # fmt: skip
+_PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;background:#000">
+<canvas style="display:block"></canvas><script type="importmap">{"imports":%s}</script>"""
+_SHOW = """async ([engine, url, camera, patience]) => {
+  const { show, version } = await import(`/pages/${engine}.mjs`);
+  const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
+  const shown = show(document.querySelector('canvas'), url, camera).then((world) => ({ world, version }));
+  return Promise.race([shown, late]).catch((error) => ({ failed: String(error.message ?? error) }));
+}"""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A program that draws splats.
+
+    Attributes:
+        title: as people write it.
+        reads: formats, as `csplat formats` names them.
+        clips: whether it cuts the colour of a splat to 0..1, also that of degree 0 before it adds the others.
+        antialiased: whether it takes off opacity what the dilation adds, whatever a file says.
+    """
+
+    title: str
+    reads: tuple[str, ...]
+    clips: bool = False
+    antialiased: bool = False
+
+    def drawn(self, model: SplatModel, camera: Camera, sh_degree: int) -> Picture:
+        """Our picture by these rules."""
+        shown = _coloured(model, camera, min(sh_degree, model.sh_degree)) if self.clips else model
+        return _drawn(shown, camera, antialiased=self.antialiased or None, sh_degree=sh_degree)
+
+
+_ENGINES = {
+    "three": Engine("three.js", ("ply", "gltf", "spz", "spz4", "splat"), clips=True, antialiased=True),
+    "playcanvas": Engine("PlayCanvas", ("ply", "gltf", "sog", "compressed-ply", "spz4")),
+    "babylon": Engine("Babylon.js", ("ply", "gltf", "sog", "compressed-ply", "spz", "spz4", "splat"), clips=True),
+}
+_FORMATS = "ply,gltf,sog,compressed-ply,spz,spz4,splat"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What became of a file in an engine.
+
+    Attributes:
+        engine: its name and version.
+        stands: how its world holds the scene: "upright", "on its head", "on its side"; or why there is no picture.
+        psnr: against ours, dB; against ours by the engine's rules.
+        wrong: highest PSNR against one of those that is wrong on purpose; what it is.
+    """
+
+    scene: str
+    engine: str
+    format: str
+    stands: str
+    psnr: tuple[float, float] | None = None
+    wrong: tuple[float, str] = (-np.inf, "")
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing else is as like it as our picture."""
+        return self.psnr is not None and self.psnr[1] > self.wrong[0]
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """As the table has them."""
+        found = [] if self.psnr is None else [f"{one:.1f}" for one in self.psnr] + ["{:.1f}, {}".format(*self.wrong)]
+        return self.scene, self.engine, self.format, "yes" if self.right else "NO", self.stands, *(found or "---")
+
+
+def main(
+    *,
+    scenes: SCENES = "sample,plane3",
+    engines: Annotated[str, typer.Option(help="which")] = ",".join(_ENGINES),
+    formats: Annotated[str, typer.Option(help="which")] = _FORMATS,
+    extra: EXTRA = [],
+    markdown: MARKDOWN = False,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="keep the pictures")] = None,
+    json: JSON = None,
+    chromium: Annotated[str, typer.Option(help="the program")] = shutil.which("chromium") or "chromium",
+    cache: CACHE = MADE,
+    peers: PEERS = NPM,
+) -> int:
+    """Look at what the command line names, and print a table."""
+    machine, rows = tell_machine(), list[Shown]()
+    wanted = [(name, _ENGINES[name]) for name in listed(engines)]
+    with _opened_page(chromium, peers) as (page, folder, address):
+        for scene in find_scenes(listed(scenes), cache, extra):
+            model, camera = _looked_at(scene)
+            ours = [(name, engine.drawn(model, camera, _DEGREE)) for name, engine in wanted]
+            pictures = {(name, _OURS): picture for name, picture in ours}
+            for form in map(named, listed(formats)):
+                path = folder / f"{scene.name}{form.suffixes[0]}"
+                write(path, model, form.name)
+                for name, engine in wanted:
+                    if form.name in engine.reads:
+                        shown, picture = _shown(page, name, f"{address}{path.name}", model, form)
+                        rows.append(replace(shown, scene=scene.name))
+                        pictures[name, form.name] = picture
+                        tell(" ".join(rows[-1].cells))
+            if out is not None:
+                _keep(out, scene.name, pictures)
+    header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "next best")
+    print(table(header, [row.cells for row in rows], markdown=markdown))
+    if json is not None:
+        write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})
+    return 0 if all(row.right for row in rows) else 1
+
+
+@contextmanager
+def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
+    """A browser, and a served folder where it finds the engines and the modules that load files into them."""
+    packages = peers / "node_modules"
+    absent = [f"{name}@{version}" for name, version in _PACKAGES.items() if not (packages / name).exists()]
+    failed = npm_install(peers, absent) if absent else ""
+    if failed:
+        raise InputError(failed)
+    with tempfile.TemporaryDirectory(prefix="csplat-owners-") as name, serve(name) as address:
+        folder = Path(name)
+        (folder / "node_modules").symlink_to(packages.resolve())
+        (folder / "pages").symlink_to(Path(__file__).with_name("pages"))
+        imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
+        (folder / "page.html").write_text(_PAGE % format_json.dumps(imports))
+        with open_page(chromium, gpu=False) as page:
+            yield page, folder, address
+
+
+def _looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
+    """A scene with the one camera that it is looked at from."""
+    model = read_ply(scene.path)
+    cameras = orbit_cameras(model, _PLACES, _WIDTH, _HEIGHT)
+    chosen = min(cameras, key=lambda camera: psnr(_drawn(model, camera), _drawn(model, camera, sh_degree=0)))
+    return replace(model, cameras=[chosen.to_json()]), chosen
+
+
+def _drawn(model: SplatModel, camera: Camera, *, antialiased: bool | None = None, sh_degree: int = _DEGREE) -> Picture:
+    return np.clip(render(model, camera, antialiased=antialiased, sh_degree=sh_degree).rgb, 0.0, 1.0)
+
+
+def _coloured(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
+    """The splats in the colours that they have from somewhere, cut to 0..1, without SH."""
+    directions = model.means - camera.position
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = np.empty(((degree + 1) ** 2, len(model)))
+    x, y, z = directions.T
+    python(sh_basis)(degree, x, y, z, basis)
+    colours = np.clip(0.5 + basis[0, 0] * model.sh0, 0.0, 1.0)
+    colours += np.einsum("kn,nkc->nc", basis[1:], model.shN[:, : len(basis) - 1])
+    sh0 = (np.clip(colours, 0.0, 1.0) - 0.5) / basis[0, 0]
+    return replace(model, sh0=sh0.astype(np.float32), shN=model.shN[:, :0])
+
+
+def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> tuple[Shown, Picture]:
+    """Let an engine draw a file, and compare what comes."""
+    engine = _ENGINES[name]
+    placed = in_axes(scene_of(model), form.axes).facts if form.axes else model
+    placed_cameras = [Camera.from_json(camera) for camera in placed.cameras or ()]
+    camera, ours = placed_cameras[0], Camera.from_json((model.cameras or [])[0])
+    page.set_viewport_size({"width": camera.W, "height": camera.H})
+    page.goto(url.rpartition("/")[0] + "/page.html")
+    said = page.evaluate(_SHOW, [name, url, _pinhole(camera, model), 1000 * _PATIENCE])
+    shown = Shown("", f"{engine.title} {said.get('version', '')}".strip(), form.name, said.get("failed", ""))
+    if shown.stands:
+        return shown, np.zeros((camera.H, camera.W, 3), np.float32)
+    picture = _still(page)
+    right = engine.drawn(model, ours, form.degree)
+    wrong = {"mirrored": right[:, ::-1], "on its head": right[::-1]}
+    if form.degree and model.sh_degree:
+        wrong["without SH"] = engine.drawn(model, ours, 0)
+    nearest = max((psnr(picture, one), title) for title, one in wrong.items())
+    found = psnr(picture, _drawn(model, ours, sh_degree=form.degree)), psnr(picture, right)
+    return replace(shown, stands=_stands(placed, said["world"]), psnr=found, wrong=nearest), picture
+
+
+def _pinhole(camera: Camera, model: SplatModel) -> dict[str, Any]:
+    """A camera as the pages want it: `view` of column vectors, column by column, y down, z forward; degrees."""
+    depths = model.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    return {
+        "view": camera.viewmat.T.ravel().tolist(),
+        "fovY": float(np.degrees(2.0 * np.arctan(camera.H / 2.0 / camera.K[1, 1]))),
+        "width": camera.W, "height": camera.H, "near": camera.near, "far": 2.0 * float(np.abs(depths).max()),
+    }  # fmt: skip
+
+
+def _still(page: Any) -> Picture:
+    """The picture that an engine comes to rest at: loaders return before splats are sorted and shaders compiled."""
+    from PIL import Image
+
+    end, last, same = time.monotonic() + _PATIENCE, np.zeros((1, 1, 3), np.uint8), 0
+    while same < _STILL and time.monotonic() < end:
+        time.sleep(_PAUSE)
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+        same = same + 1 if picture.any() and np.array_equal(picture, last) else 0
+        last = picture
+    return last.astype(np.float32) / 255.0
+
+
+def _stands(placed: SplatModel, world: Sequence[float]) -> str:
+    """How what is up by the axes of a file lies in a world whose y is up."""
+    axes = placed.coordinate_system
+    up = up_of_axes(USUAL if axes == UNSPECIFIED else axes)
+    if up is None:
+        return "?"
+    height = (np.reshape(world, (4, 4)).T[:3, :3] @ np.array(up))[1]
+    return "upright" if height > 0.9 else "on its head" if height < -0.9 else "on its side"
+
+
+def _keep(out: Path, scene: str, pictures: dict[tuple[str, str], Picture]) -> None:
+    """Write the pictures of a scene, and all of them on a sheet: a row for each engine, ours by its rules first."""
+    from PIL import Image, ImageDraw
+
+    out.mkdir(parents=True, exist_ok=True)
+    engines, forms = (list(dict.fromkeys(names)) for names in zip(*pictures, strict=True))
+    sheet = Image.new("RGB", (_WIDTH * len(forms), _HEIGHT * len(engines)))
+    for (engine, form), picture in pictures.items():
+        pixels = np.rint(255.0 * picture).astype(np.uint8)
+        write_png(out / f"{scene}-{engine}-{form}.png", pixels)
+        image = Image.fromarray(pixels)
+        ImageDraw.Draw(image).text(
+            (4, 4), f"{engine} {form}", fill=(255, 255, 0), stroke_width=1, stroke_fill=(0, 0, 0)
+        )
+        sheet.paste(image, (_WIDTH * forms.index(form), _HEIGHT * engines.index(engine)))
+    sheet.save(out / f"{scene}.png")
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,42 @@
+// three.js: GaussianSplat and its loaders. Colours go through as they are: what is SH to us, three takes for linear light.
+import * as THREE from 'three';
+import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js';
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { GaussianSplatPLYLoader } from 'three/addons/loaders/GaussianSplatPLYLoader.js';
+import { SPLATLoader } from 'three/addons/loaders/SPLATLoader.js';
+import { SPZLoader } from 'three/addons/loaders/SPZLoader.js';
+import { GaussianSplat } from 'three/addons/objects/GaussianSplat.js';
+
+export const version = `0.${THREE.REVISION}`;
+
+const loaders = { ply: GaussianSplatPLYLoader, spz: SPZLoader, splat: SPLATLoader };
+
+export async function show(canvas, url, camera) {
+  const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: true, antialias: false });
+  renderer.setPixelRatio(1);
+  renderer.setSize(camera.width, camera.height, false);
+  renderer.setClearColor(0x000000, 1);
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+  await renderer.init();
+  const splats = await load(url);
+  const scene = new THREE.Scene();
+  scene.add(splats);
+  scene.updateMatrixWorld(true);
+  let world;
+  splats.traverse((one) => { world = one.isGaussianSplat ? one.matrixWorld : world; });
+  const eye = new THREE.PerspectiveCamera(camera.fovY, camera.width / camera.height, camera.near, camera.far);
+  const pose = new THREE.Matrix4().fromArray(camera.view).multiply(world.clone().invert());
+  new THREE.Matrix4().makeScale(1, -1, -1).multiply(pose).invert().decompose(eye.position, eye.quaternion, eye.scale);
+  renderer.setAnimationLoop(() => renderer.render(scene, eye));
+  return world.toArray();
+}
+
+async function load(url) {
+  const ending = url.split('.').pop();
+  if (ending === 'glb') {
+    const loader = new GLTFLoader().register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
+    return (await loader.loadAsync(url)).scene;
+  }
+  if (!loaders[ending]) throw new Error('no loader');
+  return new GaussianSplat(await new loaders[ending]().loadAsync(url));
+}
