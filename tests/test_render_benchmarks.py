@@ -1,6 +1,7 @@
 """The benchmarks of renderer and trainer: that they measure what they say, on little."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from oracle import cropped, difference
 
 from csplat.ply import read_ply
 from csplat_bench.common.making import crowd, split
+from csplat_bench.viewer.rules import Engine
 from csplat_render import render
 from csplat_render.virtual import virtual_cameras
 
@@ -82,3 +84,11 @@ def test_cameras_are_compared(data_dir, tmp_path):
     bench("codec.quality", *words, "--json", tmp_path / "q.json")
     ((one,),) = json.loads((tmp_path / "q.json").read_text())["scenes"].values()
     assert abs(one["differences"][0]) <= 1.0
+
+
+def test_rules_of_colours_change_no_picture_whose_colours_stay_in_their_range(sample):
+    view = virtual_cameras(sample, 1, 80, 60)[0]
+    pale = replace(sample, sh0=0.2 * sample.sh0, shN=0.2 * sample.shN)
+    plain, clipped = Engine("plain", ()), Engine("clipped", (), clips=True)
+    np.testing.assert_allclose(clipped.drawn(pale, view, 3), plain.drawn(pale, view, 3), atol=1e-4)
+    assert np.abs(clipped.drawn(sample, view, 3) - plain.drawn(sample, view, 3)).max() > 0.01

@@ -5,9 +5,9 @@
 
 Writes a scene in every format, lets the engines' own loaders read it in Chromium, and compares pictures with those of
 csplat's rasteriser of the PLY, from where SH shows most of eight places around the scene: dB. `by its rules` is the
-same with the engine's own rules of colours in ours; `next best` is then the likest of ours without SH, mirrored, and
-on its head. `stands` is how the engine's world, whose y is up, holds the scene. --out keeps the pictures, and all of a
-scene on one sheet. Status 1 where a wrong picture is nearer, or none came. Wants Chromium, playwright, npm.
+same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH changes there the engine shows, 1 where
+it is all. `stands` is how the engine's world, whose y is up, holds the scene. --out keeps the pictures, and all of a
+scene on one sheet. Status 1 where one is mirrored, on its head, of wrong SH or absent. Wants Chromium, playwright, npm.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.formats import named, write
@@ -41,17 +40,14 @@ from csplat_bench.common.peers import npm_install
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
 from csplat_bench.viewer.page import open_page, serve
-from csplat_render import Camera, render
-from csplat_render.harmonics import sh_basis
-from csplat_render.jit import python
+from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
+from csplat_render import Camera
 from csplat_render.metrics import psnr
 from csplat_render.paths import orbit_cameras
 from csplat_tools.files.pictures import write_png
 
-Picture = NDArray[np.float32]
-
-_DEGREE = 3
 _OURS = "csplat"  # among the formats of pictures
+_SH_OFF = 0.3  # kernels that are cut make room for what lies behind, in other colours
 _PLACES, _WIDTH, _HEIGHT = 8, 320, 240  # SwiftShader takes its time
 _PATIENCE = 120.0  # seconds
 _PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
@@ -74,33 +70,6 @@ _SHOW = """async ([engine, url, camera, patience]) => {
 }"""
 
 
-@dataclass(frozen=True)
-class Engine:
-    """A program that draws splats.
-
-    Attributes:
-        title: as people write it.
-        reads: formats, as `csplat formats` names them.
-        clips: whether it cuts the colour of a splat to 0..1, also that of degree 0 before it adds the others.
-        antialiased: whether it takes off opacity what the dilation adds, whatever a file says.
-    """
-
-    title: str
-    reads: tuple[str, ...]
-    clips: bool = False
-    antialiased: bool = False
-
-    def drawn(self, model: SplatModel, camera: Camera, sh_degree: int) -> Picture:
-        """Our picture by these rules."""
-        shown = _coloured(model, camera, min(sh_degree, model.sh_degree)) if self.clips else model
-        return _drawn(shown, camera, antialiased=self.antialiased or None, sh_degree=sh_degree)
-
-
-_ENGINES = {
-    "three": Engine("three.js", ("ply", "gltf", "spz", "spz4", "splat"), clips=True, antialiased=True),
-    "playcanvas": Engine("PlayCanvas", ("ply", "gltf", "sog", "compressed-ply", "spz4")),
-    "babylon": Engine("Babylon.js", ("ply", "gltf", "sog", "compressed-ply", "spz", "spz4", "splat"), clips=True),
-}
 _FORMATS = "ply,gltf,sog,compressed-ply,spz,spz4,splat"
 
 
@@ -112,7 +81,8 @@ class Shown:
         engine: its name and version.
         stands: how its world holds the scene: "upright", "on its head", "on its side"; or why there is no picture.
         psnr: against ours, dB; against ours by the engine's rules.
-        wrong: highest PSNR against one of those that is wrong on purpose; what it is.
+        wrong: the same of the likest of that one mirrored and on its head.
+        sh: how far the picture lies on the way from ours without SH to ours, by these rules; 1 where there is none.
     """
 
     scene: str
@@ -120,24 +90,25 @@ class Shown:
     format: str
     stands: str
     psnr: tuple[float, float] | None = None
-    wrong: tuple[float, str] = (-np.inf, "")
+    wrong: float = 0.0
+    sh: float = 1.0
 
     @property
     def right(self) -> bool:
-        """Whether nothing else is as like it as our picture."""
-        return self.psnr is not None and self.psnr[1] > self.wrong[0]
+        """Whether it is our picture and no other."""
+        return self.psnr is not None and self.psnr[1] > self.wrong and abs(self.sh - 1.0) < _SH_OFF
 
     @property
     def cells(self) -> tuple[str, ...]:
         """As the table has them."""
-        found = [] if self.psnr is None else [f"{one:.1f}" for one in self.psnr] + ["{:.1f}, {}".format(*self.wrong)]
+        found = [] if self.psnr is None else [f"{self.psnr[0]:.1f}", f"{self.psnr[1]:.1f}", f"{self.sh:.2f}"]
         return self.scene, self.engine, self.format, "yes" if self.right else "NO", self.stands, *(found or "---")
 
 
 def main(
     *,
     scenes: SCENES = "sample,plane3",
-    engines: Annotated[str, typer.Option(help="which")] = ",".join(_ENGINES),
+    engines: Annotated[str, typer.Option(help="which")] = ",".join(ENGINES),
     formats: Annotated[str, typer.Option(help="which")] = _FORMATS,
     extra: EXTRA = [],
     markdown: MARKDOWN = False,
@@ -149,11 +120,11 @@ def main(
 ) -> int:
     """Look at what the command line names, and print a table."""
     machine, rows = tell_machine(), list[Shown]()
-    wanted = [(name, _ENGINES[name]) for name in listed(engines)]
+    wanted = [(name, ENGINES[name]) for name in listed(engines)]
     with _opened_page(chromium, peers) as (page, folder, address):
         for scene in find_scenes(listed(scenes), cache, extra):
             model, camera = _looked_at(scene)
-            ours = [(name, engine.drawn(model, camera, _DEGREE)) for name, engine in wanted]
+            ours = [(name, engine.drawn(model, camera, DEGREE)) for name, engine in wanted]
             pictures = {(name, _OURS): picture for name, picture in ours}
             for form in map(named, listed(formats)):
                 path = folder / f"{scene.name}{form.suffixes[0]}"
@@ -166,7 +137,7 @@ def main(
                         tell(" ".join(rows[-1].cells))
             if out is not None:
                 _keep(out, scene.name, pictures)
-    header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "next best")
+    header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "SH")
     print(table(header, [row.cells for row in rows], markdown=markdown))
     if json is not None:
         write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})
@@ -195,30 +166,13 @@ def _looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
     """A scene with the one camera that it is looked at from."""
     model = read_ply(scene.path)
     cameras = orbit_cameras(model, _PLACES, _WIDTH, _HEIGHT)
-    chosen = min(cameras, key=lambda camera: psnr(_drawn(model, camera), _drawn(model, camera, sh_degree=0)))
+    chosen = min(cameras, key=lambda camera: psnr(drawn(model, camera), drawn(model, camera, sh_degree=0)))
     return replace(model, cameras=[chosen.to_json()]), chosen
-
-
-def _drawn(model: SplatModel, camera: Camera, *, antialiased: bool | None = None, sh_degree: int = _DEGREE) -> Picture:
-    return np.clip(render(model, camera, antialiased=antialiased, sh_degree=sh_degree).rgb, 0.0, 1.0)
-
-
-def _coloured(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
-    """The splats in the colours that they have from somewhere, cut to 0..1, without SH."""
-    directions = model.means - camera.position
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    basis = np.empty(((degree + 1) ** 2, len(model)))
-    x, y, z = directions.T
-    python(sh_basis)(degree, x, y, z, basis)
-    colours = np.clip(0.5 + basis[0, 0] * model.sh0, 0.0, 1.0)
-    colours += np.einsum("kn,nkc->nc", basis[1:], model.shN[:, : len(basis) - 1])
-    sh0 = (np.clip(colours, 0.0, 1.0) - 0.5) / basis[0, 0]
-    return replace(model, sh0=sh0.astype(np.float32), shN=model.shN[:, :0])
 
 
 def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> tuple[Shown, Picture]:
     """Let an engine draw a file, and compare what comes."""
-    engine = _ENGINES[name]
+    engine = ENGINES[name]
     placed = in_axes(scene_of(model), form.axes).facts if form.axes else model
     placed_cameras = [Camera.from_json(camera) for camera in placed.cameras or ()]
     camera, ours = placed_cameras[0], Camera.from_json((model.cameras or [])[0])
@@ -230,12 +184,12 @@ def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> t
         return shown, np.zeros((camera.H, camera.W, 3), np.float32)
     picture = _still(page)
     right = engine.drawn(model, ours, form.degree)
-    wrong = {"mirrored": right[:, ::-1], "on its head": right[::-1]}
-    if form.degree and model.sh_degree:
-        wrong["without SH"] = engine.drawn(model, ours, 0)
-    nearest = max((psnr(picture, one), title) for title, one in wrong.items())
-    found = psnr(picture, _drawn(model, ours, sh_degree=form.degree)), psnr(picture, right)
-    return replace(shown, stands=_stands(placed, said["world"]), psnr=found, wrong=nearest), picture
+    wrong = max(psnr(picture, right[:, ::-1]), psnr(picture, right[::-1]))
+    bare = engine.drawn(model, ours, 0)
+    way = right - bare
+    sh = float(((picture - bare) * way).sum() / (way * way).sum()) if way.any() else 1.0
+    found = psnr(picture, drawn(model, ours, sh_degree=form.degree)), psnr(picture, right)
+    return replace(shown, stands=_stands(placed, said["world"]), psnr=found, wrong=wrong, sh=sh), picture
 
 
 def _pinhole(camera: Camera, model: SplatModel) -> dict[str, Any]:
