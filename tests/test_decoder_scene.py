@@ -225,9 +225,6 @@ def test_limits(limits, name):
 @pytest.mark.parametrize(
     ("kind", "bands", "columns"),
     [
-        (_spec.CODEBOOK_KIND_SCALES, (0, 0), {0: 3}),
-        (_spec.CODEBOOK_KIND_QUATS, (0, 0), {0: 3}),
-        (_spec.CODEBOOK_KIND_SH0, (0, 0), {0: 3}),
         (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
         (_spec.CODEBOOK_KIND_SH, (1, 3), {1: 9, 2: 15, 3: 21}),
         (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),

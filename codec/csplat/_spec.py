@@ -77,7 +77,7 @@ ATTRIBUTE_NAMES: Final[dict[int, str]] = {1: "opacities", 2: "scales", 3: "quats
 ATTRIBUTE_COLUMNS: Final[dict[int, int]] = {1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 32: 1}
 ATTRIBUTE_LAYER: Final[dict[int, int]] = {1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 32: 8}
 ATTRIBUTE_MAPPINGS: Final[dict[int, tuple[str, ...]]] = {1: ("linear", "square",), 2: ("lattice",), 3: ("unit_w",), 4: ("lattice",), 5: ("lattice", "ycocg",), 6: ("lattice", "ycocg",), 7: ("lattice", "ycocg",), 8: ("lattice", "ycocg",), 32: ()}
-ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed", "codebook",), 6: ("offset", "signed", "codebook", "sparse",), 7: ("offset", "signed", "codebook", "sparse",), 8: ("offset", "signed", "codebook", "sparse",), 32: ("raw",)}
+ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed",), 6: ("offset", "signed", "codebook", "sparse",), 7: ("offset", "signed", "codebook", "sparse",), 8: ("offset", "signed", "codebook", "sparse",), 32: ("raw",)}
 ATTRIBUTE_KIND: Final[dict[int, str]] = {1: "levels", 2: "lattice", 3: "levels", 4: "lattice", 5: "lattice", 6: "lattice", 7: "lattice", 8: "lattice", 32: "raw"}
 
 # Layers
@@ -110,13 +110,10 @@ CODING_NAMES: Final[dict[int, str]] = {1: "levels", 2: "morton", 3: "axis", 4: "
 CODING_WIDTH_MAX: Final[dict[int, int]] = {1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8, 8: 4}
 
 # Codebook kinds
-CODEBOOK_KIND_SCALES: Final = 2
-CODEBOOK_KIND_QUATS: Final = 3
 CODEBOOK_KIND_SHAPE: Final = 4
-CODEBOOK_KIND_SH0: Final = 5
 CODEBOOK_KIND_SH: Final = 6
-CODEBOOK_KIND_NAMES: Final[dict[int, str]] = {2: "scales", 3: "quats", 4: "shape", 5: "sh0", 6: "sh"}
-CODEBOOK_KIND_ATTRIBUTES: Final[dict[int, tuple[str, ...]]] = {2: ("scales",), 3: ("quats",), 4: ("scales", "quats",), 5: ("sh0",), 6: ("sh1", "sh2", "sh3",)}
+CODEBOOK_KIND_NAMES: Final[dict[int, str]] = {4: "shape", 6: "sh"}
+CODEBOOK_KIND_ATTRIBUTES: Final[dict[int, tuple[str, ...]]] = {4: ("scales", "quats",), 6: ("sh1", "sh2", "sh3",)}
 
 # Transforms
 TRANSFORM_NONE: Final = 0

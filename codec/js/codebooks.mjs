@@ -20,7 +20,6 @@ import { signed } from './transforms.mjs';
 const { ERROR_CODEBOOK, ERROR_INDEX, ERROR_STREAM } = spec;
 const { CODEBOOK_HEAD_OFFSETS: AT_HEAD, CODEBOOK_PARAMS_OFFSETS: AT_PARAMS } = spec;
 const ENTRY_WIDTH_MAX = 4; // STR-2
-const KIND_SHAPE = spec.CODEBOOK_KIND_NAMES[spec.CODEBOOK_KIND_SHAPE];
 
 /**
  * Entries of one chunk: the columns one after the other, each `size` entries and a 0 (the place of the escape index), and
@@ -122,8 +121,8 @@ function checkEntries({ integers, bound, offset }, codebook, layer, attributes) 
     const attribute = /** @type {AttributeRecord} */ (attributes.find((one) => one.name === name)); // by CBR-2
     if (layer > 0 && attribute.id !== spec.ATTRIBUTE_SH0 + layer) continue;
     const end = first + size * columnCount(attribute);
-    // To the scales of shapes a summand comes: their sums are bound, by CBK-6.
-    if (codebook.kind !== KIND_SHAPE || attribute.id !== spec.ATTRIBUTE_SCALES) {
+    // To scales a summand comes: their sums are bound, by CBK-6.
+    if (attribute.id !== spec.ATTRIBUTE_SCALES) {
       const block = { attribute, columns: new Float64Array(integers.subarray(first, end)), exponent: 0, bound, offset };
       checkIntegers(block, size);
       if (attribute.step !== 0) {
@@ -168,7 +167,7 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   const isSh = codebook.bandFirst > 0;
   const table = await tile.table(id, isSh ? attribute.id - spec.ATTRIBUTE_SH0 : 0);
   const offset = at - spec.BLOCK_HEAD_SIZE;
-  if (!integers && attribute.id >= spec.ATTRIBUTE_SH0) {
+  if (!integers && isSh) {
     const lookup = { id, table, index: shared.index, escaped: shared.escaped };
     if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
     return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
@@ -176,7 +175,7 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
   // Columns of the codebook's attributes before this one; a band has a chunk of its own.
   const before = isSh ? 0 : codebook.attributes.indexOf(attribute.name) * spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SCALES];
   const block = gatherEntries(tile.sums(attribute), table, before, shared.index, attribute, offset);
-  const hasSummand = codebook.kind === KIND_SHAPE && isFirst;
+  const hasSummand = attribute.id === spec.ATTRIBUTE_SCALES;
   if (hasSummand) await addSummand(tile, payload, block);
   if (escapeCount) putEscapes(block, shared.escaped, await readEscapes(tile, payload, attribute, escapeCount));
   if (hasSummand) checkIntegers(block, tile.splatCount); // of other blocks CBK-7 has looked at the entries
@@ -303,7 +302,7 @@ function gatherEntries(columns, { size, entries, bound }, before, index, attribu
 }
 
 /**
- * The common summand of the scales of the kind SHAPE.
+ * The common summand of the scales.
  *
  * @param {TileContext} tile
  * @param {Payload} payload

@@ -211,7 +211,7 @@ export interface PackedColumns {
   step: number;
 }
 
-/** Colours may stay in their codebook: then `columns` holds the escaped splats alone, which have no entry. */
+/** SH bands may stay in their codebook: then `columns` holds the escaped splats alone, which have no entry. */
 export interface Packed extends PackedColumns {
   lookup?: {
     /** Id of the codebook. */
@@ -229,13 +229,13 @@ export interface Packed extends PackedColumns {
 export interface PackedGeometry {
   count: number;
   /** Levels, one column. */
-  opacities: Packed;
+  opacities: PackedColumns;
   /** Three columns. */
-  scales: Packed;
+  scales: PackedColumns;
   /** x, y, z; w follows (spec 7.5). */
-  quats: Packed;
-  means: Packed;
-  sh0: Packed;
+  quats: PackedColumns;
+  means: PackedColumns;
+  sh0: PackedColumns;
 }
 
 /** An SH band of a tile; column channel · (2l + 1) + m holds coefficient m. */

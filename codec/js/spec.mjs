@@ -69,7 +69,7 @@ export const ATTRIBUTE_NAMES = Object.freeze({ 1: 'opacities', 2: 'scales', 3: '
 export const ATTRIBUTE_COLUMNS = Object.freeze({ 1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 32: 1 });
 export const ATTRIBUTE_LAYER = Object.freeze({ 1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 32: 8 });
 export const ATTRIBUTE_MAPPINGS = Object.freeze({ 1: Object.freeze(['linear', 'square']), 2: Object.freeze(['lattice']), 3: Object.freeze(['unit_w']), 4: Object.freeze(['lattice']), 5: Object.freeze(['lattice', 'ycocg']), 6: Object.freeze(['lattice', 'ycocg']), 7: Object.freeze(['lattice', 'ycocg']), 8: Object.freeze(['lattice', 'ycocg']), 32: Object.freeze([]) });
-export const ATTRIBUTE_CODINGS = Object.freeze({ 1: Object.freeze(['levels']), 2: Object.freeze(['offset', 'signed', 'codebook']), 3: Object.freeze(['signed', 'codebook']), 4: Object.freeze(['morton', 'axis']), 5: Object.freeze(['offset', 'signed', 'codebook']), 6: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 7: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 8: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 32: Object.freeze(['raw']) });
+export const ATTRIBUTE_CODINGS = Object.freeze({ 1: Object.freeze(['levels']), 2: Object.freeze(['offset', 'signed', 'codebook']), 3: Object.freeze(['signed', 'codebook']), 4: Object.freeze(['morton', 'axis']), 5: Object.freeze(['offset', 'signed']), 6: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 7: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 8: Object.freeze(['offset', 'signed', 'codebook', 'sparse']), 32: Object.freeze(['raw']) });
 export const ATTRIBUTE_KIND = Object.freeze({ 1: 'levels', 2: 'lattice', 3: 'levels', 4: 'lattice', 5: 'lattice', 6: 'lattice', 7: 'lattice', 8: 'lattice', 32: 'raw' });
 
 // Layers
@@ -102,13 +102,10 @@ export const CODING_NAMES = Object.freeze({ 1: 'levels', 2: 'morton', 3: 'axis',
 export const CODING_WIDTH_MAX = Object.freeze({ 1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7: 8, 8: 4 });
 
 // Codebook kinds
-export const CODEBOOK_KIND_SCALES = 2;
-export const CODEBOOK_KIND_QUATS = 3;
 export const CODEBOOK_KIND_SHAPE = 4;
-export const CODEBOOK_KIND_SH0 = 5;
 export const CODEBOOK_KIND_SH = 6;
-export const CODEBOOK_KIND_NAMES = Object.freeze({ 2: 'scales', 3: 'quats', 4: 'shape', 5: 'sh0', 6: 'sh' });
-export const CODEBOOK_KIND_ATTRIBUTES = Object.freeze({ 2: Object.freeze(['scales']), 3: Object.freeze(['quats']), 4: Object.freeze(['scales', 'quats']), 5: Object.freeze(['sh0']), 6: Object.freeze(['sh1', 'sh2', 'sh3']) });
+export const CODEBOOK_KIND_NAMES = Object.freeze({ 4: 'shape', 6: 'sh' });
+export const CODEBOOK_KIND_ATTRIBUTES = Object.freeze({ 4: Object.freeze(['scales', 'quats']), 6: Object.freeze(['sh1', 'sh2', 'sh3']) });
 
 // Transforms
 export const TRANSFORM_NONE = 0;

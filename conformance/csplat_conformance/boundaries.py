@@ -222,7 +222,7 @@ def _words(built: Built, structure: str, prefix: str) -> set[str]:
             "YCOCG" if is_shifted else "other mappings",
         }
     if structure == "codebook_record":
-        return {"SH" if number("kind") == _spec.CODEBOOK_KIND_SH else "other kinds"}
+        return {"SH" if number("kind") == _spec.CODEBOOK_KIND_SH else "SHAPE"}
     block, _, part = prefix.rpartition(".")
     if structure == "lattice_params":
         return {block.rpartition("/")[2]}

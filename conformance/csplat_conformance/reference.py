@@ -76,7 +76,7 @@ def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[l
     first = next(b for b in tile.blocks.values() if b.codebook == book.id and b.indices)
     layer, columns = band_of(attribute), _spec.ATTRIBUTE_COLUMNS[attribute]
     start = 0
-    if book.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_QUATS:
+    if attribute == _spec.ATTRIBUTE_QUATS:
         start = _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SCALES]
     entries = book.entries[layer]
     escaped = iter(block.escape.rows if block.escape else ())

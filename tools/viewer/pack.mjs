@@ -68,7 +68,7 @@ export function layoutSlots(tiles) {
 export function packGeometry(tile, opacities, quats) {
   const { count } = tile;
   const scales = fieldsOf(tile.scales, count);
-  const sh0 = fieldsOf(expanded(tile.sh0, count), count);
+  const sh0 = fieldsOf(tile.sh0, count);
   const levels = quats.levels;
   const meansBits = [0, 1, 2].map((axis) => bitsFor(largest(tile.means.columns, axis * count, count)));
   const bits = {
@@ -163,42 +163,6 @@ function fieldsOf({ columns, offsets, step }, count) {
     bits: FLOAT_BITS,
     values: { offsets: offsets.map(() => 0), step: 0 },
   };
-}
-
-/**
- * Colours without their codebook.
- *
- * @param {Packed} packed
- * @param {number} count splats
- * @returns {PackedColumns}
- */
-function expanded(packed, count) {
-  const { lookup, columns, offsets, step } = packed;
-  if (lookup === undefined) return packed;
-  const { table, index, escaped } = lookup;
-  const size = table.columns.length / offsets.length;
-  const out = new Float64Array(offsets.length * count);
-  for (let c = 0; c < offsets.length; c++) {
-    for (let i = 0; i < count; i++) out[c * count + i] = table.offsets[c] + table.columns[c * size + index[i]];
-    for (let k = 0; k < escaped.length; k++) {
-      out[c * count + escaped[k]] = offsets[c] + columns[c * escaped.length + k];
-    }
-  }
-  return narrowed(out, offsets.length, step);
-}
-
-/**
- * @param {Float64Array} columns integers
- * @param {number} width columns
- * @param {number} step
- * @returns {PackedColumns}
- */
-function narrowed(columns, width, step) {
-  const n = columns.length / width;
-  const offsets = Array.from({ length: width }, (_, c) => columns.subarray(c * n, (c + 1) * n).reduce(lesser));
-  const above = columns.map((value, i) => value - offsets[Math.floor(i / n)]);
-  if (largest(above, 0, above.length) >= 2 ** EXACT_BITS) return { columns, offsets: offsets.fill(0), step };
-  return { columns: Uint32Array.from(above), offsets, step };
 }
 
 /** @param {number} a @param {number} b */

@@ -101,13 +101,13 @@ class Indices:
 
 @dataclass(frozen=True)
 class Coded:
-    """A block coded CODEBOOK: the integers are entries, in scales of SHAPE plus a summand (spec 6.4.5).
+    """A block coded CODEBOOK: the integers are entries, in scales plus a summand (spec 6.4.5).
 
     Attributes:
         indices: which entries.
         entries: [size, C], the columns of this block's attribute.
         escapes: the integers of the escaped splats.
-        summand: of the kind SHAPE, scales: one column, added to all three.
+        summand: of scales: one column, added to all three.
         at: where the block begins in the file.
         exponent: 0; blocks coded CODEBOOK are on the file's lattice.
         bound: largest magnitude of an integer, or of a part of a sum.

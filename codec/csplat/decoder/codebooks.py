@@ -140,14 +140,14 @@ def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecor
         columns = attribute_columns(book, attribute)
         if columns is None or _spec.ATTRIBUTE_LAYER[attribute] != layer:
             continue
-        if book.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
+        if attribute == _spec.ATTRIBUTE_SCALES:
             continue  # a summand comes to them: their sums are bound, by CBK-6
         block = Columns(entries[columns], (0,) * _spec.ATTRIBUTE_COLUMNS[attribute], 0, at)
         check_integers(block.lows, block.highs, record, at)
         if attribute == _spec.ATTRIBUTE_QUATS:
             for _ in quat_rows(block, record, entries.shape[1]):
                 pass  # QUA-2
-        elif record.levels == 0:
+        else:
             check_values(block, record, entries.shape[1])
 
 

@@ -61,7 +61,7 @@ def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) ->
         )
     indices = _indices(cursor, context, attribute, book, params, params_at)
     summand = None
-    if book.record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
+    if attribute == _spec.ATTRIBUTE_SCALES:
         summand = _read_summand(cursor, context, attribute)
     escapes = None
     if params.escape_count:
@@ -131,7 +131,7 @@ def _read_indices(
 
 
 def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Columns:
-    """The common summand of the kind SHAPE, on the file's lattice of scales as its entries are."""
+    """The common summand of scales, on the file's lattice as their entries are."""
     read_exponent(cursor, context.header.attribute(attribute), fixed=True)
     offsets = read_offsets(cursor, 1)
     at = cursor.at

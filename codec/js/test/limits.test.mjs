@@ -27,7 +27,7 @@ test('a budget of bytes counts arrays and tables, before they are made', async (
 });
 
 test('a budget of bytes counts four for each entry and column of a codebook', () => {
-  const columns = { scales: 3, quats: 3, sh0: 3, shape: 6 };
+  const columns = { shape: 6 };
   const kinds = new Set();
   for (const { name } of manifest.filter(({ name }) => name.startsWith('valid/codebook_'))) {
     const { codebooks, directory } = readHeader(vector(name));

@@ -161,7 +161,7 @@ test('a damaged part is refused, the others are not', async (t) => {
 });
 
 test('a codebook that is damaged is refused each time it is asked for', async () => {
-  const file = vector('valid/codebook_sh0');
+  const file = vector('valid/codebook_shape');
   const { header } = await decode(file);
   const damaged = forged(file, (bytes) => (bytes[header.directory[0].offset + 12] ^= 1));
   const reader = await CsplatReader.open(new Blob([damaged]));

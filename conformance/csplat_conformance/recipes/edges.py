@@ -167,33 +167,34 @@ def _limits(band: int) -> Block:
 def _bounds() -> Scene:
     fine = Attribute(_spec.MAPPING_LATTICE, 2.0**-30)
     shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})
-    colours = Codebook(0, _spec.CODEBOOK_KIND_SH0, {0: [[1, -2, 3]]})
+    colours = Codebook(0, _spec.CODEBOOK_KIND_SH, {1: [[1, -2, 3] * 3]}, (1, 1))
+    sh1 = sh_attribute(1)
     tiles = (
         tile(
             1,
             2,
-            0,
+            1,
             {
                 SCALES: book(2, (0, 0), summands=(_COLUMN, _COLUMN), escape=None),
                 QUATS: book(2),
-                SH0: book(0, (0, 1), offset([[_COLUMN, 5, -5]], offsets=(_COLUMN, 0, -5))),
+                sh1: book(0, (0, 1), offset([[_COLUMN] * 3 + [5, -5] * 3], offsets=(_COLUMN,) * 3 + (0, -5) * 3)),
             },
         ),
         tile(
             2,
             2,
-            0,
+            1,
             {
                 SCALES: book(2, (1, 1), summands=(-_COLUMN, -_COLUMN)),
                 QUATS: book(2),
-                SH0: book(0, (1, 0), offset([[-_COLUMN, 0, 0]])),
+                sh1: book(0, (1, 0), offset([[-_COLUMN] * 3 + [0] * 6])),
             },
         ),
     )
     lifted = Attribute(_spec.MAPPING_YCOCG, 2.0**-30, chroma_shift=16)
-    records = attributes() | {SCALES: fine, SH0: lifted}
+    records = attributes(1) | {SCALES: fine, sh1: lifted}
     text = Chunk(_spec.CHUNK_METADATA, b"{}")  # whose id is 0, too
-    return scene(tiles=tiles, codebooks=(colours, shapes), attributes=records, chunks=(text,))
+    return scene(1, tiles, codebooks=(colours, shapes), attributes=records, chunks=(text,))
 
 
 def _summands() -> Scene:
@@ -211,7 +212,6 @@ def _many() -> Scene:
     """16,400 splats; every index and escape in long runs."""
     n, border = 16_400, 16_384
     how = Stream(1, _RUNS)
-    colours = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[9, 8, 7], [-6, -5, 4]]})
     shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})
     bands = Codebook(3, _spec.CODEBOOK_KIND_SH, {1: [[*range(9)], [*range(9, 0, -1)]]}, (1, 1))
     escaped = {0, border - 1, border, n - 1}
@@ -231,10 +231,9 @@ def _many() -> Scene:
             book(2, indices(7000), signed(rows(3)), how, summands=tuple(-(i // 4000) for i in range(n))), how=how
         ),
         QUATS: book(2, (), signed(rows(3))),
-        SH0: book(1, indices(5000), signed(rows(3)), how),
         sh_attribute(1): book(3, indices(6000), signed(rows(9)), how),
     }
-    return scene(1, [replace(same, blocks=blocks)], codebooks=(colours, shapes, bands))
+    return scene(1, [replace(same, blocks=blocks)], codebooks=(shapes, bands))
 
 
 def _codes() -> Scene:

@@ -12,7 +12,6 @@ from csplat_conformance.samples import (
     OPACITIES,
     QUATS,
     SCALES,
-    SH0,
     Recipe,
     attributes,
     axis,
@@ -24,6 +23,7 @@ from csplat_conformance.samples import (
     offset,
     rows_of,
     scene,
+    sh_attribute,
     signed,
     tile,
 )
@@ -41,24 +41,32 @@ def extreme_stream_recipes() -> list[Recipe]:
 
 def _codebooks() -> list[Recipe]:
     n = _spec.CODEBOOK_ENTRIES_MAX
-    flat = Codebook(65535, _spec.CODEBOOK_KIND_SH0, {0: [[3, -4, 5]] * (n - 1) + [[7, 7, 7]]}, how=Stream(1, _RUNS))
-    wide = book(65535, (n - 1, n, 0), signed([[1, 2, 3]]), Stream(3))
+    entries = [[3, -4, 5, 1, 2, 3]] * (n - 1) + [[7] * 6]
+    flat = Codebook(65535, _spec.CODEBOOK_KIND_SHAPE, {0: entries}, how=Stream(1, _RUNS))
+    own = signed([[1, 2, 3]])
+    wide = {SCALES: book(65535, (n - 1, n, 0), own, Stream(3), summands=(5, 0, 6)), QUATS: book(65535, (), own)}
     unused = (
-        Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]}),
+        Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6]]}),
         Codebook(2, _spec.CODEBOOK_KIND_SH, {1: rows_of(1, 2, 9, -1, 1)}, (1, 1)),
     )
-    two = Codebook(4, _spec.CODEBOOK_KIND_SH0, {0: rows_of(0, 2, 3, -9, 9)})
     shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(3, 2, 6, -9, 9)})
+    every = {
+        SCALES: book(9, (2, 2, 2), signed([[1, 2, 3]] * 3), summands=(0, 0, 0)),
+        QUATS: book(9, (), signed([[4, 5, 6]] * 3)),
+    }
     ignored = {
         SCALES: book(9, (2, 0, 1), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
         QUATS: book(9, (), signed([[4, 5, 6]])),
     }
     largest = _spec.COLUMN_MAX
+    turns = {0: [[1, 2, 3, *turn] for turn in ([1, 2, 3], [127, -127, 0], [0, 127, 127])]}
+    bounds = {1: [[*range(9)], [largest, 0, -largest] * 3]}
     at_bounds = (
-        Codebook(2, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3], [127, -127, 0], [0, 127, 127]]}),
-        Codebook(3, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3], [largest, 0, -largest]]}, how=Stream(4)),
+        Codebook(2, _spec.CODEBOOK_KIND_SHAPE, turns),
+        Codebook(3, _spec.CODEBOOK_KIND_SH, bounds, (1, 1), Stream(4)),
     )
-    ids = {QUATS: 2, SH0: 3}
+    zeros = (0, 0, 0)
+    first = {SCALES: book(2, zeros, summands=(4, 5, 6)), QUATS: book(2), sh_attribute(1): book(3, zeros)}
     shifted = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]}, how=Stream(4))
     back = {SCALES: book(1, (0, 0, 0), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: book(1)}
     return [
@@ -66,7 +74,7 @@ def _codebooks() -> list[Recipe]:
             "codebook_of_65536",
             "the escape index is 65,536 and needs three bytes",
             "CBR-4 CBK-2",
-            replace(_with({SH0: wide}), codebooks=(flat,)),
+            replace(_with(wide), codebooks=(flat,)),
         ),
         _recipe(
             "codebooks_unused",
@@ -78,7 +86,7 @@ def _codebooks() -> list[Recipe]:
             "codebook_all_escaped",
             "no splat uses an entry",
             "CBK-3",
-            replace(_with({SH0: book(4, (2, 2, 2), signed([[1, 2, 3]] * 3))}), codebooks=(two,)),
+            replace(_with(every), codebooks=(shape,)),
         ),
         _recipe(
             "codebook_unused_summand",
@@ -90,9 +98,11 @@ def _codebooks() -> list[Recipe]:
             "codebook_entries_at_bounds",
             "rotations and colours that no splat uses and that are just allowed",
             "CBK-7",
-            replace(
-                _with({a: book(id, (0, 0, 0)) for a, id in ids.items()}, records={SH0: _lattice(2.0**105)}),
+            scene(
+                1,
+                [tile(2, 3, 1, first)],
                 codebooks=at_bounds,
+                attributes=attributes(1) | {sh_attribute(1): _lattice(2.0**105)},
             ),
         ),
         _recipe(

@@ -153,14 +153,14 @@ def _codebooks() -> list[Recipe]:
         entries = {layer: rows_of(layer, 2, 3 * (2 * layer + 1), -9, 9) for layer in layers}
         return Codebook(3, _spec.CODEBOOK_KIND_SH, entries, bands)
 
-    def scales(number: int, *layers: int) -> Codebook:
-        entries = {layer: rows_of(layer, 2, 3, -9, 9) for layer in layers or (0,)}
-        return Codebook(number, _spec.CODEBOOK_KIND_SCALES, entries)
+    def shapes(number: int, *layers: int) -> Codebook:
+        entries = {layer: rows_of(layer, 2, 6, -9, 9) for layer in layers or (0,)}
+        return Codebook(number, _spec.CODEBOOK_KIND_SHAPE, entries)
 
-    one = build(scene(tiles=[], codebooks=(scales(3),)))
-    too_many = [[7] * 3] * (_spec.CODEBOOK_ENTRIES_MAX + 1)
-    many = Codebook(3, _spec.CODEBOOK_KIND_SH0, {0: too_many}, how=Stream(1, _RUNS))
-    shared = scene(tiles=[], codebooks=(scales(2), scales(3)), chunks=(_META,), order=("META", "CODB.2.0"))
+    one = build(scene(tiles=[], codebooks=(shapes(3),)))
+    too_many = [[7] * 6] * (_spec.CODEBOOK_ENTRIES_MAX + 1)
+    many = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: too_many}, how=Stream(1, _RUNS))
+    shared = scene(tiles=[], codebooks=(shapes(2), shapes(3)), chunks=(_META,), order=("META", "CODB.2.0"))
     no_bands = scene(2, [], codebooks=(sh((2, 1), 1),), chunks=(_META,), order=("META",))
     bands = "codebook[3].band_first"
     return [
@@ -178,8 +178,8 @@ def _codebooks() -> list[Recipe]:
             "records and chunks of falling ids",
             "CBR-1",
             "codebook_id",
-            scales(7),
-            scales(2),
+            shapes(7),
+            shapes(2),
             code="E_INDEX",
         ),
         whole("codebook_bands_empty", "bands 2 to 1, and so no chunks", "CBR-2", "E_VALUE", no_bands, bands),
@@ -192,15 +192,15 @@ def _codebooks() -> list[Recipe]:
             sh((1, 2), 1, 2),
         ),
         record(
-            "bands_of_scales",
-            "bands 0 and 1 of a codebook of scales, with a chunk for each",
+            "bands_of_shapes",
+            "bands 0 and 1 of a codebook of shapes, with a chunk for each",
             "CBR-2",
             "band_first",
-            replace(scales(3, 0, 1), bands=(0, 1)),
+            replace(shapes(3, 0, 1), bands=(0, 1)),
         ),
         patched(
-            "codebook_last_band_of_scales",
-            "band 1 as the last of a codebook of scales, with a chunk of layer 0",
+            "codebook_last_band_of_shapes",
+            "band 1 as the last of a codebook of shapes, with a chunk of layer 0",
             "CBR-2",
             "E_VALUE",
             one,
@@ -208,11 +208,11 @@ def _codebooks() -> list[Recipe]:
             at=bands,
         ),
         record(
-            "both_bands_of_scales",
-            "band 1 as the only one of a codebook of scales, with a chunk of layer 1",
+            "both_bands_of_shapes",
+            "band 1 as the only one of a codebook of shapes, with a chunk of layer 1",
             "CBR-2",
             "band_first",
-            replace(scales(3, 1), bands=(1, 1)),
+            replace(shapes(3, 1), bands=(1, 1)),
         ),
     ]
 
@@ -250,7 +250,7 @@ def _directory() -> list[Recipe]:
                     f"directory[{value.decode()}].type",
                 )
             )
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
+    table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)})
     payload = _payload(build(scene(tiles=[], codebooks=(table,))), "CODB.3.0")
 
     def surplus(name: str, why: str, number: int) -> Recipe:

@@ -25,7 +25,7 @@ from csplat_conformance.samples import (
     signed,
     tile,
 )
-from csplat_conformance.scene import Attribute, Block, Codebook, Extra, Rows, Stream
+from csplat_conformance.scene import Attribute, Block, Codebook, Extra, Rows, Scene, Stream
 
 __all__ = ["alone_block_recipes"]
 
@@ -201,13 +201,17 @@ def _coded() -> list[Recipe]:
         why = f"an escape block of {name} that says CODEBOOK and holds another coding"
         return patched(f"escape_of_{name}_by_codebook", why, "CBK-5", "E_STREAM", base, coding)
 
-    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]})
-    shades = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3]]})
-    elsewhere = (
-        (QUATS, turns, book(1, (0, 1), offset([[4, 5, 6]]))),
-        (SH0, shades, book(1, (0, 1), Block(_spec.CODING_LEVELS, [[4, 5, 6]]))),
-    )
-    turn = tile(changes={QUATS: book(1, (0, 1), signed([[4, 5, 6]]))})
+    shapes = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6]]})
+
+    def own(of_scales: Block, of_quats: Block) -> Scene:
+        blocks = {SCALES: book(1, (0, 1), of_scales, summands=(5, 0)), QUATS: book(1, (), of_quats)}
+        return scene(tiles=[tile(changes=blocks)], codebooks=(shapes,))
+
+    three = signed([[4, 5, 6]])
+    elsewhere = {
+        "scales": own(Block(_spec.CODING_LEVELS, [[4, 5, 6]]), three),
+        "quats": own(three, offset([[4, 5, 6]])),
+    }
     both = Codebook(4, _spec.CODEBOOK_KIND_SH, {b: rows_of(b, 2, 6 * b + 3, -9, 9) for b in (1, 2)}, (1, 2))
     first = book(4, (0, 2), signed(rows_of(7, 1, 9, -9, 9)))
     fewer = scene(2, [tile(degree=2, changes={sh_attribute(1): first, sh_attribute(2): book(4)})], codebooks=(both,))
@@ -237,20 +241,28 @@ def _coded() -> list[Recipe]:
             "opacities by a codebook, which no kind is for",
             "BLK-1",
             "E_VALUE",
-            scene(tiles=[tile(changes={OPACITIES: book(1, (0, 0))})], codebooks=(shades,)),
+            scene(tiles=[tile(changes={OPACITIES: book(1, (0, 0))})], codebooks=(shapes,)),
             "TILE.0.0/opacities.coding",
         ),
-        escaped("quats", build(scene(tiles=[turn], codebooks=(turns,))), "TILE.0.0/quats"),
+        whole(
+            "coding_codebook_of_sh0",
+            "colours of degree 0 by a codebook, which no kind is for",
+            "BLK-1",
+            "E_VALUE",
+            scene(tiles=[tile(changes={SH0: book(1, (0, 0))})], codebooks=(shapes,)),
+            "TILE.0.0/sh0.coding",
+        ),
+        escaped("quats", build(own(three, three)), "TILE.0.0/quats"),
         *(
             whole(
-                f"escape_of_{_spec.ATTRIBUTE_NAMES[attribute]}_by_another",
-                f"an escape block of {_spec.ATTRIBUTE_NAMES[attribute]} in a coding of other attributes",
+                f"escape_of_{name}_by_another",
+                f"an escape block of {name} in a coding of other attributes",
                 "CBK-5",
                 "E_STREAM",
-                scene(tiles=[tile(changes={attribute: block})], codebooks=(table,)),
-                f"TILE.0.0/{_spec.ATTRIBUTE_NAMES[attribute]}.escape.coding",
+                made,
+                f"TILE.0.0/{name}.escape.coding",
             )
-            for attribute, table, block in elsewhere
+            for name, made in elsewhere.items()
         ),
         patched(
             "escape_of_higher",

@@ -107,14 +107,15 @@ def _later_blocks() -> list[Recipe]:
 
 def _parts() -> list[Recipe]:
     """Indices, summands and escape blocks."""
-    turns = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[1, 2, 3]]})
-    turn = build(scene(tiles=[tile(changes={QUATS: book(1, (0, 1), signed([[4, 5, 6]]))})], codebooks=(turns,)))
     block = book(1, (0, 1), summands=(-50, -40))
     wide = replace(block, how=Stream(5))
     summand, escape = "TILE.0.0/scales.summand", "TILE.0.1/sh1.escape"
 
-    def shape(first: Block) -> Scene:
-        return scene(tiles=[tile(changes={SCALES: first, QUATS: book(1)})], codebooks=(_shape(1),))
+    def shape(first: Block, second: Block | None = None) -> Scene:
+        return scene(tiles=[tile(changes={SCALES: first, QUATS: second or book(1)})], codebooks=(_shape(1),))
+
+    own = signed([[4, 5, 6]])
+    turn = build(shape(book(1, (0, 2), own, summands=(-50, 0)), book(1, (), own)))
 
     reserved = {
         "summand": ("the lattice parameters of a summand", f"{summand}.reserved_0"),

@@ -9,13 +9,13 @@ from csplat_conformance.broken import patched, whole
 from csplat_conformance.builder import build
 from csplat_conformance.samples import (
     OPACITIES,
-    SCALES,
     SH0,
     Recipe,
     book,
     levels,
     rows_of,
     scene,
+    sh_attribute,
     signed,
     tile,
 )
@@ -35,7 +35,7 @@ def alone_stream_recipes() -> list[Recipe]:
         return whole(name, why, clause, "E_STREAM", made, f"{_STREAM}.{field}")
 
     def entries(name: str, why: str, clause: str, field: str, size: int, how: Stream) -> Recipe:
-        table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)}, how=how)
+        table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)}, how=how)
         changes = {"codebook[3].size": size}
         return patched(
             name,
@@ -80,8 +80,8 @@ def alone_stream_recipes() -> list[Recipe]:
             "an index more than splats",
             "STR-1",
             "E_STREAM",
-            _scales_by(book(3, (0, 1, 0))),
-            "TILE.0.0/scales.indices.count",
+            _band_by(book(3, (0, 1, 0))),
+            "TILE.0.1/sh1.indices.count",
         ),
         opacities(
             "width_of_nothing", "elements of no bytes, and no bytes", "STR-2", "width", [7, 8], Stream(0, packed=b"")
@@ -99,8 +99,8 @@ def alone_stream_recipes() -> list[Recipe]:
             "indices of five bytes",
             "STR-2",
             "E_STREAM",
-            _scales_by(book(3, (0, 1), how=Stream(5))),
-            "TILE.0.0/scales.indices.width",
+            _band_by(book(3, (0, 1), how=Stream(5))),
+            "TILE.0.1/sh1.indices.width",
         ),
         entries("width_5_of_entries", "entries of five bytes", "STR-2", "width", 2, Stream(5)),
         whole(
@@ -161,6 +161,6 @@ def alone_stream_recipes() -> list[Recipe]:
     ]
 
 
-def _scales_by(block: Block) -> Scene:
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
-    return scene(tiles=[tile(changes={SCALES: block})], codebooks=(table,))
+def _band_by(block: Block) -> Scene:
+    table = Codebook(3, _spec.CODEBOOK_KIND_SH, {1: rows_of(0, 2, 9, -9, 9)}, (1, 1))
+    return scene(1, [tile(degree=1, changes={sh_attribute(1): block})], codebooks=(table,))

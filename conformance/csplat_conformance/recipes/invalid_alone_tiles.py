@@ -49,7 +49,7 @@ def _tiles() -> list[Recipe]:
     bare = scene(tiles=[_Partial(**vars(tile()))])
     upper = scene(1, [_Partial(**vars(tile(degree=1)), there=(1,))])
     surplus = build(scene(tiles=[tile(extras=(Block(_spec.CODING_RAW, [[1], [2]]),))]))
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
+    table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)})
     tables = [scene(tiles=[tile(tables=ids)], codebooks=(replace(table, id=2), table)) for ids in ((3, 3), (3, 2))]
     twins = build(scene(1, [tile(1, degree=1), tile(2, degree=1)]))
     three = build(scene(3, [tile(degree=3)]))
@@ -183,7 +183,7 @@ def _cut() -> list[Recipe]:
     def left(field: str, more: int = 0) -> int:
         return len(base.data) - base.fields[field].offset - more
 
-    table = Codebook(3, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(0, 2, 3, -9, 9)})
+    table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)})
     last = build(scene(codebooks=(table,), order=("TILE.0.0", "CODB.3.0")))
     text = build(scene(chunks=(_META,), order=("TILE.0.0", "META")))
 

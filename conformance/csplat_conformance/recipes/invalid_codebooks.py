@@ -35,22 +35,22 @@ def _codebooks() -> list[Recipe]:
     made = rich_scene()
     base = rich()
     first = made.tiles[0]
-    one = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: rows_of(4, 3, 3, -60, 60)})
+    one = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: rows_of(4, 3, 9, -60, 60)}, (1, 1))
 
-    def sh0(block: Block, *books: Codebook, tables: tuple[int, ...] | None = None) -> Scene:
-        return scene(tiles=[tile(changes={SH0: block}, tables=tables)], codebooks=books or (one,))
+    def sh1(block: Block, *books: Codebook, tables: tuple[int, ...] | None = None) -> Scene:
+        changes = {sh_attribute(1): block}
+        return scene(1, [tile(degree=1, changes=changes, tables=tables)], codebooks=books or (one,))
 
     def tiled(blocks: dict[int, Block]) -> Scene:
         return replace(made, tiles=(replace(first, blocks=first.blocks | blocks), made.tiles[1]))
 
-    scales = Codebook(1, _spec.CODEBOOK_KIND_SCALES, {0: rows_of(4, 3, 3, -60, 60)})
-    escape = signed([[1, 2, 3]])
+    shapes = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(4, 3, 6, -60, 60)})
+    escape = signed([[*range(9)]])
     nested = book(1, (0, 0))
     without = {a: b for a, b in first.blocks.items() if a != sh_attribute(1)}
     lone = replace(made, tiles=(replace(first, blocks=without), made.tiles[1]))
     far = Attribute(_spec.MAPPING_LATTICE, 2.0**107)
-    large_sh = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]}, (1, 1), Stream(4))
-    large = Codebook(1, _spec.CODEBOOK_KIND_SH0, {0: [[1, 2, 3], [0, 2**21, 0]]}, how=Stream(4))
+    large = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]}, (1, 1), Stream(4))
     summed = {SCALES: replace(book(2, (0, 2, 1), summands=(0, 2**21, 0)), how=Stream(4))}
     shape = {SCALES: book(2, (0, 2, 1), summands=(2**22, 2**22, 2**22))}
     return [
@@ -59,40 +59,40 @@ def _codebooks() -> list[Recipe]:
             "a codebook that the tile does not list",
             "CBK-1",
             "E_CODEBOOK",
-            sh0(book(1, (0, 1)), tables=()),
-            "TILE.0.0/sh0.params.codebook_id",
+            sh1(book(1, (0, 1)), tables=()),
+            "TILE.0.1/sh1.params.codebook_id",
         ),
         whole(
             "codebook_of_another",
-            "sh0 by a codebook of scales",
+            "band 1 by a codebook of shapes",
             "CBK-1",
             "E_CODEBOOK",
-            sh0(book(1, (0, 1)), scales),
-            "TILE.0.0/sh0.params.codebook_id",
+            sh1(book(1, (0, 1)), shapes),
+            "TILE.0.1/sh1.params.codebook_id",
         ),
         whole(
             "codebook_index",
             "an index above the escape index",
             "CBK-2",
             "E_CODEBOOK",
-            sh0(book(1, (0, 4))),
-            "TILE.0.0/sh0.indices.width",
+            sh1(book(1, (0, 4))),
+            "TILE.0.1/sh1.indices.width",
         ),
         whole(
             "codebook_escape_unasked",
             "an escaped splat, and none announced",
             "CBK-3",
             "E_CODEBOOK",
-            sh0(book(1, (0, 3))),
-            "TILE.0.0/sh0.params.escape_count",
+            sh1(book(1, (0, 3))),
+            "TILE.0.1/sh1.params.escape_count",
         ),
         whole(
             "codebook_escape_missing",
             "no escaped splat, and one announced",
             "CBK-3",
             "E_CODEBOOK",
-            sh0(book(1, (0, 1), escape)),
-            "TILE.0.0/sh0.params.escape_count",
+            sh1(book(1, (0, 1), escape)),
+            "TILE.0.1/sh1.params.escape_count",
         ),
         patched(
             "codebook_escape_count_huge",
@@ -132,8 +132,8 @@ def _codebooks() -> list[Recipe]:
             "an escape block coded CODEBOOK",
             "CBK-5",
             "E_STREAM",
-            sh0(book(1, (0, 3), replace(nested, rows=((0, 0, 0),)))),
-            "TILE.0.0/sh0.escape.coding",
+            sh1(book(1, (0, 3), replace(nested, rows=((0,) * 9,)))),
+            "TILE.0.1/sh1.escape.coding",
         ),
         patched(
             "escape_of_another",
@@ -145,23 +145,10 @@ def _codebooks() -> list[Recipe]:
         ),
         whole(
             "codebook_value_beyond_float32",
-            "an entry whose value leaves binary32",
+            "an entry whose value leaves binary32: a decoder may compute values once for all tiles",
             "LAT-5 CBK-7",
             "E_RANGE",
-            replace(sh0(book(1, (0, 1)), large), attributes=attributes() | {SH0: far}),
-            "CODB.1.0/entries.width",
-        ),
-        whole(
-            "codebook_sh_value_beyond_float32",
-            "the same in an SH codebook, whose values a decoder may compute once for all tiles",
-            "LAT-5 CBK-7",
-            "E_RANGE",
-            scene(
-                1,
-                [tile(degree=1, changes={sh_attribute(1): book(1, (0, 1))})],
-                codebooks=(large_sh,),
-                attributes=attributes(1) | {sh_attribute(1): far},
-            ),
+            replace(sh1(book(1, (0, 1)), large), attributes=attributes(1) | {sh_attribute(1): far}),
             "CODB.1.1/entries.width",
         ),
         whole(
@@ -177,8 +164,8 @@ def _codebooks() -> list[Recipe]:
             "coded bytes of a codebook that no tile names",
             "COD-2",
             "E_CODER",
-            scene(codebooks=(replace(one, how=Stream(1, coder="deflate", coded=b"\xff\xff")),)),
-            "CODB.1.0/entries.coded",
+            scene(1, codebooks=(replace(one, how=Stream(1, coder="deflate", coded=b"\xff\xff")),)),
+            "CODB.1.1/entries.coded",
         ),
         whole(
             "codebook_summand_large",
@@ -195,40 +182,33 @@ def _unused_entries() -> list[Recipe]:
     """CBK-7: of each kind an entry out of bounds that no splat uses; the first one all splats use."""
     far = 2.0**107  # 2^21 steps of it are beyond binary32
     four = Stream(4)
-    kinds = {
-        "scale": ("scales", "LAT-5", _spec.CODEBOOK_KIND_SCALES, SCALES, [[-3, 2, 1], [0, 0, -(2**21)]]),
-        "quat": ("a component beyond M", "QUA-1", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [0, -128, 0]]),
-        "quat_radicand": ("R below 0", "QUA-2", _spec.CODEBOOK_KIND_QUATS, QUATS, [[1, 2, 3], [127, 1, 127]]),
-        "sh0": ("a colour", "LAT-5", _spec.CODEBOOK_KIND_SH0, SH0, [[1, 2, 3], [0, 2**21, 0]]),
-        "sh0_integer": ("2^22 + 1", "LAT-4", _spec.CODEBOOK_KIND_SH0, SH0, [[1, 2, 3], [0, 0, 2**22 + 1]]),
-    }
-    result = []
-    for name, (why, clause, kind, attribute, entries) in kinds.items():
-        made = scene(
-            tiles=[tile(changes={attribute: book(1, (0, 0))})],
-            codebooks=(Codebook(1, kind, {0: entries}, how=four),),
-        )
-        if clause == "LAT-5":
-            made = replace(made, attributes=attributes() | {attribute: Attribute(_spec.MAPPING_LATTICE, far)})
-        result.append(_unused(name, why, clause, made, "CODB.1.0"))
-    shape = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6], [1, 2, 3, 127, 127, -1]]})
-    shapes = tile(changes={SCALES: book(1, (0, 0), summands=(5, 6)), QUATS: book(1)})
+
+    def shapes(rotation: list[int]) -> Scene:
+        table = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6], [1, 2, 3, *rotation]]}, how=Stream(2))
+        one = tile(changes={SCALES: book(1, (0, 0), summands=(5, 6)), QUATS: book(1)})
+        return scene(tiles=[one], codebooks=(table,))
+
+    def colours(entry: list[int], step: float) -> Scene:
+        one = tile(degree=1, changes={sh_attribute(1): book(1, (0, 0))})
+        table = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[*range(9)], entry]}, (1, 1), four)
+        record = {sh_attribute(1): Attribute(_spec.MAPPING_LATTICE, step)}
+        return scene(1, [one], codebooks=(table,), attributes=attributes(1) | record)
+
     second = sh_attribute(2)
     lifted = [2 * 10**6] * 5 + [1, 15 * 10**5, 1, 1, 1] + [0] * 5  # red is 2 750 000 in the second coefficient
     bands = {1: [[1] * 9, [2] * 9], 2: [[1] * 15, lifted]}
-    colours = scene(
+    lifting = scene(
         2,
         [tile(degree=2, changes={sh_attribute(1): book(1, (0, 0)), second: book(1)})],
         codebooks=(Codebook(1, _spec.CODEBOOK_KIND_SH, bands, (1, 2), four),),
         attributes=attributes(2, ycocg=True) | {second: Attribute(_spec.MAPPING_YCOCG, far)},
     )
-    unnamed = Codebook(1, _spec.CODEBOOK_KIND_QUATS, {0: [[127, 127, 127]]})
+    unnamed = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 127, 127, 127]]})
     return [
-        *result,
-        _unused(
-            "shape", "a rotation whose R is below 0", "QUA-2", scene(tiles=[shapes], codebooks=(shape,)), "CODB.1.0"
-        ),
-        _unused("sh", "a colour that only the lifting takes there", "LAT-5", colours, "CODB.1.2"),
+        _unused("quat", "a component beyond M", "QUA-1", shapes([0, -128, 0]), "CODB.1.0"),
+        _unused("quat_radicand", "R below 0", "QUA-2", shapes([127, 1, 127]), "CODB.1.0"),
+        _unused("sh_integer", "2^22 + 1", "LAT-4", colours([0] * 8 + [2**22 + 1], 2.0**-30), "CODB.1.1"),
+        _unused("sh", "a colour that only the lifting takes there", "LAT-5", lifting, "CODB.1.2"),
         whole(
             "codebook_unnamed_entry",
             "an entry out of bounds of a codebook that no tile names",
@@ -236,6 +216,14 @@ def _unused_entries() -> list[Recipe]:
             "E_RANGE",
             scene(codebooks=(unnamed,)),
             "CODB.1.0/entries.width",
+        ),
+        whole(
+            "codebook_unnamed_value",
+            "a coefficient beyond binary32 in a codebook that no tile names",
+            "LAT-5 CBK-7 CHK-2",
+            "E_RANGE",
+            replace(colours([0] * 8 + [2**21], far), tiles=()),
+            "CODB.1.1/entries.width",
         ),
     ]
 

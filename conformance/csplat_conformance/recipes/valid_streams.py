@@ -30,11 +30,6 @@ _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_BYTE_PLANES,
     _spec.TRANSFORM_RUN_LENGTH,
 )
-_KINDS = {
-    "scales": (_spec.CODEBOOK_KIND_SCALES, SCALES),
-    "quats": (_spec.CODEBOOK_KIND_QUATS, QUATS),
-    "sh0": (_spec.CODEBOOK_KIND_SH0, SH0),
-}
 
 
 def valid_stream_recipes() -> list[Recipe]:
@@ -62,23 +57,7 @@ def _streams() -> list[Recipe]:
 
 
 def _codebooks() -> list[Recipe]:
-    result = []
-    for name, (kind, attribute) in _KINDS.items():
-        made = Codebook(1, kind, {0: rows_of(4, 3, 3, -60, 60)})
-        one = tile(3, 4, 0, {attribute: book(1, (2, 0, 1, 0))})
-        result.append(
-            _recipe(f"codebook_{name}", "no escapes", "CBK-1 CBK-2 CBK-7", scene(tiles=[one], codebooks=(made,)))
-        )
-        escaped = tile(3, 4, 0, {attribute: book(1, (2, 0, 3, 0), signed(rows_of(2, 1, 3, -70, 70)))})
-        result.append(
-            _recipe(
-                f"codebook_{name}_escape",
-                "the third splat is escaped",
-                "CBK-3 CBK-5",
-                scene(tiles=[escaped], codebooks=(made,)),
-            )
-        )
-    result += _shapes()
+    result = _shapes()
     for first, last in ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (1, 3)):
         entries = {band: rows_of(band, 3, 3 * (2 * band + 1), -99, 99) for band in range(first, last + 1)}
         made = Codebook(900, _spec.CODEBOOK_KIND_SH, entries, (first, last), Stream(1, (_DELTA, _ZIGZAG)))
@@ -115,7 +94,7 @@ def _shapes() -> list[Recipe]:
         _recipe(
             "codebook_shape",
             "a common summand of the log scales",
-            "CBK-1 CBK-4 CBK-6",
+            "CBK-1 CBK-2 CBK-4 CBK-6 CBK-7",
             scene(tiles=[plain], codebooks=(shape,)),
         ),
         _recipe(

@@ -89,7 +89,7 @@ def _check_entries(
     sound = True
     for attribute in attributes:
         columns = attribute_columns(book, attribute)
-        if columns is None or (book.record.kind, attribute) == (_spec.CODEBOOK_KIND_SHAPE, _spec.ATTRIBUTE_SCALES):
+        if columns is None or attribute == _spec.ATTRIBUTE_SCALES:
             continue
         sound &= check_integers(findings, index, attribute, table[:, columns].T, 0, where)
     return sound

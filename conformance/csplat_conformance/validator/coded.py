@@ -51,7 +51,7 @@ def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, 
     else:
         first = _find_first(reader, book, params)
     summands = None
-    has_summand = book.record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES
+    has_summand = attribute == _spec.ATTRIBUTE_SCALES
     if has_summand:
         summands = _read_summands(reader, payload, name, attribute)
     escapes = _read_escapes(reader, payload, name, attribute, params) if params.record.escape_count else None
@@ -62,7 +62,7 @@ def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, 
     if summands is not None:
         rows += summands[~first.escaped]
     sound = check_integers(reader.findings, reader.index, attribute, rows, 0, (at, f"{payload.name}/{name}"))
-    if sound and attribute == _spec.ATTRIBUTE_SCALES and (escapes is not None or not first.escaped.any()):
+    if sound and has_summand and (escapes is not None or not first.escaped.any()):
         parts = [part for part in (rows, escapes) if part is not None and part.size]
         reader.check_scales(max(int(part.max()) for part in parts), 0)
 
@@ -122,7 +122,7 @@ def _find_first(reader: TileReader, book: CodebookAt, params: Params) -> First:
 
 
 def _read_summands(reader: TileReader, payload: Payload, name: str, attribute: int) -> I64 | None:
-    """The common summand of the kind SHAPE: LAT-2, LAT-3; [n]."""
+    """The common summand of scales: LAT-2, LAT-3; [n]."""
     _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
     offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
     width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]

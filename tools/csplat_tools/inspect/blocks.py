@@ -141,7 +141,7 @@ def _walk_codebook(
         raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-1", found=f"codebook {params.codebook_id}")
     if attribute == _first_attribute(record, record.band_first):
         _walk_stream(cursor, use)
-    if record.kind == _spec.CODEBOOK_KIND_SHAPE and attribute == _spec.ATTRIBUTE_SCALES:
+    if attribute == _spec.ATTRIBUTE_SCALES:
         cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4)
         _walk_stream(cursor, use)
     use.escaped_count += params.escape_count
