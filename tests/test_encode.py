@@ -178,6 +178,22 @@ def test_all_splats_in_one_point(make_model):
     np.testing.assert_allclose(decoded.means, same.means, atol=float(np.spacing(np.float32(3.14159))))
 
 
+def test_what_lies_on_a_grid_of_powers_of_two_comes_back_as_it_was(make_model):
+    model = make_model(2000, 0)
+    means, scales = np.rint(model.means * 1024) / 1024, np.rint(model.scales * 16) / 16
+    decoded, result = round_trip(replace(model, means=means, scales=scales), attribute_psnr=80)
+    index = result.source_index
+    np.testing.assert_array_equal(decoded.means, means[index])
+    np.testing.assert_array_equal(np.sort(decoded.scales), np.sort(scales[index]))
+    assert (2.0**-10, 2.0**-4) == tuple(result.report.options[name] for name in ("position_step", "scale_step"))
+
+    means[-1, 2] += np.spacing(means[-1, 2])
+    _, off = round_trip(replace(model, means=means, scales=scales), attribute_psnr=80)
+    assert off.report.options["position_step"] < 2.0**-10
+    _, coarse = round_trip(replace(model, means=means, scales=scales), preset="small")
+    assert coarse.report.options["scale_step"] > 2.0**-4
+
+
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_extreme_values_come_back(make_model, preset):
     model = make_model(64, 3)

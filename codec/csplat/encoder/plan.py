@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,8 @@ _SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
 _EDGE = 0.02  # share of splats on either side that does not count as the scene's extent
 _MOST_BITS = 16  # per axis of a tile
 _LEAST_STEP = 1e-250
+_LOOK = 1024  # splats of which few scenes pass for multiples of a power of two
+_FINER = 0.8  # of a step: how fine the source's grid may be, and be worth its bits
 _HALF_DIAGONAL = 3.0**0.5 / 2.0  # of a lattice cell, in steps: no centre is moved farther
 
 
@@ -106,7 +109,7 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
     return Plan(
         lattice=_lattice(model, options, steps.means),
         morton=options.means_coding != "axis",
-        scale_step=_first(options.scale_step, steps.scales),
+        scale_step=_first(options.scale_step, _source_step(model.scales, steps.scales)),
         opacity_levels=_first(options.opacity_levels, steps.opacity_levels),
         quat_levels=_first(options.quat_levels, steps.quat_levels),
         sh0_step=_first(options.sh0_step, steps.sh0),
@@ -185,7 +188,28 @@ def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattic
     reach = float(np.abs(core).max())
     if options.position_bits is not None:
         return Lattice(_usable(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
-    return Lattice(_usable(wanted or extent / (1 << _MOST_BITS), reach), _MOST_BITS)
+    step = _source_step(model.means, wanted or extent / (1 << _MOST_BITS))
+    return Lattice(_usable(step, reach), _MOST_BITS)
+
+
+def _source_step(values: F32, step: float) -> float:
+    """Return the grid that the values lie on, where none finer is wanted: they come back as they were, in fewer bits.
+
+    Centres and log scales of SPZ, and of what was SPZ once, are multiples of a power of two.
+    """
+    if not (step > _LEAST_STEP and values.any()):
+        return step
+    grid = 2.0 ** math.ceil(math.log2(_FINER * step))
+    if not (_on_grid(values[:_LOOK], grid) and _on_grid(values, grid)):
+        return step
+    while _on_grid(values, 2.0 * grid):
+        grid *= 2.0
+    return grid
+
+
+def _on_grid(values: F32, grid: float) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return not np.fmod(values, np.float32(grid)).any()
 
 
 def _usable(step: float, reach: float) -> float:
