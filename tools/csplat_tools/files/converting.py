@@ -95,7 +95,7 @@ def convert_file(
         filters: what becomes of the scene on the way.
         no_loss: refuse where anything is lost.
         dry_run: write nothing.
-        progress: is told how many splats are written.
+        progress: is told how many splats are read; some formats want them twice.
 
     Raises:
         CsplatError: the source is not whole, the target cannot hold it, or something would be lost and must not be.
@@ -155,8 +155,10 @@ def _watched(scene: Scene, progress: Progress | None) -> Scene:
     def blocks() -> Iterator[SplatModel]:
         done = 0
         for model in scene.blocks():
-            progress("writing", done / max(1, scene.count))
+            progress("reading", done / max(1, scene.count))
             yield model
             done += len(model)
+        progress("reading", 1.0)
+        progress("writing", 0.0)  # or going through it once more, which begins anew
 
     return replace(scene, blocks=blocks)
