@@ -154,11 +154,11 @@ def look_at(
     if not (math.isfinite(length) and length > 0.0):
         raise InputError("a camera cannot look at the point where it stands")
     forward = forward / length
-    right = np.cross(forward, np.array(up, np.float64))
+    right = _cross(forward, np.array(up, np.float64))
     if math.sqrt(float(np.sum(right**2))) <= _PARALLEL:
-        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+        right = _cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
     right = right / math.sqrt(float(np.sum(right**2)))
-    down = np.cross(forward, right)
+    down = _cross(forward, right)
     viewmat = np.eye(4)
     for row, axis in enumerate((right, down, forward)):
         viewmat[row, :3] = axis
@@ -181,10 +181,15 @@ def direction(up: ArrayLike, azimuth: float, elevation: float) -> F64:
     first = np.eye(3)[int(np.argmin(np.abs(u)))]
     first = first - u * float(np.sum(first * u))
     first = first / math.sqrt(float(np.sum(first**2)))
-    second = np.cross(u, first)
+    second = _cross(u, first)
     a, e = math.radians(azimuth), math.radians(elevation)
     result: F64 = (first * math.cos(a) + second * math.sin(a)) * math.cos(e) + u * math.sin(e)
     return result
+
+
+def _cross(a: F64, b: F64) -> F64:
+    """`np.cross` of two vectors, to the bit, without what that spends on axes: cameras are tried by the hundred."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def orbit(

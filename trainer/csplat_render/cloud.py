@@ -191,7 +191,8 @@ def _project(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F64, F6
         inside = (z > camera.near) & (u >= 0.0) & (u < camera.W) & (v >= 0.0) & (v < camera.H)
     z = z[inside]
     columns = -(-camera.W // cell)
-    cells = (v[inside] // cell).astype(np.int64) * columns + (u[inside] // cell).astype(np.int64)
+    # Integers first: of what is not negative that is the same, and a tenth of the time of `//` of floats.
+    cells = v[inside].astype(np.int64) // cell * columns + u[inside].astype(np.int64) // cell
     scale = camera.K[0, 0] / z
     return cells, z, cloud.masses[inside] * (scale / cell) ** 2, cloud.sizes[inside] * scale
 
