@@ -65,6 +65,15 @@ def sample_path() -> Path:
     return ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 
 
+@pytest.fixture(scope="module")
+def small_views():
+    """Virtual views that decide and judge are small: for searches and reports whose figures nobody reads."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csplat_tools.views.finding._DECIDING", (12, 80, 60))
+        patch.setattr("csplat_tools.views.finding._JUDGING", (8, 160, 120))
+        yield
+
+
 @pytest.fixture
 def make_model():
     """A function that makes a small random model: `make_model(count, degree, **fields)`."""

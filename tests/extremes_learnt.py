@@ -70,10 +70,10 @@ def trained(name: str) -> TrainResult:
 
 
 @cache
-def tuned(name: str) -> tuple[Frozen, FinetuneResult, Judge]:
-    """The scene, tuned as a file, and who judges it by pictures that were kept aside."""
+def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Judge]:
+    """The scene, tuned as a file to so many pictures but four, and who judges it by those four."""
     source = learnt_from(name)
-    views = split_views(renders_of(source, virtual_cameras(source, 52, 48, 36), BLACK, None), BLACK, aside=4)
+    views = split_views(renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, aside=4)
     frozen = Draft.of(source, COARSE).frozen()
     aside = Judge(
         [view.camera for view in views.validation], [Look(view.wanted.astype(np.float32)) for view in views.validation]

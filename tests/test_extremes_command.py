@@ -17,7 +17,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from csplat import read_ply
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.extremes
+pytestmark = [pytest.mark.extremes, pytest.mark.usefixtures("small_views")]
 
 
 def run(*words):

@@ -43,7 +43,7 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.tuning import renders_of, split_views, tune
 
-pytestmark = pytest.mark.extremes
+pytestmark = [pytest.mark.extremes, pytest.mark.usefixtures("small_views")]
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -209,4 +209,4 @@ def test_splats_wider_than_float32_are_tuned():
 
 def test_colours_that_square_beyond_float32_are_refused_before_anything_is_tuned():
     with pytest.raises(InputError, match="colours are too large to be tuned"):
-        tuned("exploded")
+        tuned("exploded", 6)

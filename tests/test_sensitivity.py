@@ -21,6 +21,8 @@ from csplat_tools.files.importance import weights_of
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 STEP = 1e-5
 
 

@@ -30,6 +30,8 @@ from csplat_tools.views.agreeing import find_views, removal_keys
 from csplat_trainer.evaluate import photograph_judge
 from csplat_trainer.pictures import Picture
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 SMALL = SimplifyOptions(views=12, view_size=(48, 36), steps=4, rounds=2)
 
 

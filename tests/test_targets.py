@@ -21,6 +21,8 @@ pytest.importorskip("numba", reason="targets of size and PSNR want the extra [re
 # Importing it needs what is looked for above.
 from captures import photograph, shell
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 
 @pytest.fixture(scope="module")
 def scene():

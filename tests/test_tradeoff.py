@@ -44,6 +44,8 @@ from csplat_tools.tradeoffs.setting import read_setting
 from csplat_tools.tradeoffs.tables import format_tradeoff
 from csplat_tools.views import DataOptions
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 POINT = {
     "name", "family", "error", "command", "settings", "size_bytes", "sha256", "bytes_per_source_splat", "ratio",
     "splats", "sh_degree", "psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "photographs", "seconds",

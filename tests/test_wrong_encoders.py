@@ -19,6 +19,8 @@ from csplat_conformance.encoders import all_inputs
 from csplat_conformance.report import Status
 from csplat_tools.cli.app import app
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
 HAS_RENDERER = find_spec("numba") is not None
