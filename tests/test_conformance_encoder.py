@@ -32,6 +32,9 @@ PICTURES = ("ordinary/surfaces", "ordinary/glossy")
 DEGREE_4 = "nasty/degree_4"  # ours refuses it, and nothing else that can be encoded
 
 
+pytestmark = pytest.mark.usefixtures("small_views")  # `finding.psnr` keeps judges: of one size in all files
+
+
 def invoke(*words):
     return CliRunner().invoke(app, ["conformance", "encoder", *map(str, words)])
 
