@@ -24,6 +24,8 @@ PYTHON = ROOT / "codec" / "csplat" / "_spec.py"
 RULES = ROOT / "conformance" / "csplat_conformance" / "_rules.py"
 JAVASCRIPT = ROOT / "codec" / "js" / "spec.mjs"
 TYPES = ROOT / "codec" / "js" / "decoder.d.ts"
+C = ROOT / "codec" / "c" / "csplat.c"
+C_HEADER = ROOT / "codec" / "c" / "csplat.h"
 
 STRUCT_CODES = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i"} | {
     "u64": "Q",
@@ -66,6 +68,8 @@ def main() -> int:
         RULES: rules_module(registry),
         JAVASCRIPT: javascript_module(registry),
         TYPES: with_types(TYPES.read_text(encoding="utf-8"), registry),
+        C: with_c_numbers(C.read_text(encoding="utf-8"), registry),
+        C_HEADER: with_c_codes(C_HEADER.read_text(encoding="utf-8"), registry),
         FORMAT: with_tables(FORMAT.read_text(encoding="utf-8"), registry),
     }
     stale = []
@@ -414,11 +418,58 @@ def with_types(text: str, registry: Registry) -> str:
     """Return the text of codec/js/decoder.d.ts with the error codes renewed."""
     codes = [f"  | '{entry['id']}'" for entry in enum_named(registry, "error")["entries"]]
     union = "\n".join(["export type ErrorCode =", *codes]) + ";"
-    begin, end = "// begin generated: error codes\n", "// end generated"
+    return between(text, "// begin generated: error codes\n", union + "\n", "// end generated")
+
+
+def between(text: str, begin: str, new: str, end: str) -> str:
+    """Return the text with what stands between two marks replaced; SystemExit where the marks are not there once."""
     if text.count(begin) != 1 or end not in text.split(begin)[1]:
-        raise SystemExit("decoder.d.ts: no place for the error codes")
+        raise SystemExit(f"no place for what follows {begin.strip()!r}")
     before, rest = text.split(begin)
-    return f"{before}{begin}{union}\n{end}{rest.split(end, 1)[1]}"
+    return f"{before}{begin}{new}{end}{rest.split(end, 1)[1]}"
+
+
+# C -----------------------------------------------------------------------------------------------
+
+
+def with_c_numbers(text: str, registry: Registry) -> str:
+    """Return the text of codec/c/csplat.c with the numbers of the format renewed."""
+    form = registry["format"]
+    magic = "".join(f"\\{byte:03o}" for byte in form["magic"])
+    lines = [
+        f"/* {NOTICE} */",
+        f"#define SPEC_VERSION_MAJOR {form['version_major']}",
+        f"#define SPEC_VERSION_MINOR {form['version_minor']}",
+        f'#define SPEC_MAGIC "{magic}"',
+        *(f"#define SPEC_{c['name'].upper()} {c_value(c['value'])}" for c in registry["constant"]),
+    ]
+    for enum in registry["enum"]:
+        if enum["name"] != "error":
+            prefix = f"SPEC_{enum['name'].upper()}"
+            lines += [f"#define {prefix}_{e['name'].upper()} {c_value(e['id'])}" for e in enum["entries"]]
+    for structure in registry["structure"]:
+        fields = fields_of(structure)
+        prefix = f"SPEC_{structure['name'].upper()}"
+        size = struct.calcsize("<" + "".join(struct_code(field) for field in fields))
+        places = zip(fields, field_offsets(fields), strict=True)
+        lines += [f"#define {prefix}_SIZE {size}", *(f"#define {prefix}_AT_{f[0].upper()} {at}" for f, at in places)]
+    text = between(text, "/* begin generated: numbers */\n", "\n".join(lines) + "\n", "/* end generated */")
+    names = [f'{" " * 40}"{e["id"]}",\n' for e in enum_named(registry, "error")["entries"]]
+    return between(
+        text, "/* begin generated: names of error codes */\n", "".join(names), f"{' ' * 40}/* end generated */"
+    )
+
+
+def with_c_codes(text: str, registry: Registry) -> str:
+    """Return the text of codec/c/csplat.h with the error codes renewed."""
+    codes = [f"    CSPLAT_{e['id']}, /* {e['text']} */\n" for e in enum_named(registry, "error")["entries"]]
+    return between(text, "/* begin generated: error codes */\n", "".join(codes), "    /* end generated */")
+
+
+def c_value(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    return f"INT64_C({value})" if value > 0x7FFFFFFF else str(value)
 
 
 # Spec tables -------------------------------------------------------------------------------------

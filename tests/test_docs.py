@@ -103,6 +103,8 @@ def test_a_package_index_shows_nothing_that_only_a_checkout_has():
 def test_all_files_that_name_the_version_name_the_same():
     assert csplat.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
     assert csplat.__version__ == json.loads((ROOT / "codec" / "js" / "package.json").read_text("utf-8"))["version"]
+    built = (ROOT / "codec" / "c" / "CMakeLists.txt").read_text("utf-8")
+    assert f"project(csplat VERSION {csplat.__version__} " in built
     assert f"\nversion: {csplat.__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
 
 

@@ -32,6 +32,7 @@ SOURCES = {
     "embedding.md": "codec/EMBEDDING.md",
     "implementers.md": "conformance/IMPLEMENTERS.md",
     "javascript.md": "codec/js/README.md",
+    "c.md": "codec/c/README.md",
     "format.md": "spec/format.md",
     "conformance.md": "conformance/README.md",
     "codec-figures.md": "codec/FIGURES.md",

@@ -1,0 +1,232 @@
+/* A decoder for .csplat, a compressed format for 3D Gaussian splats (spec/format.md).
+ *
+ *     csplat *file;
+ *     csplat_error error;
+ *     if (csplat_open_memory(&file, data, size, NULL, &error)) return puts(error.message);
+ *     const csplat_info *info = csplat_get_info(file);
+ *     for (uint32_t i = 0; i < info->tile_count; i++) {
+ *         csplat_floats out = {means, quats, scales, opacities, sh0, NULL};   room for CSPLAT_TILE_SPLATS each
+ *         if (csplat_read_tile(file, i, 0, &out)) break;                      csplat_last_error(file) says why
+ *     }
+ *     csplat_close(file);
+ *
+ * Nothing is global. A csplat belongs to one thread at a time; several threads open one each, of the same bytes.
+ * Every function that can fail returns CSPLAT_OK, which is 0, or the code of the specification. After a failure the
+ * csplat can still be asked for something else. SPDX-License-Identifier: Apache-2.0 */
+#ifndef CSPLAT_H
+#define CSPLAT_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define CSPLAT_TILE_SPLATS 65536 /* splats of a tile at most */
+#define CSPLAT_NO_OFFSET UINT64_MAX
+
+typedef struct csplat csplat;
+
+/* Codes of the specification, section 12. */
+typedef enum csplat_code {
+    CSPLAT_OK = 0,
+    /* begin generated: error codes */
+    CSPLAT_E_MAGIC, /* the file does not begin with the magic, or a text-mode transfer damaged it */
+    CSPLAT_E_VERSION, /* another version of the format */
+    CSPLAT_E_TRUNCATED, /* the data ends before what it announces */
+    CSPLAT_E_TRAILING, /* bytes follow the end of the file */
+    CSPLAT_E_CRC, /* a CRC-32 does not match */
+    CSPLAT_E_RESERVED, /* a reserved field or bit is not 0 */
+    CSPLAT_E_VALUE, /* a field holds a forbidden value */
+    CSPLAT_E_INDEX, /* index and chunks contradict each other */
+    CSPLAT_E_UNSUPPORTED, /* a profile, type or coding that this version or this decoder does not have */
+    CSPLAT_E_STREAM, /* a stream header contradicts its place */
+    CSPLAT_E_CODER, /* coded bytes are damaged, end early or late, or do not give the declared size */
+    CSPLAT_E_RANGE, /* a decoded integer or value is out of range */
+    CSPLAT_E_CODEBOOK, /* an index, a count or a codebook that does not fit */
+    CSPLAT_E_BOX, /* a tile's record does not describe its splats */
+    CSPLAT_E_JSON, /* a JSON chunk is not UTF-8 JSON of the right kind */
+    CSPLAT_E_LIMIT, /* the decoder's budget is too small */
+    CSPLAT_E_INPUT, /* the caller's data or arguments, not a file, are at fault */
+    /* end generated */
+} csplat_code;
+
+typedef struct csplat_error {
+    csplat_code code;
+    uint64_t offset;       /* of the byte to blame, from the start of the file, or CSPLAT_NO_OFFSET */
+    const char *clause;    /* of the specification, "CRC-1", or "" */
+    char message[192];     /* one line: code, place, what is wrong */
+} csplat_error;
+
+/* Where the bytes of a file come from. */
+typedef struct csplat_source {
+    /* Put exactly `size` bytes from `offset` on into `into`; 0 when that fails. */
+    int (*read)(void *user, uint64_t offset, size_t size, void *into);
+    void *user;
+    uint64_t size; /* of the file */
+} csplat_source;
+
+/* Everything here may be 0, which is the default. */
+typedef struct csplat_options {
+    uint64_t splats_max;     /* of csplat_decode, 2^25 */
+    uint64_t bytes_max;      /* of the arrays of csplat_decode and of codebooks, 8 GiB */
+    uint64_t json_bytes_max; /* of one text of csplat_read_text, 64 MiB */
+    /* malloc and free. Both or none. */
+    void *(*allocate)(void *user, size_t size);
+    void (*release)(void *user, void *memory);
+    /* zlib. Raw DEFLATE (RFC 1951): 1 if `coded` is one complete stream, no byte longer, of exactly `size` bytes.
+     * What else it has to refuse is told by section 6.2 of the specification (COD-2 to COD-8). */
+    int (*inflate)(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
+    void *user; /* of the three above */
+} csplat_options;
+
+typedef struct csplat_extra {
+    const char *name; /* UTF-8, ends with a 0 */
+    uint8_t dtype;    /* 1 u8, 2 i8, 3 u16, 4 i16, 5 u32, 6 i32, 7 f32, 8 f64; 0: unknown, never returned */
+    uint8_t bytes;    /* of one value; 0 where unknown */
+} csplat_extra;
+
+typedef struct csplat_codebook {
+    uint16_t id;
+    uint8_t band_first, band_last; /* SH bands, or 0 where it is not of colours of SH */
+    uint32_t size;                 /* entries */
+} csplat_codebook;
+
+/* What header and index say. */
+typedef struct csplat_info {
+    uint64_t file_size;
+    uint64_t splat_count;
+    uint32_t tile_count;
+    uint8_t sh_degree;
+    uint8_t antialiased, flat; /* how to render: mip-splatting's filter, 2DGS */
+    char axes[4];              /* directions of +x, +y, +z: letters of R L U D F B; "" where unknown */
+    double unit_metres;        /* 0 where unknown */
+    double origin[3];          /* what the means are relative to; it is not added */
+    uint32_t opacity_levels;   /* M of the opacities; they are (q / M), or squared: (q / M)^2 */
+    uint8_t opacity_squared;
+    uint32_t quat_levels;      /* M of the rotations */
+    const csplat_codebook *codebooks;
+    const csplat_extra *extras;
+    uint32_t codebook_count, extra_count;
+} csplat_info;
+
+typedef struct csplat_tile {
+    uint64_t first;       /* number of its first splat in the scene */
+    uint32_t splat_count;
+    uint8_t bands;        /* bit l - 1 is set: it has SH band l; all coefficients are 0 otherwise */
+    float min[3], max[3]; /* box of the centres */
+    float max_scale;      /* natural logarithm of the largest standard deviation */
+    uint32_t bytes[4];    /* of layer 0 and of SH bands 1 to 3 in the file */
+} csplat_tile;
+
+/* Where a tile's values go; what is NULL is left out. K = (degree + 1)^2 - 1. */
+typedef struct csplat_floats {
+    float *means;     /* [n][3], scene units, relative to the origin */
+    float *quats;     /* [n][4], w x y z, unit length */
+    float *scales;    /* [n][3], natural logarithms of the standard deviations */
+    float *opacities; /* [n], alpha */
+    float *sh0;       /* [n][3], SH coefficient of band 0 */
+    float *shN;       /* [n][K][3], bands 1 to degree */
+} csplat_floats;
+
+/* A whole scene. */
+typedef struct csplat_scene {
+    uint64_t splat_count;
+    unsigned sh_degree; /* of shN */
+    csplat_floats values;
+    void **extras; /* [extra_count], NULL for unknown types; of each the values of its type */
+} csplat_scene;
+
+/* The integer arrays of the specification, 9.2, for tests. What is NULL is left out. */
+typedef struct csplat_integers {
+    uint32_t *opacities;
+    int64_t *scales, *means, *sh0, *sh[3]; /* sh[l - 1]: [n][2 l + 1][3] */
+    int32_t *quats;
+    int32_t *exponents; /* [5 + sh_degree]: opacities, scales, quats, means, sh0, bands */
+} csplat_integers;
+
+/* Quantised values in narrow arrays: an integer is offset[column] + element, a value float32(integer * step).
+ * Opacities and quats have no step, see csplat_info. Colours are R, G, B; column channel * (2l + 1) + m of an SH
+ * band holds coefficient m. The pointers hold until the next call with the csplat. */
+typedef struct csplat_columns {
+    const void *data;       /* u8, u16 or u32: all elements of column 0, then of column 1, ... */
+    unsigned width;         /* bytes of an element: 1, 2, 4 */
+    unsigned columns;
+    uint32_t count;         /* rows */
+    int64_t offset[21];
+    double step;
+} csplat_columns;
+
+/* One attribute. Where `index` is not NULL the values stand in a codebook, but those of the splats `rows`, whose index
+ * is the size of the codebook: `columns` has a row for each of these. Where `index` is NULL and `rows` is not, `columns`
+ * has the splats `rows`, and all others are 0. */
+typedef struct csplat_packed {
+    csplat_columns columns;
+    const uint32_t *rows;  /* [columns.count], or NULL: all splats */
+    const void *index;     /* [n] u8, u16 or u32, or NULL */
+    unsigned index_width;
+    uint16_t codebook;     /* its id */
+} csplat_packed;
+
+/* Layer 0 of a tile. */
+typedef struct csplat_packed_geometry {
+    csplat_packed opacities, scales, quats, means, sh0; /* quats: x, y, z; w follows (specification, 7.5) */
+} csplat_packed_geometry;
+
+/* Error bounds that the file states; below 0 where it states none. */
+typedef struct csplat_stated_errors {
+    uint64_t source_count, pruned_count;
+    uint8_t source_sh_degree, refitted;
+    struct {
+        double max, rms;
+    } means, covariance, opacities, sh[4];
+} csplat_stated_errors;
+
+typedef enum csplat_text { CSPLAT_METADATA, CSPLAT_CAMERAS, CSPLAT_ENCODER_OPTIONS } csplat_text;
+
+/* Read and check header and index. *out is NULL on failure; `options` and `error` may be NULL. With csplat_open_memory
+ * nothing is copied: `data` stays where it is until csplat_close. */
+csplat_code csplat_open_memory(csplat **out, const void *data, size_t size, const csplat_options *options,
+                               csplat_error *error);
+csplat_code csplat_open(csplat **out, const csplat_source *source, const csplat_options *options, csplat_error *error);
+void csplat_close(csplat *file);
+
+const csplat_info *csplat_get_info(const csplat *file);
+csplat_code csplat_get_tile(csplat *file, uint32_t tile, csplat_tile *out);
+const csplat_error *csplat_last_error(const csplat *file);
+
+/* All splats, in arrays of their own, which csplat_free_scene releases. With sh_degree below the file's, higher bands are
+ * neither read nor checked; otherwise all of the file is, as the specification asks of exact decoders. */
+csplat_code csplat_decode(csplat *file, unsigned sh_degree, csplat_scene **out);
+void csplat_free_scene(csplat *file, csplat_scene *scene);
+
+/* One tile with its SH bands up to a degree, which may be above the file's: those are 0. */
+csplat_code csplat_read_tile(csplat *file, uint32_t tile, unsigned sh_degree, const csplat_floats *out);
+/* One SH band, [n][2 * band + 1][3]; 0 where the tile leaves it out. */
+csplat_code csplat_read_band(csplat *file, uint32_t tile, unsigned band, float *out);
+/* Extra columns: out[i], unless it is NULL, gets the values of column i. */
+csplat_code csplat_read_extras(csplat *file, uint32_t tile, void *const *out);
+csplat_code csplat_read_integers(csplat *file, uint32_t tile, const csplat_integers *out);
+
+csplat_code csplat_read_packed(csplat *file, uint32_t tile, csplat_packed_geometry *out);
+/* columns.count and index are 0 where the tile leaves the band out. */
+csplat_code csplat_read_packed_band(csplat *file, uint32_t tile, unsigned band, csplat_packed *out);
+/* A band of a codebook: its entries, and one row of zeros behind them, for splats that have no entry. */
+csplat_code csplat_read_packed_codebook(csplat *file, uint16_t id, unsigned band, csplat_columns *out);
+
+/* A text in JSON, checked by section 5.4; it holds until the next text is read. NULL where the file has none. */
+csplat_code csplat_read_text(csplat *file, csplat_text which, const char **text, size_t *size);
+/* *found is 0 where the file states none. */
+csplat_code csplat_read_stated_errors(csplat *file, csplat_stated_errors *out, int *found);
+
+/* Check all that no tile needs: CRCs of chunks and layers that are skipped, codebooks, texts, stated errors. */
+csplat_code csplat_check(csplat *file);
+
+/* "E_CRC" */
+const char *csplat_code_name(csplat_code code);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,294 @@
+/* The C decoder behind the protocol of the conformance suite (conformance/IMPLEMENTERS.md):
+ *
+ *     csplat conformance decoder --cmd 'csplat_adapter {input} {outdir}'
+ *
+ * Without arguments it takes them from standard input, line by line in turn, and answers each pair with a line of JSON, {}
+ * where the file was decoded: so that tests need not start a process for each file.
+ *
+ * The file is decoded as a whole and tile by tile; from memory and through a callback; to floats, integers and packed
+ * arrays. Where two of these disagree the adapter ends with status 2. */
+#include "csplat.h"
+
+#include <ctype.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static const char *directory;
+static unsigned char *data;
+static size_t size;
+
+static void die(const char *what)
+{
+    fprintf(stderr, "%s\n", what);
+    exit(2);
+}
+
+static void *room(size_t count, size_t each)
+{
+    void *memory = calloc(count ? count : 1, each);
+    if (!memory)
+        die("no memory");
+    return memory;
+}
+
+static void refuse(const csplat_error *error)
+{
+    printf("{\"code\": \"%s\", \"clause\": \"%s\"", csplat_code_name(error->code), error->clause);
+    if (error->offset != CSPLAT_NO_OFFSET)
+        printf(", \"offset\": %llu", (unsigned long long)error->offset);
+    printf("}\n");
+}
+
+static FILE *create(const char *part, const char *name)
+{
+    char path[4096];
+    size_t at = (size_t)snprintf(path, sizeof path - 256, "%s/%s", directory, part);
+    FILE *file;
+    for (; *name && at < sizeof path - 8; name++)
+        if (isalnum((unsigned char)*name) || strchr("-._~", *name))
+            path[at++] = *name;
+        else
+            at += (size_t)snprintf(path + at, 4, "%%%02X", (unsigned char)*name);
+    strcpy(path + at, strcmp(part, "header") == 0 ? ".json" : ".bin");
+    if (!(file = fopen(path, "wb")))
+        die("cannot write");
+    return file;
+}
+
+static void put(const char *part, const char *name, const void *values, size_t bytes)
+{
+    FILE *file = create(part, name);
+    if (bytes && fwrite(values, 1, bytes, file) != bytes)
+        die("cannot write");
+    fclose(file);
+}
+
+static void put_header(const csplat_info *info)
+{
+    FILE *file = create("header", "");
+    fprintf(file, "{\"profile\": \"base\", \"splat_count\": %llu, \"tile_count\": %lu, \"sh_degree\": %u, ",
+            (unsigned long long)info->splat_count, (unsigned long)info->tile_count, info->sh_degree);
+    fprintf(file, "\"scene_flags\": [%s%s%s], ", info->antialiased ? "\"antialiased\"" : "",
+            info->antialiased && info->flat ? ", " : "", info->flat ? "\"flat\"" : "");
+    fprintf(file, "\"axes\": \"%s\", \"unit_metres\": %.17g, \"origin\": [%.17g, %.17g, %.17g]}\n", info->axes,
+            info->unit_metres, info->origin[0], info->origin[1], info->origin[2]);
+    fclose(file);
+}
+
+static int from_memory(void *user, uint64_t offset, size_t count, void *into)
+{
+    (void)user;
+    if (offset > size || count > size - offset)
+        return 0;
+    memcpy(into, data + offset, count);
+    return 1;
+}
+
+/* An integer of a packed attribute of splat i of a tile; `table` is its codebook, if it has one. */
+static int64_t packed_integer(const csplat_packed *p, const csplat_columns *table, size_t i, unsigned column, size_t *row)
+{
+    const csplat_columns *from = &p->columns;
+    size_t at = i, element;
+    if (p->index) {
+        at = p->index_width == 1   ? ((const uint8_t *)p->index)[i]
+             : p->index_width == 2 ? ((const uint16_t *)p->index)[i]
+                                   : ((const uint32_t *)p->index)[i];
+        from = table;
+    }
+    if (p->rows) {
+        int mine = *row < p->columns.count && p->rows[*row] == i;
+        if (!mine && !p->index)
+            return 0;
+        if (mine) {
+            at = *row;
+            from = &p->columns;
+        }
+    } else if (!p->index && p->columns.count == 0)
+        return 0;
+    element = (size_t)column * from->count + at;
+    return from->offset[column] + (int64_t)(from->width == 1   ? ((const uint8_t *)from->data)[element]
+                                            : from->width == 2 ? ((const uint16_t *)from->data)[element]
+                                                               : ((const uint32_t *)from->data)[element]);
+}
+
+/* Whether packed values are the integers [n][columns], colours of `coefficients`. */
+static void compare(const csplat_packed *p, const csplat_columns *table, size_t n, unsigned columns, unsigned coefficients,
+                    const int64_t *integers)
+{
+    size_t row = 0;
+    for (size_t i = 0; i < n; i++) {
+        for (unsigned k = 0; k < columns; k++)
+            if (packed_integer(p, table, i, k, &row) != integers[i * columns + k % coefficients * 3 + k / coefficients])
+                die("the packed form differs from the integers");
+        row += p->rows && row < p->columns.count && p->rows[row] == i;
+    }
+}
+
+static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degree, const csplat_integers *integers)
+{
+    csplat_packed_geometry g;
+    if (csplat_read_packed(file, tile, &g))
+        die("the packed form is refused");
+    compare(&g.scales, NULL, n, 3, 1, integers->scales);
+    compare(&g.means, NULL, n, 3, 1, integers->means);
+    compare(&g.sh0, NULL, n, 3, 1, integers->sh0);
+    for (unsigned band = 1; band <= degree; band++) {
+        csplat_packed p;
+        csplat_columns table = {0};
+        if (csplat_read_packed_band(file, tile, band, &p))
+            die("a packed band is refused");
+        if (p.index && csplat_read_packed_codebook(file, p.codebook, band, &table))
+            die("a packed codebook is refused");
+        compare(&p, &table, n, 3 * (2 * band + 1), 2 * band + 1, integers->sh[band - 1]);
+    }
+}
+
+/* Whether a tile by itself, through a callback, has the values that it has in the whole scene. */
+static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, const csplat_scene *scene)
+{
+    const size_t n = t->splat_count, k = ((size_t)scene->sh_degree + 1) * (scene->sh_degree + 1) - 1, first = (size_t)t->first;
+    float *means = room(n, 12), *shN = room(n, 12 * (k ? k : 1)), *band = room(n, 84);
+    csplat_floats out = {0};
+    out.means = means;
+    out.shN = shN;
+    if (csplat_read_tile(file, tile, scene->sh_degree, &out) || memcmp(means, scene->values.means + 3 * first, 12 * n) ||
+        memcmp(shN, scene->values.shN + 3 * k * first, 12 * k * n))
+        die("a tile differs from the whole");
+    for (unsigned l = scene->sh_degree; l >= 1; l--) {
+        if (csplat_read_band(file, tile, l, band))
+            die("a band is refused");
+        for (size_t i = 0; i < n; i++)
+            if (memcmp(band + i * 3 * (2 * l + 1), shN + 3 * (i * k + l * l - 1), 12 * (2 * (size_t)l + 1)))
+                die("a band differs from the whole");
+    }
+    free(means);
+    free(shN);
+    free(band);
+}
+
+/* Write all arrays of a decoded file. */
+static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
+{
+    csplat_integers all = {0};
+    uint32_t *tile_splats;
+    const csplat_info *info;
+    size_t n, records;
+    info = csplat_get_info(file);
+    n = (size_t)info->splat_count;
+    records = 5 + (size_t)info->sh_degree;
+    tile_splats = room(info->tile_count, 4);
+    all.opacities = room(n, 4);
+    all.scales = room(n, 24);
+    all.quats = room(n, 12);
+    all.means = room(n, 24);
+    all.sh0 = room(n, 24);
+    all.exponents = room(info->tile_count * records, 4);
+    for (unsigned band = 1; band <= 3; band++)
+        all.sh[band - 1] = room(band <= info->sh_degree ? n : 0, 24 * (2 * (size_t)band + 1));
+    for (uint32_t i = 0; i < info->tile_count; i++) {
+        csplat_integers part = all;
+        csplat_tile t;
+        size_t first;
+        csplat_get_tile(file, i, &t);
+        first = (size_t)t.first;
+        tile_splats[i] = t.splat_count;
+        part.opacities += first;
+        part.scales += 3 * first;
+        part.quats += 3 * first;
+        part.means += 3 * first;
+        part.sh0 += 3 * first;
+        part.exponents += i * records;
+        for (unsigned band = 1; band <= info->sh_degree; band++)
+            part.sh[band - 1] += 3 * (2 * band + 1) * first;
+        if (csplat_read_integers(file, i, &part))
+            die("integers are refused");
+        compare_packed(other, i, t.splat_count, info->sh_degree, &part);
+        compare_floats(other, i, &t, scene);
+    }
+    put_header(info);
+    put("integers.", "opacities", all.opacities, 4 * n);
+    put("integers.", "scales", all.scales, 24 * n);
+    put("integers.", "quats", all.quats, 12 * n);
+    put("integers.", "means", all.means, 24 * n);
+    put("integers.", "sh0", all.sh0, 24 * n);
+    for (unsigned band = 1; band <= info->sh_degree; band++) {
+        const char name[] = {'s', 'h', (char)('0' + band), 0};
+        put("integers.", name, all.sh[band - 1], 24 * (2 * (size_t)band + 1) * n);
+    }
+    put("integers.", "tile_splats", tile_splats, 4 * (size_t)info->tile_count);
+    put("integers.", "exponents", all.exponents, 4 * info->tile_count * records);
+    put("floats.", "means", scene->values.means, 12 * n);
+    put("floats.", "quats", scene->values.quats, 16 * n);
+    put("floats.", "scales", scene->values.scales, 12 * n);
+    put("floats.", "opacities", scene->values.opacities, 4 * n);
+    put("floats.", "sh0", scene->values.sh0, 12 * n);
+    put("floats.", "shN", scene->values.shN, 12 * n * (records - 5 + 1) * (records - 5 + 1) - 12 * n);
+    for (uint32_t i = 0; i < info->extra_count; i++)
+        if (scene->extras[i])
+            put("extra.", info->extras[i].name, scene->extras[i], n * info->extras[i].bytes);
+    free(all.opacities);
+    free(all.scales);
+    free(all.quats);
+    free(all.means);
+    free(all.sh0);
+    free(all.exponents);
+    for (int band = 0; band < 3; band++)
+        free(all.sh[band]);
+    free(tile_splats);
+}
+
+/* Decode a file of a path; 1 where it was refused. */
+static int answer(const char *path)
+{
+    csplat_source source = {from_memory, NULL, 0};
+    csplat *file, *other;
+    csplat_scene *scene = NULL;
+    csplat_error error;
+    int refused = 1;
+    FILE *input = fopen(path, "rb");
+    if (!input)
+        die("cannot open");
+    fseek(input, 0, SEEK_END);
+    source.size = size = (size_t)ftell(input);
+    rewind(input);
+    data = room(size, 1);
+    if (fread(data, 1, size, input) != size)
+        die("cannot read");
+    fclose(input);
+    if (csplat_open_memory(&file, data, size, NULL, &error))
+        refuse(&error);
+    else if (csplat_decode(file, 3, &scene))
+        refuse(csplat_last_error(file));
+    else {
+        if (csplat_open(&other, &source, NULL, &error))
+            die("through a callback it is refused");
+        put_all(file, other, scene);
+        csplat_close(other);
+        refused = 0;
+    }
+    if (file)
+        csplat_free_scene(file, scene);
+    csplat_close(file);
+    free(data);
+    return refused;
+}
+
+int main(int count, char **arguments)
+{
+    static char path[4096], folder[4096];
+    if (count == 3) {
+        directory = arguments[2];
+        return answer(arguments[1]);
+    }
+    if (count != 1)
+        die("usage: csplat_adapter [INPUT OUTDIR]");
+    directory = folder;
+    while (fgets(path, sizeof path, stdin) && fgets(folder, sizeof folder, stdin)) {
+        path[strcspn(path, "\n")] = folder[strcspn(folder, "\n")] = '\0';
+        if (!answer(path))
+            puts("{}");
+        fflush(stdout);
+    }
+    return 0;
+}

@@ -1,0 +1,103 @@
+"""The decoder in C: it compiles without a warning, reads and refuses what the vectors say, and its example runs."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from chromium import absent
+
+import csplat_conformance
+from csplat_conformance import protocol
+from csplat_conformance.process import Ended
+from csplat_conformance.runner import Choice, run_command
+
+ROOT = Path(__file__).resolve().parent.parent
+C = ROOT / "codec" / "c"
+VECTORS = Path(csplat_conformance.__file__).parent / "vectors"
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+COMPILER = shutil.which("cc")
+SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiler():
+    if COMPILER is None or run([COMPILER, "-E", "-include", "zlib.h", "-"], input="").returncode:
+        absent("there is no C compiler, cc, or no zlib.h")
+
+
+def run(command, **options):
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def compiled(folder, name, *arguments):
+    """Compile for a program; its path."""
+    program = folder / name
+    command = [COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(program), "-lz", "-lm"]
+    made = run(command)
+    assert (made.returncode, made.stderr) == (0, "")
+    return program
+
+
+@pytest.fixture(scope="module")
+def adapter(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("c")
+    return compiled(folder, "adapter", *SANITIZED, C / "csplat.c", C / "tools" / "adapter.c")
+
+
+@pytest.fixture
+def asked(adapter, monkeypatch):
+    """One process for all files: the runner starts one for each, and starting the sanitizers takes most of the time."""
+    with subprocess.Popen([str(adapter)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+
+        def run_program(_command, places, _timeout, **_):
+            process.stdin.write(f"{places['input']}\n{places['outdir']}\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+            assert line, f"the adapter ended at {places['input']}: status {process.wait()}"
+            return Ended(None, line != "{}\n", line.encode(), b"", 0.0)
+
+        monkeypatch.setattr(protocol, "run_program", run_program)
+        yield
+        process.stdin.close()
+        assert process.wait() == 0  # AddressSanitizer found no leak
+
+
+@pytest.mark.usefixtures("asked")
+def test_passes_the_conformance_suite_under_sanitizers():
+    report = run_command("adapter {input} {outdir}", Choice(jobs=1))
+    assert report.failures == []
+    assert len(report.outcomes) > 1000
+    assert not [note for note in report.notes if "unread" in note]
+
+
+def test_the_example_tells_what_is_in_a_file(tmp_path):
+    example = compiled(tmp_path, "example", C / "csplat.c", C / "example.c")
+    told = subprocess.run(
+        [example, VECTORS / "valid" / "worked_example.csplat"], capture_output=True, text=True, check=True
+    )
+    assert '2 splats, SH degree 1, 1 tile, axes RDF\n{"title":"two"}\n' in told.stdout
+    refused = run([example, VECTORS / "invalid" / "chunk_crc.csplat"])
+    assert (refused.returncode, refused.stderr.split(" at byte")[0]) == (1, "E_CRC")
+
+
+def test_the_sample_of_the_guide_decodes(tmp_path):
+    sample = (ROOT / "codec" / "EMBEDDING.md").read_text(encoding="utf-8").split("```c\n")[1].split("```")[0]
+    source = tmp_path / "sample.c"
+    source.write_text(
+        '#include "csplat.h"\n#include <stdio.h>\n'
+        "static float means[196608], quats[262144], scales[196608], opacities[65536], sh0[196608], shN[2949120];\n"
+        "static int fail(const char *message)\n{\n    return puts(message);\n}\n"
+        "int main(void)\n{\nstatic char data[4096];\nsize_t size = fread(data, 1, sizeof data, stdin);\n"
+        f'{sample}return printf("%g %g", (double)quats[0], (double)shN[0]) != 3;\n}}\n',
+        encoding="utf-8",
+    )
+    program = compiled(tmp_path, "sample", C / "csplat.c", source)
+    with (VECTORS / "valid" / "worked_example.csplat").open("rb") as file:
+        assert run([program], stdin=file).stdout == "1 1"
+
+
+def test_compiles_without_zlib(tmp_path):
+    compiled(tmp_path, "csplat.o", "-c", "-DCSPLAT_NO_ZLIB", C / "csplat.c")
