@@ -6,13 +6,14 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; 
 VENV := .venv
 BIN := $(VENV)/bin
 BENCH := $(BIN)/python -m csplat_bench
+CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format spec sample docs bench fuzz clean
+.PHONY: help demo test lint format spec sample docs bench fuzz fuzz-c clean
 
 help: ## this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
 
 demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
 	@mkdir -p out
@@ -67,6 +68,13 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400
+
+fuzz-c: ## ten minutes of the same for the decoder in C; needs clang
+	@mkdir -p out/fuzz/c/corpus
+	$(CLANG) -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all codec/c/fuzz/fuzz.c \
+		-lz -lm -o out/fuzz/c/fuzz
+	out/fuzz/c/fuzz -max_total_time=600 -max_len=8000 -timeout=10 -artifact_prefix=out/fuzz/c/ out/fuzz/c/corpus \
+		$(wildcard conformance/csplat_conformance/vectors/*/)
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \

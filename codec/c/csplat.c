@@ -305,6 +305,7 @@ typedef struct book {
     uint32_t size;
     const chunk *chunks[3]; /* by SH band from the first on; of other kinds the first one */
     int32_t *tables[3];     /* [size][columns], colours as [coefficient][r, g, b]; NULL until they are read */
+    float *values[3];       /* the same of SH bands, in the memory behind tables */
 } book;
 
 typedef struct tile {
@@ -343,6 +344,7 @@ typedef struct block {
     uint32_t count;
     const book *book; /* where the other splats have their integers; NULL: they are 0 */
     const int32_t *table;
+    const float *values; /* of the table, of SH bands */
     const uint32_t *index;
     int exponent;
     double step; /* step x 2^exponent */
@@ -1618,7 +1620,7 @@ static int read_table(csplat *d, book *b, unsigned slot)
     TRY(reserve(d, &d->entries, s.count, sizeof *entries));
     entries = d->entries.data;
     undo_signed(&s, entries);
-    TRY(rows = allocate(d, s.count, sizeof *rows));
+    TRY(rows = allocate(d, s.count, is_sh_book(b) ? sizeof *rows + sizeof(float) : sizeof *rows));
     if (b->kind == SPEC_CODEBOOK_KIND_SHAPE) {
         for (size_t i = 0; i < b->size; i++)
             for (unsigned column = 0; column < 3; column++)
@@ -1633,6 +1635,13 @@ static int read_table(csplat *d, book *b, unsigned slot)
     if (!filled) {
         release(d, rows);
         return 0;
+    }
+    if (is_sh_book(b)) {
+        const float step = (float)d->attributes[SH0 + b->band_first + slot].step;
+        float *values = (float *)(void *)(rows + s.count);
+        for (uint32_t i = 0; i < s.count; i++)
+            values[i] = (float)rows[i] * step;
+        b->values[slot] = values;
     }
     b->tables[slot] = rows;
     d->table_bytes += bytes;
@@ -1889,7 +1898,7 @@ static int expand(csplat *d, unsigned id, uint32_t n, unsigned stride, const uin
     TRY(reserve(d, &d->integers, 3 * (uint64_t)n, sizeof *out));
     out = d->integers.data;
     for (unsigned k = 0; k < 3; k++, out += n) {
-        const int32_t *escape = b->columns + (size_t)k * b->count;
+        const int32_t *escape = b->count ? b->columns + (size_t)k * b->count : NULL;
         for (uint32_t i = 0; i < n; i++) {
             if (b->index[i] == size)
                 out[i] = *escape++;
@@ -1953,6 +1962,7 @@ static int read_codebook_block(csplat *d, cursor *c, const tile *t, unsigned id,
     b->index = d->indices[first].data;
     stride = columns_of_book(k, is_sh_book(k) ? id - SH0 - k->band_first : 0);
     b->table = k->tables[is_sh_book(k) ? id - SH0 - k->band_first : 0] + (stride == 6 && id == QUATS ? 3 : 0);
+    b->values = k->values[is_sh_book(k) ? id - SH0 - k->band_first : 0];
     if (id <= SH0)
         return expand(d, id, n, stride, summed ? d->summands.data : NULL, offset, b, at);
     if (escape_count) {
@@ -2043,20 +2053,27 @@ static void put_lattice(const block *b, unsigned coefficients, float *out, size_
     }
 }
 
+/* Rows of a codebook, of a number of columns that the compiler knows. */
+static inline void put_entries(const block *b, size_t n, unsigned columns, float *out, size_t stride)
+{
+    const uint32_t size = b->book->size;
+    for (size_t i = 0; i < n; i++, out += stride)
+        if (b->index[i] < size)
+            memcpy(out, b->values + (size_t)b->index[i] * columns, columns * sizeof *out);
+}
+
 static void put_band(const block *b, unsigned band, size_t n, float *out, size_t stride)
 {
-    const unsigned coefficients = 2 * band + 1, columns = 3 * coefficients;
-    const float step = (float)b->step;
-    if (b->index)
-        for (size_t i = 0; i < n; i++) {
-            const int32_t *row = b->table + (size_t)b->index[i] * columns;
-            if (b->index[i] < b->book->size)
-                for (unsigned k = 0; k < columns; k++)
-                    out[i * stride + k] = (float)row[k] * step;
-        }
+    const unsigned coefficients = 2 * band + 1;
+    if (b->index && band == 1)
+        put_entries(b, n, 9, out, stride);
+    else if (b->index && band == 2)
+        put_entries(b, n, 15, out, stride);
+    else if (b->index)
+        put_entries(b, n, 21, out, stride);
     else if (b->rows || !b->count)
         for (size_t i = 0; i < n; i++)
-            for (unsigned k = 0; k < columns; k++)
+            for (unsigned k = 0; k < 3 * coefficients; k++)
                 out[i * stride + k] = 0;
     if (b->count)
         put_lattice(b, coefficients, out, stride);
@@ -2107,9 +2124,9 @@ static int pack(csplat *d, buffer *into, const int32_t *columns, size_t n, unsig
     out->step = step;
     for (unsigned k = 0; k < count; k++) {
         int32_t low = rest || !n ? 0 : columns[k * n], high = low;
-        for (size_t i = 0; i < n; i++) {
-            low = columns[k * n + i] < low ? columns[k * n + i] : low;
-            high = columns[k * n + i] > high ? columns[k * n + i] : high;
+        for (size_t i = k * n; i < (k + 1) * n; i++) {
+            low = columns[i] < low ? columns[i] : low;
+            high = columns[i] > high ? columns[i] : high;
         }
         least[k] = low;
         out->offset[k] = low;
@@ -2120,7 +2137,8 @@ static int pack(csplat *d, buffer *into, const int32_t *columns, size_t n, unsig
     out->data = at = into->data;
     for (unsigned k = 0; k < count; k++) {
         const int32_t zero = 0;
-        narrow_into(columns + k * n, n, least[k], out->width, at);
+        if (n)
+            narrow_into(columns + k * n, n, least[k], out->width, at);
         at += n * out->width;
         for (unsigned i = 0; i < rest; i++, at += out->width)
             narrow_into(&zero, 1, least[k], out->width, at);
