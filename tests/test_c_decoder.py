@@ -35,21 +35,23 @@ def run(command, **options):
 def compiled(folder, name, *arguments):
     """Compile for a program; its path."""
     program = folder / name
-    command = [COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(program), "-lz", "-lm"]
+    libraries = () if "-c" in arguments else ("-lz", "-lm")
+    command = [COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(program), *libraries]
     made = run(command)
     assert (made.returncode, made.stderr) == (0, "")
     return program
 
 
 @pytest.fixture(scope="module")
-def adapter(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("c")
-    return compiled(folder, "adapter", *SANITIZED, C / "csplat.c", C / "tools" / "adapter.c")
+def decoder(tmp_path_factory):
+    """The decoder with sanitizers, which takes some seconds to compile."""
+    return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", *SANITIZED, C / "csplat.c")
 
 
 @pytest.fixture
-def asked(adapter, monkeypatch):
+def asked(decoder, tmp_path, monkeypatch):
     """One process for all files: the runner starts one for each, and starting the sanitizers takes most of the time."""
+    adapter = compiled(tmp_path, "adapter", *SANITIZED, decoder, C / "tools" / "adapter.c")
     with subprocess.Popen([str(adapter)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
 
         def run_program(_command, places, _timeout, **_):
@@ -71,6 +73,12 @@ def test_passes_the_conformance_suite_under_sanitizers():
     assert report.failures == []
     assert len(report.outcomes) > 1000
     assert not [note for note in report.notes if "unread" in note]
+
+
+def test_survives_callers_whose_functions_fail(decoder, tmp_path):
+    interface = compiled(tmp_path, "interface", *SANITIZED, decoder, C / "tools" / "interface.c")
+    ended = run([interface, VECTORS / "valid" / "rich.csplat"])
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_the_example_tells_what_is_in_a_file(tmp_path):

@@ -698,37 +698,46 @@ static void zlib_release(voidpf opaque, voidpf memory)
     d->options.release(d->options.user, memory);
 }
 
-static int zlib_inflate(csplat *d, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size)
+static int begin_zlib(csplat *d)
 {
     z_stream *z = &d->zlib;
-    int result;
-    if (!d->zlib_began) {
-        z->zalloc = zlib_allocate;
-        z->zfree = zlib_release;
-        z->opaque = d;
-        if (inflateInit2(z, -MAX_WBITS) != Z_OK)
-            return 0;
-        d->zlib_began = 1;
-    } else if (inflateReset(z) != Z_OK)
-        return 0;
+    if (d->zlib_began)
+        return inflateReset(z) == Z_OK;
+    z->zalloc = zlib_allocate;
+    z->zfree = zlib_release;
+    z->opaque = d;
+    if (inflateInit2(z, -MAX_WBITS) != Z_OK)
+        return fail(d, CSPLAT_E_LIMIT, "LIM-1", CSPLAT_NO_OFFSET, "no memory for zlib");
+    return d->zlib_began = 1;
+}
+
+static int zlib_inflate(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size)
+{
+    z_stream *z = user;
     z->next_in = (z_const Bytef *)coded;
     z->avail_in = (uInt)coded_size;
     z->next_out = out;
     z->avail_out = (uInt)size;
-    result = inflate(z, Z_FINISH);
-    return result == Z_STREAM_END && z->avail_in == 0 && z->avail_out == 0;
+    return inflate(z, Z_FINISH) == Z_STREAM_END && z->avail_in == 0 && z->avail_out == 0;
 }
 #endif
 
-static int inflate_exactly(csplat *d, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size)
+/* Undo DEFLATE: `size` bytes into d->inflated. */
+static int undo_deflate(csplat *d, const uint8_t *coded, size_t coded_size, size_t size, uint64_t offset)
 {
-    if (d->options.inflate)
-        return d->options.inflate(d->options.user, coded, coded_size, out, size);
+    int (*by)(void *, const uint8_t *, size_t, uint8_t *, size_t) = d->options.inflate;
+    void *user = d->options.user;
+    TRY(reserve(d, &d->inflated, size, 1));
 #ifndef CSPLAT_NO_ZLIB
-    return zlib_inflate(d, coded, coded_size, out, size);
-#else
-    return 0; /* csplat_open refuses options without inflate */
+    if (!by) {
+        TRY(begin_zlib(d));
+        by = zlib_inflate;
+        user = &d->zlib;
+    }
 #endif
+    return by(user, coded, coded_size, d->inflated.data, size) ||
+           fail(d, CSPLAT_E_CODER, "COD-2", offset, "%llu bytes are no DEFLATE stream of %llu",
+                (unsigned long long)coded_size, (unsigned long long)size);
 }
 
 /* RUN_LENGTH: values, low bytes, high bytes of the lengths minus one. `out` has 16 bytes of room behind its end. */
@@ -807,10 +816,7 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
                         "%lu stored bytes, wanted %lu", (unsigned long)coded_size, (unsigned long)packed_size);
         s->bytes = coded;
     } else {
-        TRY(reserve(d, &d->inflated, packed_size, 1));
-        if (!inflate_exactly(d, coded, coded_size, d->inflated.data, packed_size))
-            return fail(d, CSPLAT_E_CODER, "COD-2", start + SPEC_STREAM_HEAD_SIZE,
-                        "%lu bytes are no DEFLATE stream of %lu", (unsigned long)coded_size, (unsigned long)packed_size);
+        TRY(undo_deflate(d, coded, coded_size, packed_size, start + SPEC_STREAM_HEAD_SIZE));
         s->bytes = d->inflated.data;
     }
     if (runs) {
@@ -1419,8 +1425,8 @@ static int read_index(csplat *d)
     TRY(count_layers(d, end, sizes[5], sizes[6], &layers));
     d->chunk_count = (size_t)(counts[3] + layers);
     TRY(d->books = allocate(d, counts[1], sizeof *d->books));
-    TRY(d->public_books = allocate(d, counts[1], sizeof *d->public_books));
     memset(d->books, 0, (size_t)counts[1] * sizeof *d->books);
+    TRY(d->public_books = allocate(d, counts[1], sizeof *d->public_books));
     TRY(d->extras = allocate(d, counts[2], sizeof *d->extras));
     TRY(d->extra_names = allocate(d, counts[2], SPEC_EXTRA_NAME_MAX + 1));
     TRY(d->chunks = allocate(d, d->chunk_count, sizeof *d->chunks));

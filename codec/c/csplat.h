@@ -148,7 +148,7 @@ typedef struct csplat_integers {
 
 /* Quantised values in narrow arrays: an integer is offset[column] + element, a value float32(integer * step).
  * Opacities and quats have no step, see csplat_info. Colours are R, G, B; column channel * (2l + 1) + m of an SH
- * band holds coefficient m. The pointers hold until the next call with the csplat. */
+ * band holds coefficient m. The pointers hold until anything but a codebook is read. */
 typedef struct csplat_columns {
     const void *data;       /* u8, u16 or u32: all elements of column 0, then of column 1, ... */
     unsigned width;         /* bytes of an element: 1, 2, 4 */
