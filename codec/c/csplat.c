@@ -375,6 +375,7 @@ struct csplat {
     const chunk *texts[3], *stated;
     buffer index_bytes, chunk_bytes, book_bytes;   /* of the source, where it is not in memory */
     buffer inflated, unrun, integers, entries, escapes, summands, rows, codes; /* working memory */
+    buffer band_integers[SPEC_SH_DEGREE_MAX + 1], band_rows[SPEC_SH_DEGREE_MAX + 1];
     buffer indices[ATTRIBUTES_END], narrow[ATTRIBUTES_END], narrow_index, text, names;
     const uint8_t *index;
     size_t index_size;
@@ -2040,49 +2041,63 @@ static void put_means(const tile *t, const int32_t *q, size_t n, float *out)
     }
 }
 
-/* Rows of lattice values: [rows][3 * coefficients], `stride` floats from one to the next. Single precision is exact (7.2). */
-static void put_lattice(const block *b, unsigned coefficients, float *out, size_t stride)
+/* Lattice values of rows `from` to `to` of the columns, where the block has them, or those splats. Single precision is exact (7.2). */
+static void put_columns(const block *b, unsigned coefficients, size_t from, size_t to, float *out, size_t stride)
 {
     const float step = (float)b->step;
     const size_t n = b->count;
-    for (size_t from = 0; from < n; from += PIECE) {
-        const size_t to = from + PIECE < n ? from + PIECE : n;
-        for (unsigned k = 0; k < coefficients; k++) {
-            const int32_t *r = b->columns + k * n, *g = r + coefficients * n, *bl = g + coefficients * n;
-            for (size_t i = from; i < to; i++) {
-                float *p = out + (b->rows ? b->rows[i] : i) * stride + 3 * k;
-                p[0] = (float)r[i] * step;
-                p[1] = (float)g[i] * step;
-                p[2] = (float)bl[i] * step;
-            }
+    for (unsigned k = 0; k < coefficients; k++) {
+        const int32_t *red = b->columns + k * n, *green = red + coefficients * n, *blue = green + coefficients * n;
+        for (size_t i = from; i < to; i++) {
+            float *p = out + (b->rows ? b->rows[i] : i) * stride + 3 * k;
+            p[0] = (float)red[i] * step;
+            p[1] = (float)green[i] * step;
+            p[2] = (float)blue[i] * step;
         }
     }
 }
 
 /* Rows of a codebook, of a number of columns that the compiler knows. */
-static inline void put_entries(const block *b, size_t n, unsigned columns, float *out, size_t stride)
+static inline void put_entries(const block *b, size_t from, size_t to, unsigned columns, float *out, size_t stride)
 {
     const uint32_t size = b->book->size;
-    for (size_t i = 0; i < n; i++, out += stride)
+    for (size_t i = from; i < to; i++)
         if (b->index[i] < size)
-            memcpy(out, b->values + (size_t)b->index[i] * columns, columns * sizeof *out);
+            memcpy(out + i * stride, b->values + (size_t)b->index[i] * columns, columns * sizeof *out);
 }
 
-static void put_band(const block *b, unsigned band, size_t n, float *out, size_t stride)
+static unsigned coefficients_of(unsigned degree)
 {
-    const unsigned coefficients = 2 * band + 1;
-    if (b->index && band == 1)
-        put_entries(b, n, 9, out, stride);
-    else if (b->index && band == 2)
-        put_entries(b, n, 15, out, stride);
-    else if (b->index)
-        put_entries(b, n, 21, out, stride);
-    else if (b->rows || !b->count)
-        for (size_t i = 0; i < n; i++)
-            for (unsigned k = 0; k < 3 * coefficients; k++)
-                out[i * stride + k] = 0;
-    if (b->count)
-        put_lattice(b, coefficients, out, stride);
+    return (degree + 1) * (degree + 1) - 1;
+}
+
+/* SH bands `first` to `last` of a tile, [n] rows `stride` floats apart: all bands of a few splats, then of the next. */
+static void put_bands(const block *b, unsigned first, unsigned last, size_t n, float *out, size_t stride)
+{
+    size_t row[SPEC_SH_DEGREE_MAX + 1] = {0}; /* of rows that the columns are about */
+    for (size_t from = 0; from < n; from += PIECE) {
+        const size_t to = from + PIECE < n ? from + PIECE : n;
+        for (unsigned band = first; band <= last; band++) {
+            const block *k = &b[band];
+            float *at = out + 3 * (coefficients_of(band - 1) - coefficients_of(first - 1));
+            const size_t begin = row[band];
+            if (k->index && band == 1)
+                put_entries(k, from, to, 9, at, stride);
+            else if (k->index && band == 2)
+                put_entries(k, from, to, 15, at, stride);
+            else if (k->index)
+                put_entries(k, from, to, 21, at, stride);
+            else if (k->rows || !k->count)
+                for (size_t i = from; i < to; i++)
+                    memset(at + i * stride, 0, 3 * (2 * (size_t)band + 1) * sizeof *at); /* +0 */
+            while (k->rows && row[band] < k->count && k->rows[row[band]] < to)
+                row[band]++;
+            if (k->rows)
+                put_columns(k, 2 * band + 1, begin, row[band], at, stride);
+            else if (k->count)
+                put_columns(k, 2 * band + 1, from, to, at, stride);
+        }
+    }
 }
 
 static void put_integers(const block *b, unsigned columns, size_t n, int64_t *out)
@@ -2189,13 +2204,13 @@ static int put_floats(csplat *d, const tile *t, unsigned id, const block *b, con
     if (id == OPACITIES && out->opacities)
         put_opacities(d, b->columns, n, out->opacities);
     if (id == SCALES && out->scales)
-        put_lattice(b, 1, out->scales, 3);
+        put_columns(b, 1, 0, n, out->scales, 3);
     if (id == QUATS && out->quats)
         put_quats(d, b->columns, n, out->quats);
     if (id == MEANS && out->means)
         put_means(t, b->columns, n, out->means);
     if (id == SH0 && out->sh0)
-        put_lattice(b, 1, out->sh0, 3);
+        put_columns(b, 1, 0, n, out->sh0, 3);
     return 1;
 }
 
@@ -2819,6 +2834,10 @@ void csplat_close(csplat *d)
 #endif
     for (size_t i = 0; i < sizeof all / sizeof *all; i++)
         release(d, all[i]->data);
+    for (size_t i = 0; i <= SPEC_SH_DEGREE_MAX; i++) {
+        release(d, d->band_integers[i].data);
+        release(d, d->band_rows[i].data);
+    }
     for (size_t i = 0; i < ATTRIBUTES_END; i++) {
         release(d, d->indices[i].data);
         release(d, d->narrow[i].data);
@@ -2874,23 +2893,30 @@ csplat_code csplat_get_tile(csplat *d, uint32_t index, csplat_tile *out)
     return CSPLAT_OK;
 }
 
-static unsigned coefficients_of(unsigned degree)
+static void swap(buffer *a, buffer *b)
 {
-    return (degree + 1) * (degree + 1) - 1;
+    const buffer kept = *a;
+    *a = *b;
+    *b = kept;
 }
 
 static int read_tile_floats(csplat *d, const tile *t, unsigned degree, const csplat_floats *out)
 {
     const sink into = {out, NULL, NULL};
-    const size_t stride = 3 * (size_t)coefficients_of(degree);
+    block bands[SPEC_SH_DEGREE_MAX + 1];
     begin_tile(d);
     TRY(read_geometry(d, t, &into));
     for (unsigned band = 1; band <= degree; band++) {
-        block b;
-        TRY(read_band(d, t, band, &b));
-        if (out->shN)
-            put_band(&b, band, t->splat_count, out->shN + 3 * coefficients_of(band - 1), stride);
+        int worked;
+        swap(&d->integers, &d->band_integers[band]); /* what the block points to stays until all bands are here */
+        swap(&d->rows, &d->band_rows[band]);
+        worked = read_band(d, t, band, &bands[band]);
+        swap(&d->integers, &d->band_integers[band]);
+        swap(&d->rows, &d->band_rows[band]);
+        TRY(worked);
     }
+    if (out->shN)
+        put_bands(bands, 1, degree, t->splat_count, out->shN, 3 * (size_t)coefficients_of(degree));
     return 1;
 }
 
@@ -2905,12 +2931,12 @@ csplat_code csplat_read_tile(csplat *d, uint32_t index, unsigned degree, const c
 csplat_code csplat_read_band(csplat *d, uint32_t index, unsigned band, float *out)
 {
     const tile *t;
-    block b;
+    block bands[SPEC_SH_DEGREE_MAX + 1];
     if (band < 1 || band > SPEC_SH_DEGREE_MAX)
         return done(d, refuse(d, "an SH band that is not 1 to 3"));
-    if (!find_tile(d, index, &t) || !read_band_alone(d, t, band, &b))
+    if (!find_tile(d, index, &t) || !read_band_alone(d, t, band, &bands[band]))
         return d->error.code;
-    put_band(&b, band, t->splat_count, out, 3 * (2 * (size_t)band + 1));
+    put_bands(bands, band, band, t->splat_count, out, 3 * (2 * (size_t)band + 1));
     return CSPLAT_OK;
 }
 
