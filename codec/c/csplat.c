@@ -16,7 +16,7 @@
 #include <zlib.h>
 #endif
 
-#if FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1
+#if FLT_EVAL_METHOD < 0 || FLT_EVAL_METHOD == 2 || FLT_EVAL_METHOD > 64
 #error "csplat wants binary64 products rounded to binary64: compile with -msse2 -mfpmath=sse"
 #endif
 #ifdef __FAST_MATH__
@@ -830,8 +830,14 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
     return 1;
 }
 
-/* One element of `width` bytes; `step` is 1 in byte planes, so that `lane` leads from a byte to the next. */
-static uint32_t element32(const uint8_t *p, size_t lane, unsigned width)
+#if defined(__GNUC__) || defined(__clang__)
+#define INLINE static inline __attribute__((always_inline))
+#else
+#define INLINE static inline
+#endif
+
+/* One element of `width` bytes, `lane` bytes from each to the next. */
+INLINE uint32_t element32(const uint8_t *p, size_t lane, unsigned width)
 {
     uint32_t x = p[0];
     if (width > 1)
@@ -843,59 +849,62 @@ static uint32_t element32(const uint8_t *p, size_t lane, unsigned width)
     return x;
 }
 
-static void gather32(const uint8_t *p, size_t step, size_t lane, unsigned width, size_t n, uint32_t *out)
+/* All elements of a stream; written out for each width and set of transforms, which the compiler knows then. */
+INLINE void undo_all(const stream *s, unsigned width, int zigzag, int delta, int is_signed, uint32_t *out)
 {
-    for (size_t i = 0; i < n; i++)
-        out[i] = element32(p + i * step, lane, width);
+    const size_t n = s->count, step = s->planes ? 1 : width, lane = s->planes ? n : 1;
+    const uint32_t mask = UINT32_C(0xFFFFFFFF) >> (32 - 8 * width), sign = UINT32_C(0x80000000) >> (32 - 8 * width);
+    const uint8_t *p = s->bytes;
+    uint32_t last = 0;
+    for (size_t i = 0; i < n; i++) {
+        uint32_t x = element32(p + i * step, lane, width);
+        if (zigzag)
+            x = (x >> 1) ^ (0 - (x & 1));
+        if (delta)
+            x = last += x;
+        x &= mask;
+        out[i] = is_signed ? (x ^ sign) - sign : x;
+    }
 }
 
-/* The elements of a stream of at most four bytes, modulo 2^32: what lies above 8 * width bits means nothing. */
-static void undo32(const stream *s, uint32_t *out)
+INLINE void undo_of_width(const stream *s, unsigned width, int is_signed, uint32_t *out)
 {
-    size_t n = s->count, step = s->planes ? 1 : s->width, lane = s->planes ? n : 1;
-    uint32_t last = 0;
+    if (s->zigzag && s->delta)
+        undo_all(s, width, 1, 1, is_signed, out);
+    else if (s->zigzag)
+        undo_all(s, width, 1, 0, is_signed, out);
+    else if (s->delta)
+        undo_all(s, width, 0, 1, is_signed, out);
+    else
+        undo_all(s, width, 0, 0, is_signed, out);
+}
+
+/* The elements of a stream of at most four bytes. */
+INLINE void undo32(const stream *s, int is_signed, uint32_t *out)
+{
     switch (s->width) {
     case 1:
-        gather32(s->bytes, 1, 1, 1, n, out);
+        undo_of_width(s, 1, is_signed, out);
         break;
     case 2:
-        gather32(s->bytes, step, lane, 2, n, out);
+        undo_of_width(s, 2, is_signed, out);
         break;
     case 3:
-        gather32(s->bytes, step, lane, 3, n, out);
+        undo_of_width(s, 3, is_signed, out);
         break;
     default:
-        gather32(s->bytes, step, lane, 4, n, out);
+        undo_of_width(s, 4, is_signed, out);
     }
-    if (s->zigzag && s->delta)
-        for (size_t i = 0; i < n; i++)
-            out[i] = last += (out[i] >> 1) ^ (0 - (out[i] & 1));
-    else if (s->zigzag)
-        for (size_t i = 0; i < n; i++)
-            out[i] = (out[i] >> 1) ^ (0 - (out[i] & 1));
-    else if (s->delta)
-        for (size_t i = 0; i < n; i++)
-            out[i] = last += out[i];
 }
 
 static void undo_unsigned(const stream *s, uint32_t *out)
 {
-    undo32(s, out);
-    if (s->width < 4 && (s->zigzag || s->delta)) {
-        uint32_t mask = (UINT32_C(1) << 8 * s->width) - 1;
-        for (size_t i = 0; i < s->count; i++)
-            out[i] &= mask;
-    }
+    undo32(s, 0, out);
 }
 
 static void undo_signed(const stream *s, int32_t *out)
 {
-    uint32_t *bits = (uint32_t *)out;
-    unsigned unused = 32 - 8 * s->width;
-    uint32_t sign = UINT32_C(0x80000000) >> unused, mask = UINT32_C(0xFFFFFFFF) >> unused;
-    undo32(s, bits);
-    for (size_t i = 0; i < s->count; i++)
-        out[i] = signed32(((bits[i] & mask) ^ sign) - sign);
+    undo32(s, 1, (uint32_t *)out); /* two's complement, as all int32_t are */
 }
 
 static void undo64(const stream *s, uint64_t *out)
