@@ -478,11 +478,12 @@ static void note(csplat *d, csplat_code code, const char *clause, uint64_t offse
     e->code = code;
     e->clause = clause;
     e->offset = offset;
-    if (offset == CSPLAT_NO_OFFSET)
-        snprintf(e->message, sizeof e->message, "%s (%s): ", csplat_code_name(code), clause);
-    else
-        snprintf(e->message, sizeof e->message, "%s at byte %llu (%s): ", csplat_code_name(code),
-                 (unsigned long long)offset, clause);
+    snprintf(e->message, sizeof e->message, "%s", csplat_code_name(code));
+    used = strlen(e->message);
+    if (offset != CSPLAT_NO_OFFSET)
+        snprintf(e->message + used, sizeof e->message - used, " at byte %llu", (unsigned long long)offset);
+    used = strlen(e->message);
+    snprintf(e->message + used, sizeof e->message - used, *clause ? " (%s): " : "%s: ", clause);
     used = strlen(e->message);
     va_start(arguments, format);
     vsnprintf(e->message + used, sizeof e->message - used, format, arguments);
@@ -1103,7 +1104,8 @@ static int read_book(csplat *d, unsigned i, const uint8_t *p, uint64_t at)
     TRY(reserved(d, p + SPEC_CODEBOOK_RECORD_AT_RESERVED_1, 2, at + SPEC_CODEBOOK_RECORD_AT_RESERVED_1));
     if (i > 0 && b->id <= b[-1].id)
         return fail(d, CSPLAT_E_INDEX, "CBR-1", at, "codebook_id %u does not ascend", b->id);
-    if (b->kind < SPEC_CODEBOOK_KIND_SCALES || b->kind > SPEC_CODEBOOK_KIND_SH)
+    if (b->kind != SPEC_CODEBOOK_KIND_SCALES && b->kind != SPEC_CODEBOOK_KIND_QUATS && b->kind != SPEC_CODEBOOK_KIND_SHAPE &&
+        b->kind != SPEC_CODEBOOK_KIND_SH0 && b->kind != SPEC_CODEBOOK_KIND_SH)
         return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at + SPEC_CODEBOOK_RECORD_AT_KIND, "codebooks of kind %u", b->kind);
     if (b->kind == SPEC_CODEBOOK_KIND_SH
             ? b->band_first < 1 || b->band_first > b->band_last || b->band_last > d->info.sh_degree
