@@ -95,10 +95,7 @@
 #define SPEC_CODING_CODEBOOK 6
 #define SPEC_CODING_RAW 7
 #define SPEC_CODING_SPARSE 8
-#define SPEC_CODEBOOK_KIND_SCALES 2
-#define SPEC_CODEBOOK_KIND_QUATS 3
 #define SPEC_CODEBOOK_KIND_SHAPE 4
-#define SPEC_CODEBOOK_KIND_SH0 5
 #define SPEC_CODEBOOK_KIND_SH 6
 #define SPEC_TRANSFORM_NONE 0
 #define SPEC_TRANSFORM_DELTA 1
@@ -1104,8 +1101,7 @@ static int read_book(csplat *d, unsigned i, const uint8_t *p, uint64_t at)
     TRY(reserved(d, p + SPEC_CODEBOOK_RECORD_AT_RESERVED_1, 2, at + SPEC_CODEBOOK_RECORD_AT_RESERVED_1));
     if (i > 0 && b->id <= b[-1].id)
         return fail(d, CSPLAT_E_INDEX, "CBR-1", at, "codebook_id %u does not ascend", b->id);
-    if (b->kind != SPEC_CODEBOOK_KIND_SCALES && b->kind != SPEC_CODEBOOK_KIND_QUATS && b->kind != SPEC_CODEBOOK_KIND_SHAPE &&
-        b->kind != SPEC_CODEBOOK_KIND_SH0 && b->kind != SPEC_CODEBOOK_KIND_SH)
+    if (b->kind != SPEC_CODEBOOK_KIND_SHAPE && b->kind != SPEC_CODEBOOK_KIND_SH)
         return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at + SPEC_CODEBOOK_RECORD_AT_KIND, "codebooks of kind %u", b->kind);
     if (b->kind == SPEC_CODEBOOK_KIND_SH
             ? b->band_first < 1 || b->band_first > b->band_last || b->band_last > d->info.sh_degree
@@ -1596,7 +1592,7 @@ static int read_lattice(csplat *d, cursor *c, unsigned id, unsigned coding, int 
 
 static unsigned columns_of_book(const book *b, unsigned slot)
 {
-    return b->kind == SPEC_CODEBOOK_KIND_SHAPE ? 6 : is_sh_book(b) ? columns_of(SH0 + b->band_first + slot) : 3;
+    return is_sh_book(b) ? columns_of(SH0 + b->band_first + slot) : 6;
 }
 
 /* Check the entries of an attribute, column by column, and put them into rows (CBK-7). */
@@ -1639,17 +1635,14 @@ static int read_table(csplat *d, book *b, unsigned slot)
     entries = d->entries.data;
     undo_signed(&s, entries);
     TRY(rows = allocate(d, s.count, is_sh_book(b) ? sizeof *rows + sizeof(float) : sizeof *rows));
-    if (b->kind == SPEC_CODEBOOK_KIND_SHAPE) {
+    if (is_sh_book(b))
+        filled = fill_table(d, SH0 + b->band_first + slot, entries, b->size, rows, columns, s.offset);
+    else {
         for (size_t i = 0; i < b->size; i++)
             for (unsigned column = 0; column < 3; column++)
                 rows[6 * i + column] = entries[column * b->size + i];
         filled = fill_table(d, QUATS, entries + 3 * (size_t)b->size, b->size, rows + 3, 6, s.offset);
-    } else
-        filled = fill_table(d, is_sh_book(b) ? SH0 + b->band_first + slot
-                               : b->kind == SPEC_CODEBOOK_KIND_SCALES ? SCALES
-                               : b->kind == SPEC_CODEBOOK_KIND_QUATS  ? QUATS
-                                                                      : SH0,
-                            entries, b->size, rows, columns, s.offset);
+    }
     if (!filled) {
         release(d, rows);
         return 0;
@@ -1679,8 +1672,9 @@ static int may_be_coded(unsigned id, unsigned coding)
     case SPEC_CODING_OFFSET:
         return id == SCALES || is_colour(id);
     case SPEC_CODING_SIGNED:
-    case SPEC_CODING_CODEBOOK:
         return id == SCALES || id == QUATS || is_colour(id);
+    case SPEC_CODING_CODEBOOK:
+        return id == SCALES || id == QUATS || id > SH0;
     case SPEC_CODING_SPARSE:
         return id > SH0;
     default:
@@ -1851,23 +1845,12 @@ static int is_listed(const tile *t, unsigned id)
 /* The attribute whose block has the indices of a codebook; `has` is whether the codebook is one of `id`. */
 static unsigned first_of(const book *b, unsigned id, int *has)
 {
-    switch (b->kind) {
-    case SPEC_CODEBOOK_KIND_SCALES:
-        *has = id == SCALES;
-        return SCALES;
-    case SPEC_CODEBOOK_KIND_QUATS:
-        *has = id == QUATS;
-        return QUATS;
-    case SPEC_CODEBOOK_KIND_SHAPE:
-        *has = id == SCALES || id == QUATS;
-        return SCALES;
-    case SPEC_CODEBOOK_KIND_SH0:
-        *has = id == SH0;
-        return SH0;
-    default:
+    if (is_sh_book(b)) {
         *has = id >= SH0 + (unsigned)b->band_first && id <= SH0 + (unsigned)b->band_last;
         return SH0 + b->band_first;
     }
+    *has = id == SCALES || id == QUATS;
+    return SCALES;
 }
 
 static int read_indices(csplat *d, cursor *c, const book *b, unsigned id, uint32_t n, uint32_t escape_count)
@@ -1947,7 +1930,7 @@ static int read_codebook_block(csplat *d, cursor *c, const tile *t, unsigned id,
     uint32_t escape_count;
     int32_t offset = 0;
     unsigned book_id, first, coding, stride;
-    int has = 0, summed;
+    int has = 0;
     book *k;
     TRY(take(d, c, SPEC_CODEBOOK_PARAMS_SIZE, &p));
     TRY(reserved(d, p + SPEC_CODEBOOK_PARAMS_AT_RESERVED_0, 2, at + SPEC_CODEBOOK_PARAMS_AT_RESERVED_0));
@@ -1965,24 +1948,23 @@ static int read_codebook_block(csplat *d, cursor *c, const tile *t, unsigned id,
     else if (d->used[first] != k || d->escapes_of[first] != escape_count)
         return fail(d, CSPLAT_E_CODEBOOK, "CBK-4", at, "no block of attribute %u has codebook %u and %lu escapes", first,
                     book_id, (unsigned long)escape_count);
-    summed = k->kind == SPEC_CODEBOOK_KIND_SHAPE && id == SCALES;
-    if (summed)
+    if (id == SCALES)
         TRY(read_summands(d, c, n, &offset));
     b->columns = NULL;
     b->count = 0;
     if (escape_count) {
         TRY(read_block_head(d, c, id, 1, &coding));
-        TRY(read_lattice(d, c, id, coding, 1, escape_count, is_colour(id) && id != SH0 ? &d->integers : &d->escapes, b));
+        TRY(read_lattice(d, c, id, coding, 1, escape_count, is_colour(id) ? &d->integers : &d->escapes, b));
     }
     b->exponent = 0;
     b->step = d->attributes[id].step;
     b->book = k;
     b->index = d->indices[first].data;
     stride = columns_of_book(k, is_sh_book(k) ? id - SH0 - k->band_first : 0);
-    b->table = k->tables[is_sh_book(k) ? id - SH0 - k->band_first : 0] + (stride == 6 && id == QUATS ? 3 : 0);
+    b->table = k->tables[is_sh_book(k) ? id - SH0 - k->band_first : 0] + (id == QUATS ? 3 : 0);
     b->values = k->values[is_sh_book(k) ? id - SH0 - k->band_first : 0];
-    if (id <= SH0)
-        return expand(d, id, n, stride, summed ? d->summands.data : NULL, offset, b, at);
+    if (!is_sh_book(k))
+        return expand(d, id, n, stride, id == SCALES ? d->summands.data : NULL, offset, b, at);
     if (escape_count) {
         uint32_t *rows, found = 0;
         TRY(reserve(d, &d->rows, escape_count, sizeof *rows));
