@@ -53,6 +53,8 @@ def _codebooks() -> list[Recipe]:
     large = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[1, 0, 0] * 3, [2**21, 0, 0] * 3]}, (1, 1), Stream(4))
     summed = {SCALES: replace(book(2, (0, 2, 1), summands=(0, 2**21, 0)), how=Stream(4))}
     shape = {SCALES: book(2, (0, 2, 1), summands=(2**22, 2**22, 2**22))}
+    small = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 1, -(2**22), 1, 2, 3]]}, how=Stream(4))
+    lower = {SCALES: book(1, (0, 0), summands=(-1, -1)), QUATS: book(1)}
     return [
         whole(
             "codebook_unlisted",
@@ -173,6 +175,18 @@ def _codebooks() -> list[Recipe]:
             "LAT-4 CBK-6",
             "E_RANGE",
             replace(tiled(shape), attributes=made.attributes | {SCALES: Attribute(0, 2.0**-30)}),
+            "TILE.0.0/scales.attribute",
+        ),
+        whole(
+            "codebook_summand_low",
+            "entry plus summand beyond -2^22, and no entry above 1",
+            "LAT-4 CBK-6",
+            "E_RANGE",
+            scene(
+                tiles=[tile(changes=lower)],
+                codebooks=(small,),
+                attributes=attributes(0) | {SCALES: Attribute(_spec.MAPPING_LATTICE, 2.0**-30)},
+            ),
             "TILE.0.0/scales.attribute",
         ),
     ]
