@@ -44,6 +44,13 @@ class Scene:
     format: str = ""
     levels: tuple[int, ...] = ()
 
+    def numbered(self) -> Iterator[tuple[slice, SplatModel]]:
+        """Each block, and which splats of the scene it has."""
+        start = 0
+        for block in self.blocks():
+            yield slice(start, start + len(block)), block
+            start += len(block)
+
     def model(self) -> SplatModel:
         """All of it in memory."""
         return joined(self.facts, list(self.blocks()))

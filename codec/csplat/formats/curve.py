@@ -25,7 +25,6 @@ I64 = NDArray[np.int64]
 
 _STEPS = 1 << 21  # of each axis
 _SAMPLE = 1 << 16  # splats that say where the curve runs
-_TAIL = 1e-3  # of them are left beyond either end of each axis: few that are far would take all the steps
 _IN_MEMORY = 1 << 24  # bytes that need no file
 
 
@@ -91,10 +90,10 @@ def _model(facts: SplatModel, rows: NDArray[Any]) -> SplatModel:
 
 @dataclass(frozen=True)
 class _Curve:
-    """A Z curve through most of a scene.
+    """A Z curve through a scene.
 
     Attributes:
-        low, high: [3], the ends of its axes; what lies beyond is on its border.
+        low, high: [3], the ends of its axes, those of a sample; what lies beyond is on its border.
         splits: codes that part the scene into about equal blocks.
     """
 
@@ -114,7 +113,7 @@ class _Curve:
             raise InputError(f"the scene has {at:,} splats, {scene.count:,} were announced")
         if not len(sample):
             return cls(np.zeros(3), np.ones(3), np.zeros(0, np.int64))
-        low, high = np.quantile(sample, [_TAIL, 1 - _TAIL], axis=0)
+        low, high = sample.min(0).astype(np.float64), sample.max(0).astype(np.float64)
         curve = cls(low, np.where(high > low, high, low + 1.0), np.zeros(0, np.int64))
         codes = np.sort(curve.codes(sample))
         blocks = -(-scene.count // BLOCK)

@@ -68,7 +68,7 @@ def write_sog(path: Path, scene: Scene) -> None:
 
 
 def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
-    """Each part, by name. Kept are the pixels, 4 bytes a splat in each of 5 or 6 pictures."""
+    """Each part, by name. Kept are 17 bytes of each splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
     height = max(1, math.ceil(count / width / 4)) * 4
@@ -96,7 +96,7 @@ def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
         return pixels.reshape(height, width, 4)
 
     codes = {name: np.empty((count, channels), np.uint8) for name, channels in _CHANNELS.items()}
-    for rows, model in _numbered(scene):
+    for rows, model in scene.numbered():
         places = np.rint((_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
         largest, three = smallest_three(model.quats)
         codes["means_l.webp"][rows], codes["means_u.webp"][rows] = places % 256, places // 256
@@ -120,20 +120,12 @@ def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
     yield "meta.json", json.dumps(meta, separators=(",", ":")).encode()
 
 
-def _numbered(scene: Scene) -> Iterator[tuple[slice, SplatModel]]:
-    """Each block, and which splats of the scene it has."""
-    start = 0
-    for model in scene.blocks():
-        yield slice(start, start + len(model)), model
-        start += len(model)
-
-
 def _sampled(scene: Scene) -> tuple[F64, F64, SplatModel]:
     """Bounds of the logarithms of all positions; and splats at equal steps along the curve, or all that are few."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     taken = []
-    for rows, model in _numbered(scene):
+    for rows, model in scene.numbered():
         logs = _logs(model.means)
         low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
         taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
@@ -233,7 +225,7 @@ def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8
     if len(labels) < scene.count:
         labels = np.concatenate([assign(points(model), entries, near_groups=_NEAR) for model in scene.blocks()])
     total, sums = np.zeros(len(entries)), np.zeros((3 * coefficients, len(entries)))
-    for rows, model in _numbered(scene):
+    for rows, model in scene.numbered():
         weights = weigh(model)
         total += np.bincount(labels[rows], weights, len(entries))
         for index, column in enumerate(model.shN.reshape(len(model), -1).T):

@@ -57,12 +57,9 @@ def write_spz(path: Path, scene: Scene, *, version: int) -> None:
     flags = ANTIALIASED if scene.facts.antialiased else 0
     packed = Packed(path.name, version, scene.count, scene.facts.sh_degree, _fraction(path, scene), flags)
     room = packed.room()
-    start = 0
-    for block in scene.blocks():
-        rows = slice(start, start + len(block))
+    for rows, block in scene.numbered():
         for part, codes in zip(packed.parts, _encoded(block, packed.bits), strict=True):
             part[rows] = codes
-        start = rows.stop
     write_packed(path, packed, room)
 
 
