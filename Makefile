@@ -10,7 +10,7 @@ CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format spec sample docs bench fuzz fuzz-c clean
+.PHONY: help demo test lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
@@ -65,6 +65,9 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).distortion.grades
 	$(BENCH).distortion.operating
 	$(BENCH).study
+
+wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
+	codec/js/wasm/build.sh codec/js/wasm.mjs
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

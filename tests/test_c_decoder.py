@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -45,15 +46,20 @@ def compiled(folder, name, *arguments):
 
 @pytest.fixture(scope="module")
 def decoder(tmp_path_factory):
-    """The decoder with sanitizers, which takes some seconds to compile."""
-    return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", *SANITIZED, C / "csplat.c")
+    """The decoder and its inflate with sanitizers, which take some seconds to compile."""
+    folder = tmp_path_factory.mktemp("c")
+    for name in ("csplat", "inflate"):
+        compiled(folder, f"{name}.o", "-c", *SANITIZED, "-DCSPLAT_NO_ZLIB", C / f"{name}.c")
+    return [folder / "csplat.o", folder / "inflate.o"]
 
 
-@pytest.fixture
-def asked(decoder, tmp_path, monkeypatch):
+@contextmanager
+def asked(adapter):
     """One process for all files: the runner starts one for each, and starting the sanitizers takes most of the time."""
-    adapter = compiled(tmp_path, "adapter", *SANITIZED, decoder, C / "tools" / "adapter.c")
-    with subprocess.Popen([str(adapter)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with (
+        pytest.MonkeyPatch.context() as monkeypatch,
+        subprocess.Popen([str(adapter)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process,
+    ):
 
         def run_program(_command, places, _timeout, **_):
             process.stdin.write(f"{places['input']}\n{places['outdir']}\n")
@@ -68,18 +74,34 @@ def asked(decoder, tmp_path, monkeypatch):
         assert process.wait() == 0  # AddressSanitizer found no leak
 
 
-@pytest.mark.usefixtures("asked")
-def test_passes_the_conformance_suite_under_sanitizers():
-    report = run_command("adapter {input} {outdir}", Choice(jobs=1))
+def test_passes_the_conformance_suite_under_sanitizers(decoder, tmp_path):
+    with asked(compiled(tmp_path, "adapter", *SANITIZED, *decoder, C / "tools" / "adapter.c")):
+        report = run_command("adapter {input} {outdir}", Choice(jobs=1))
     assert report.failures == []
     assert len(report.outcomes) > 1000
     assert not [note for note in report.notes if "unread" in note]
 
 
+def test_reads_and_refuses_the_same_streams_by_zlib(tmp_path):
+    with asked(compiled(tmp_path, "adapter", C / "csplat.c", C / "tools" / "adapter.c")):
+        report = run_command("adapter {input} {outdir}", Choice("*deflate*,valid/rich", jobs=1))
+    assert report.failures == []
+    assert len(report.outcomes) > 50
+
+
 def test_survives_callers_whose_functions_fail(decoder, tmp_path):
-    interface = compiled(tmp_path, "interface", *SANITIZED, decoder, C / "tools" / "interface.c")
+    interface = compiled(tmp_path, "interface", *SANITIZED, *decoder, C / "tools" / "interface.c")
     ended = run([interface, VECTORS / "valid" / "rich.csplat"])
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_sources(tmp_path):
+    if shutil.which("clang-14") is None or shutil.which("wasm-ld-14") is None:
+        absent("there is no clang-14 or no lld-14")
+    made = run(["codec/js/wasm/build.sh", tmp_path / "wasm.mjs"], cwd=ROOT)
+    assert (made.returncode, made.stderr) == (0, "")
+    committed = (ROOT / "codec" / "js" / "wasm.mjs").read_bytes()
+    assert (tmp_path / "wasm.mjs").read_bytes() == committed, "make wasm"
 
 
 def test_the_example_tells_what_is_in_a_file(tmp_path):
@@ -107,7 +129,3 @@ def test_the_sample_of_the_guide_decodes(tmp_path):
     program = compiled(tmp_path, "sample", C / "csplat.c", source)
     with (VECTORS / "valid" / "worked_example.csplat").open("rb") as file:
         assert run([program], stdin=file).stdout == "1 1"
-
-
-def test_compiles_without_zlib(tmp_path):
-    compiled(tmp_path, "csplat.o", "-c", "-DCSPLAT_NO_ZLIB", C / "csplat.c")

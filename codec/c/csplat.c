@@ -727,7 +727,10 @@ static int undo_deflate(csplat *d, const uint8_t *coded, size_t coded_size, size
     int (*by)(void *, const uint8_t *, size_t, uint8_t *, size_t) = d->options.inflate;
     void *user = d->options.user;
     TRY(reserve(d, &d->inflated, size, 1));
-#ifndef CSPLAT_NO_ZLIB
+#ifdef CSPLAT_NO_ZLIB
+    if (!by)
+        by = csplat_inflate;
+#else
     if (!by) {
         TRY(begin_zlib(d));
         by = zlib_inflate;
@@ -2760,7 +2763,6 @@ static csplat_code open_file(csplat **out, const void *memory, const csplat_sour
     csplat_options o = {0};
     csplat_error local;
     csplat *d;
-    int worked;
     *out = NULL;
     error = error ? error : &local;
     memset(error, 0, sizeof *error);
@@ -2786,13 +2788,7 @@ static csplat_code open_file(csplat **out, const void *memory, const csplat_sour
     d->source = *source;
     d->memory = memory;
     make_crc_table(d->crc_table);
-    worked = 1;
-#ifdef CSPLAT_NO_ZLIB
-    if (!o.inflate)
-        worked = refuse(d, "built without zlib: options.inflate is wanted");
-#endif
-    worked = worked && read_header(d) && read_index(d);
-    if (worked) {
+    if (read_header(d) && read_index(d)) {
         *out = d;
         return CSPLAT_OK;
     }

@@ -75,7 +75,7 @@ typedef struct csplat_options {
     /* malloc and free. Both or none. */
     void *(*allocate)(void *user, size_t size);
     void (*release)(void *user, void *memory);
-    /* zlib. Raw DEFLATE (RFC 1951): 1 if `coded` is one complete stream, no byte longer, of exactly `size` bytes.
+    /* zlib; csplat_inflate where CSPLAT_NO_ZLIB is defined. Raw DEFLATE (RFC 1951): 1 if `coded` is one complete stream, no byte longer, of exactly `size` bytes.
      * What else it has to refuse is told by section 6.2 of the specification (COD-2 to COD-8). */
     int (*inflate)(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
     void *user; /* of the three above */
@@ -225,6 +225,9 @@ csplat_code csplat_check(csplat *file);
 
 /* "E_CRC" */
 const char *csplat_code_name(csplat_code code);
+
+/* An inflate for csplat_options, in a file of its own, inflate.c. */
+int csplat_inflate(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
 
 #ifdef __cplusplus
 }

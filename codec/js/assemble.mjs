@@ -21,12 +21,13 @@ export class Assembly {
    * @param {Required<Limits>} limits
    * @param {number} tableBytes of all codebooks
    */
-  constructor(header, tiles, { shDegree, integers, extra }, limits, tableBytes) {
+  constructor(header, tiles, wanted, limits, tableBytes) {
+    const { shDegree, integers, extra } = wanted;
     const count = tiles.reduce((sum, tile) => sum + tile.splatCount, 0);
     const extras = extra ? header.extras : [];
     checkBudget(count, arrayBytes(count, shDegree, extras, integers) + tableBytes, limits);
     this.count = count;
-    this.shDegree = shDegree;
+    this.wanted = wanted;
     this.arrays = allocate(() =>
       integers
         ? new IntegerArrays(count, shDegree, tiles, spec.ATTRIBUTE_SH0 + shDegree)
@@ -46,7 +47,7 @@ export class Assembly {
   }
 
   fields() {
-    return { ...this.arrays.fields(), extra: this.extras.byName(), count: this.count, shDegree: this.shDegree };
+    return { ...this.arrays.fields(), extra: this.extras.byName(), count: this.count, shDegree: this.wanted.shDegree };
   }
 }
 

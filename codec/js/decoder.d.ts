@@ -211,17 +211,17 @@ export interface PackedColumns {
   step: number;
 }
 
-/** SH bands may stay in their codebook: then `columns` holds the escaped splats alone, which have no entry. */
+/** An SH band may stay in its codebook. */
 export interface Packed extends PackedColumns {
+  /** The splats that the columns are about, where they are not all: the others stand in the codebook, or are 0. */
+  rows?: Uint32Array;
   lookup?: {
     /** Id of the codebook. */
     codebook: number;
     /** Its entries, and one row of zeros behind them. The same object for every tile of a reader. */
     table: PackedColumns;
-    /** [count], a row of the table; the last one for escaped splats. */
+    /** [count], a row of the table; the last one for the splats `rows`. */
     index: Uint8Array | Uint16Array | Uint32Array;
-    /** The escaped splats in the order of `columns`. */
-    escaped: Uint32Array;
   };
 }
 

@@ -5,17 +5,14 @@
 //   const reader = await CsplatReader.open(url);    // header and index, then the parts that are asked for
 //   const tile = await reader.readTile(0, { shDegree: 1 });
 
-import { describe, emptyDescription } from './ancillary.mjs';
-import { Assembly, codebooksById } from './assemble.mjs';
-import { readTable, tableBytes } from './codebooks.mjs';
-import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
+import { Assembly } from './assemble.mjs';
+import { readFileHeader } from './container.mjs';
 import { CsplatError, FormatError, InputError, LimitError, UnsupportedError, fault } from './errors.mjs';
 import { readIndex } from './index.mjs';
-import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from './options.mjs';
 import { CsplatReader } from './reader.mjs';
 import * as spec from './spec.mjs';
-import { Tile } from './tile.mjs';
+import { MemorySource } from './whole.mjs';
 
 export { CsplatError, CsplatReader, FormatError, InputError, LimitError, UnsupportedError };
 
@@ -23,9 +20,7 @@ export { CsplatError, CsplatReader, FormatError, InputError, LimitError, Unsuppo
  * @typedef {import('./decoder.d.ts').DecodeOptions} DecodeOptions
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
- * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./tile.mjs').SceneContext} SceneContext
- * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
 
 /**
@@ -57,88 +52,38 @@ export function readHeader(data, options = {}) {
  * @returns {Promise<any>} Scene, or IntegerScene for the form 'integers'
  */
 export async function decode(data, options = {}) {
-  const bytes = toBytes(data);
-  const limits = checkedLimits(options.limits);
+  const { limits, inflate, signal, onProgress } = options;
+  const source = new MemorySource(toBytes(data));
   const integers = checkedForm(options.form);
-  const file = readFileHeader(bytes);
-  checkFileSize(bytes.length, file);
-  const header = readIndex(bytes.subarray(spec.HEADER_SIZE, file.end), file, limits);
+  const reader = await CsplatReader.open(source, { limits, inflate });
+  const { header } = reader;
   const tiles = checkedTiles(options.tiles, header);
   const shDegree = checkedDegree(options.shDegree, header);
-  const codebooks = codebooksById(header.codebooks);
   const wanted = { shDegree, integers, extra: true };
-  const assembly = new Assembly(header, tiles, wanted, limits, tableBytes(header.directory, codebooks));
-  const payloads = openChunks(bytes, header);
-  const scene = { header, codebooks, inflate: options.inflate ?? (await platformInflate()) };
-  const { table, description } = await readDirectory(scene, payloads, limits.jsonBytes);
-  const scratch = reused(shDegree);
-  let first = 0;
-  for (const record of tiles) {
-    options.signal?.throwIfAborted();
-    const tile = new Tile({ ...scene, table, scratch }, record, async () => {}); // lower layers have been decoded before
-    for (const place of record.layers) {
-      if (place.layer > shDegree && place.layer !== spec.LAYER_EXTRA) continue;
-      assembly.put(await tile.readLayer(payloads(place), place, integers), record, first);
+  const assembly = new Assembly(header, tiles, wanted, reader.limits, reader.tableBytes);
+  reader.scratch = reused(shDegree);
+  try {
+    let first = 0;
+    for (const record of tiles) {
+      await reader.fill(assembly, record, first, signal);
+      first += record.splatCount;
+      onProgress?.(first, assembly.count);
     }
-    first += record.splatCount;
-    options.onProgress?.(first, assembly.count);
+    await reader.checkAll();
+    return { ...assembly.fields(), header, ...(await reader.describe()), checks: reader.checks };
+  } finally {
+    reader.compiled?.close();
   }
-  const chunks = header.directory.length + header.tiles.reduce((sum, { layers }) => sum + layers.length, 0);
-  return { ...assembly.fields(), header, ...description, checks: { header: true, index: true, chunks } };
-}
-
-/**
- * CHK-2: "A decoder of a whole file MUST check the CRC of all chunks, known or not."
- *
- * @param {Bytes} bytes
- * @param {Header} header
- * @returns {(place: {offset: number}) => Bytes} the payload of a chunk of the index
- */
-function openChunks(bytes, header) {
-  /** @type {Map<number, Bytes>} */
-  const payloads = new Map();
-  for (const places of [header.directory, ...header.tiles.map(({ layers }) => layers)]) {
-    for (const place of places) {
-      payloads.set(place.offset, openChunk(bytes.subarray(place.offset, place.offset + place.size), place));
-    }
-  }
-  return ({ offset }) => /** @type {Bytes} */ (payloads.get(offset));
-}
-
-/**
- * Read every chunk of the directory that this version knows. CHK-2: "read all CODB chunks, used or not".
- *
- * @param {Pick<SceneContext, 'header' | 'codebooks' | 'inflate'>} scene
- * @param {ReturnType<typeof openChunks>} payloads
- * @param {number} jsonBytes
- */
-async function readDirectory({ header, codebooks, inflate }, payloads, jsonBytes) {
-  const description = emptyDescription();
-  /** @type {Map<string, Table>} */
-  const tables = new Map();
-  for (const record of header.directory) {
-    const codebook = codebooks.get(record.id);
-    if (record.type === spec.CHUNK_CODEBOOK && codebook) {
-      const { attributes } = header;
-      const table = await readTable(payloads(record), record, codebook, attributes, inflate);
-      tables.set(`${record.id}.${record.layer}`, table);
-    } else if (Object.hasOwn(spec.CHUNK_NAMES, record.type)) {
-      await describe(description, record, payloads(record), { splatCount: header.splatCount, jsonBytes, inflate });
-    }
-  }
-  /** @type {SceneContext['table']} */
-  const table = async (id, layer) => /** @type {Table} */ (tables.get(`${id}.${layer}`)); // DIR-5: there is one
-  return { description, table };
 }
 
 /**
  * Arrays that tile after tile uses again, and band after band: fresh memory costs more than what is done with it.
  *
  * @param {number} shDegree
- * @returns {SceneContext['scratch']}
+ * @returns {(key: number, length: number) => Float64Array<ArrayBuffer>}
  */
 function reused(shDegree) {
-  /** @type {Map<number, Float64Array>} */
+  /** @type {Map<number, Float64Array<ArrayBuffer>>} */
   const arrays = new Map();
   return (key, length) => {
     const band = Math.abs(key) - spec.ATTRIBUTE_SH0;

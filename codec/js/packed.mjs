@@ -1,7 +1,7 @@
 // The form 'packed': integers as narrow as a tile's layer allows, codebooks as tables. For those who draw them as they are.
 
 import { entryColumns } from './codebooks.mjs';
-import { columnCount, everySplat } from './codings.mjs';
+import { columnCount } from './codings.mjs';
 import { ldexp } from './lattice.mjs';
 import * as spec from './spec.mjs';
 
@@ -21,7 +21,7 @@ import * as spec from './spec.mjs';
  * @returns {any} PackedGeometry for layer 0, PackedBand for the others
  */
 export function packLayer(blocks, layer, count) {
-  if (layer !== spec.LAYER_GEOMETRY) return { count, sh: packBlock(everySplat(blocks[0], count)) };
+  if (layer !== spec.LAYER_GEOMETRY) return { count, sh: packBlock(blocks[0]) };
   return { count, ...Object.fromEntries(blocks.map((block) => [block.attribute.name, packBlock(block)])) };
 }
 
@@ -29,14 +29,14 @@ export function packLayer(blocks, layer, count) {
  * @param {Block} block
  * @returns {Packed}
  */
-function packBlock({ attribute, columns, exponent, lookup }) {
+function packBlock({ attribute, columns, exponent, lookup, present }) {
   const step = attribute.step === 0 ? 0 : ldexp(attribute.step, exponent);
   const packed = packColumns(columns, columnCount(attribute), step);
-  if (lookup === undefined) return packed;
+  if (lookup === undefined) return present ? { ...packed, rows: present } : packed;
   const { id, index, escaped, table } = lookup;
   // The values of one table are asked for by tile after tile, under one attribute: those of a band have a chunk of their own.
   table.packed ??= packColumns(entryColumns(table, attribute), columnCount(attribute), attribute.step);
-  return { ...packed, lookup: { codebook: id, table: table.packed, index: narrow(index), escaped } };
+  return { ...packed, rows: escaped, lookup: { codebook: id, table: table.packed, index: narrow(index, table.size) } };
 }
 
 /**
@@ -69,10 +69,11 @@ function packColumns(columns, count, step) {
   return { columns: out, offsets, step };
 }
 
-/** @param {Uint32Array} index */
-function narrow(index) {
-  let most = 0;
-  for (let i = 0; i < index.length; i++) most = Math.max(most, index[i]);
+/**
+ * @param {Uint32Array} index
+ * @param {number} most
+ */
+function narrow(index, most) {
   const out = arrayFor(most, index.length);
   out.set(index);
   return out;

@@ -1,9 +1,10 @@
 // Tiles and layers of a file, one by one and in any order, over HTTP Range, from a Blob or from memory.
 
 import { describe, emptyDescription } from './ancillary.mjs';
-import { arrayBytes, bandArray } from './arrays.mjs';
+import { FloatArrays, arrayBytes, bandArray } from './arrays.mjs';
 import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
+import { CompiledDecoder } from './compiled.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
@@ -19,16 +20,19 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
  * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
+ * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
  * @typedef {import('./decoder.d.ts').LayerForm} LayerForm
+ * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
  * @typedef {import('./decoder.d.ts').LayerRequest} LayerRequest
  * @typedef {import('./decoder.d.ts').ReaderOptions} ReaderOptions
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
+ * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
 
 /** Reads parts of a file, and checks the CRC of each. */
@@ -52,11 +56,14 @@ export class CsplatReader {
       received: (size) => options.onProgress?.((progress.received += size), progress.fileSize),
     });
     const known = source.size ?? Infinity;
-    const file = readFileHeader(await source.read(0, Math.min(spec.HEADER_SIZE, known), signal));
+    const head = await source.read(0, Math.min(spec.HEADER_SIZE, known), signal);
+    const file = readFileHeader(head);
     if (known !== Infinity) checkFileSize(known, file);
     progress.fileSize = file.fileSize;
-    const header = readIndex(await source.read(spec.HEADER_SIZE, file.indexSize, signal), file, limits);
-    return new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()));
+    const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
+    const header = readIndex(index, file, limits);
+    const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
+    return new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()), compiled);
   }
 
   /**
@@ -64,14 +71,16 @@ export class CsplatReader {
    * @param {Header} header
    * @param {Required<Limits>} limits
    * @param {Inflate} inflate
+   * @param {CompiledDecoder | null} compiled for floats and packed arrays, where WebAssembly runs
    */
-  constructor(source, header, limits, inflate) {
+  constructor(source, header, limits, inflate, compiled) {
     this.source = source;
     this.header = header;
     this.limits = limits;
     this.inflate = inflate;
-    /** What has been checked so far; `chunks` counts. */
-    this.checks = { header: true, index: true, chunks: 0 };
+    this.compiled = compiled;
+    /** @type {Set<number>} offsets of the chunks whose CRC was checked */
+    this.checked = new Set();
     /** How long reads have waited for bytes so far, each for itself. */
     this.waitedMs = 0;
     this.codebooks = codebooksById(header.codebooks);
@@ -81,11 +90,20 @@ export class CsplatReader {
     for (const record of header.directory) {
       if (record.type === spec.CHUNK_CODEBOOK) this.codebookChunks.set(`${record.id}.${record.layer}`, record);
     }
+    /** @type {Map<string, Promise<Bytes>>} those that were fetched */
+    this.codebookBytes = new Map();
     /** @type {Map<string, Promise<Table>>} */
     this.tables = new Map();
     /** @type {Map<number, Tile>} tiles that hold indices which layers to come need */
     this.open = new Map();
+    /** @type {Map<LayerRecord, Bytes>} layers that hold such indices, for WebAssembly */
+    this.kept = new Map();
     this.table = this.table.bind(this);
+  }
+
+  /** Which CRCs were checked so far. */
+  get checks() {
+    return { header: true, index: true, chunks: this.checked.size };
   }
 
   /**
@@ -97,17 +115,35 @@ export class CsplatReader {
    */
   async readTile(index, { shDegree, extra = false, form, signal } = {}) {
     const record = checkedTile(index, this.header);
-    const degree = checkedDegree(shDegree, this.header);
-    const places = record.layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= degree));
-    const integers = checkedForm(form);
-    const wanted = { shDegree: degree, integers, extra };
+    const wanted = { shDegree: checkedDegree(shDegree, this.header), integers: checkedForm(form), extra };
     const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes);
-    const payloads = await Promise.all(places.map((place) => this.readChunk(place, signal)));
-    const tile = this.tileOf(record);
-    for (const [i, place] of places.entries())
-      assembly.put(await tile.readLayer(payloads[i], place, integers), record, 0);
-    this.release(tile);
+    await this.fill(assembly, record, 0, signal);
     return assembly.fields();
+  }
+
+  /**
+   * Decode a tile into arrays.
+   *
+   * @param {Assembly} assembly
+   * @param {TileRecord} record
+   * @param {number} first splat of the arrays that is the tile's first
+   * @param {AbortSignal} [signal]
+   */
+  async fill(assembly, record, first, signal) {
+    const { shDegree, integers, extra } = assembly.wanted;
+    const places = record.layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
+    const bytes = await Promise.all(places.map((place) => this.fetch(place, signal)));
+    const chunks = new Map(places.map((place, i) => [place, bytes[i]]));
+    const { arrays } = assembly;
+    const made =
+      arrays instanceof FloatArrays &&
+      (await this.byCompiled(record, chunks, (decoder) => decoder.readTile(record, arrays, first)));
+    const tile = this.tileOf(record);
+    for (const [place, chunk] of chunks) {
+      if (made && place.layer !== spec.LAYER_EXTRA) continue;
+      assembly.put(await tile.readLayer(this.opened(chunk, place), place, integers), record, first);
+    }
+    this.release(tile);
   }
 
   /**
@@ -129,16 +165,60 @@ export class CsplatReader {
     }
     const place = record.layers.find((one) => one.layer === layer);
     if (place === undefined) return null;
-    if (packed) {
-      const bytes = arrayBytes(record.splatCount, layer, [], true);
-      checkBudget(record.splatCount, bytes + this.tableBytes, this.limits);
-    }
-    const payload = await this.readChunk(place, signal);
+    const count = record.splatCount;
+    if (packed) checkBudget(count, arrayBytes(count, layer, [], true) + this.tableBytes, this.limits);
+    const chunk = await this.fetch(place, signal);
+    const made = !integers && (await this.layerByCompiled(record, place, chunk, packed, signal));
+    if (made) return made;
     const tile = this.tileOf(record);
-    const { blocks } = await tile.readLayer(payload, place, integers);
+    const { blocks } = await tile.readLayer(this.opened(chunk, place), place, integers);
     this.release(tile);
-    if (packed) return packLayer(blocks, layer, record.splatCount);
-    return { sh: bandArray(blocks[0], record.splatCount, integers), count: record.splatCount };
+    return packed ? packLayer(blocks, layer, count) : { sh: bandArray(blocks[0], count, integers), count };
+  }
+
+  /**
+   * @param {TileRecord} record
+   * @param {LayerRecord} place
+   * @param {Bytes} chunk
+   * @param {boolean} packed
+   * @param {AbortSignal} [signal]
+   */
+  async layerByCompiled(record, place, chunk, packed, signal) {
+    const { layer } = place;
+    const chunks = new Map([[place, chunk]]);
+    // Bands of one codebook share the indices of the lowest of them, which is kept for the others.
+    for (const { bandFirst, bandLast } of record.tables.flatMap((id) => this.codebooks.get(id) ?? [])) {
+      if (bandFirst === bandLast || layer < bandFirst || layer > bandLast) continue;
+      const lowest = record.layers.find((one) => one.layer === bandFirst);
+      if (lowest === undefined) continue;
+      const bytes = lowest === place ? chunk.slice() : (this.kept.get(lowest) ?? (await this.fetch(lowest, signal)));
+      this.kept.set(lowest, bytes);
+      chunks.set(lowest, bytes);
+    }
+    return this.byCompiled(record, chunks, (decoder) => {
+      if (layer === spec.LAYER_GEOMETRY) return decoder.readPacked(record);
+      const sh = packed ? decoder.readPackedBand(record, layer) : decoder.readBand(record, layer);
+      return sh && { sh, count: record.splatCount };
+    });
+  }
+
+  /**
+   * Let WebAssembly decode layers of a tile.
+   *
+   * @template T
+   * @param {TileRecord} record
+   * @param {Map<LayerRecord, Bytes>} chunks of the layers
+   * @param {(decoder: CompiledDecoder) => T} decode
+   * @returns {Promise<T | null>} null or false where it cannot: then it is up to the modules beside this one
+   */
+  async byCompiled({ tables }, chunks, decode) {
+    if (this.compiled === null) return null;
+    const parts = new Map([...chunks].map(([{ offset }, bytes]) => [offset, bytes]));
+    const layers = [...chunks.keys()].map(({ layer }) => layer);
+    for (const [key, { id, layer, offset }] of this.codebookChunks) {
+      if (tables.includes(id) && layers.includes(layer)) parts.set(offset, await this.codebookChunk(key));
+    }
+    return this.compiled.reading(parts, this.checked, decode);
   }
 
   /**
@@ -151,9 +231,27 @@ export class CsplatReader {
     const scene = { splatCount: this.header.splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
     for (const record of this.header.directory) {
       if (record.type === spec.CHUNK_CODEBOOK || !Object.hasOwn(spec.CHUNK_NAMES, record.type)) continue;
-      await describe(description, record, await this.readChunk(record, signal), scene);
+      await describe(description, record, this.opened(await this.fetch(record, signal), record), scene);
     }
     return description;
+  }
+
+  /**
+   * Check what nobody has read so far. CHK-2: a decoder of a whole file checks "the CRC of all chunks, known or not", and
+   * reads "all CODB chunks, used or not".
+   */
+  async checkAll() {
+    const { directory, tiles } = this.header;
+    const chunks = new Map();
+    for (const place of [...directory, ...tiles.flatMap(({ layers }) => layers)]) {
+      if (!this.checked.has(place.offset)) chunks.set(place, await this.fetch(place));
+    }
+    const parts = new Map();
+    for (const record of directory) parts.set(record.offset, await this.fetch(record));
+    if (!this.compiled?.reading(parts, this.checked, (decoder) => decoder.check())) {
+      for (const { id, layer } of this.codebookChunks.values()) await this.table(id, layer);
+    }
+    for (const [place, chunk] of chunks) if (!this.checked.has(place.offset)) this.opened(chunk, place);
   }
 
   /**
@@ -173,7 +271,7 @@ export class CsplatReader {
       places.add(place);
       for (const id of record.tables) {
         const key = `${id}.${layer}`;
-        const chunk = this.tables.has(key) ? undefined : this.codebookChunks.get(key);
+        const chunk = this.codebookBytes.has(key) ? undefined : this.codebookChunks.get(key);
         if (chunk) places.add(chunk);
       }
     }
@@ -183,19 +281,45 @@ export class CsplatReader {
   /**
    * @param {ChunkPlace} place
    * @param {AbortSignal} [signal]
+   * @returns {Promise<Bytes>}
    */
-  async readChunk(place, signal) {
+  async fetch(place, signal) {
     signal?.throwIfAborted();
     const before = performance.now();
     const bytes = await this.source.read(place.offset, place.size, signal);
     this.waitedMs += performance.now() - before;
-    const payload = openChunk(bytes, place);
-    this.checks.chunks++;
+    return bytes;
+  }
+
+  /**
+   * @param {Bytes} chunk
+   * @param {ChunkPlace} place
+   */
+  opened(chunk, place) {
+    const payload = openChunk(chunk, place);
+    this.checked.add(place.offset);
     return payload;
   }
 
   /**
-   * The table of a codebook's chunk, fetched once. Without a signal: others may wait for the same table.
+   * A chunk of a codebook, fetched once. Without a signal: others may wait for the same chunk.
+   *
+   * @param {string} key
+   */
+  codebookChunk(key) {
+    let bytes = this.codebookBytes.get(key);
+    if (bytes === undefined) {
+      const record = this.codebookChunks.get(key);
+      if (!record) throw new InputError(`no codebook ${key}`); // DIR-5 and CBK-1 leave no way here
+      bytes = this.fetch(record);
+      this.codebookBytes.set(key, bytes);
+      bytes.catch(() => this.codebookBytes.delete(key)); // may be tried again
+    }
+    return bytes;
+  }
+
+  /**
+   * The table of a codebook's chunk, decoded once.
    *
    * @param {number} id
    * @param {number} layer
@@ -227,10 +351,9 @@ export class CsplatReader {
    * @param {number} id
    */
   async fetchTable(key, id) {
-    const record = this.codebookChunks.get(key);
-    const codebook = this.codebooks.get(id);
-    if (!record || !codebook) throw new InputError(`no codebook ${key}`); // DIR-5 and CBK-1 leave no way here
-    return readTable(await this.readChunk(record), record, codebook, this.header.attributes, this.inflate);
+    const record = /** @type {DirectoryRecord} */ (this.codebookChunks.get(key));
+    const payload = this.opened(await this.codebookChunk(key), record);
+    return readTable(payload, record, /** @type {CodebookRecord} */ (this.codebooks.get(id)), this.header.attributes, this.inflate);
   }
 
   /**
@@ -242,7 +365,9 @@ export class CsplatReader {
     if (tile === undefined) {
       const needLayer = async (/** @type {number} */ layer) => {
         const place = record.layers.find((one) => one.layer === layer);
-        if (place) await /** @type {Tile} */ (tile).readLayer(await this.readChunk(place), place, false);
+        if (!place) return;
+        const payload = this.opened(await this.fetch(place), place);
+        await /** @type {Tile} */ (tile).readLayer(payload, place, false);
       };
       tile = new Tile(this, record, needLayer);
       this.open.set(record.index, tile);

@@ -176,8 +176,9 @@ const lesser = (a, b) => Math.min(a, b);
  * @returns {BandTexels}
  */
 export function packBand(packed, count) {
-  if (packed.lookup === undefined) return { rows: packRows(packed), codebook: null };
-  const { codebook: id, table, index, escaped } = packed.lookup;
+  if (packed.lookup === undefined) return { rows: packRows(everySplat(packed, count)), codebook: null };
+  const { codebook: id, table, index } = packed.lookup;
+  const escaped = packed.rows ?? [];
   const size = table.columns.length / packed.offsets.length - 1; // the last row stands for the escaped
   const full = Uint32Array.from(index);
   for (let k = 0; k < escaped.length; k++) full[escaped[k]] = size + k;
@@ -185,6 +186,24 @@ export function packBand(packed, count) {
   const words = packFields(full, count, indexBits);
   const rows = escaped.length ? packRows(packed) : null;
   return { rows, codebook: { id, size, index: words, indexBits } };
+}
+
+/**
+ * The same integers with a row for every splat.
+ *
+ * @param {Packed} packed without a codebook
+ * @param {number} count splats
+ * @returns {PackedColumns}
+ */
+function everySplat({ columns, offsets, step, rows }, count) {
+  if (rows === undefined) return { columns, offsets, step };
+  const all = new Float64Array(offsets.length * count);
+  for (let c = 0; c < offsets.length; c++)
+    for (let k = 0; k < rows.length; k++) all[c * count + rows[k]] = offsets[c] + columns[c * rows.length + k];
+  const least = offsets.map((_, c) => all.subarray(c * count, (c + 1) * count).reduce(lesser));
+  const narrow = new Uint32Array(all.length);
+  for (let i = 0; i < all.length; i++) narrow[i] = all[i] - least[Math.floor(i / count)]; // below 2^24: LAT-4
+  return { columns: narrow, offsets: least, step };
 }
 
 /**

@@ -16,19 +16,38 @@ const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 
 /** Where the decoder lies: a copy of it may be tested in its place. */
 const folder = process.env.CSPLAT_JS ? pathToFileURL(`${process.env.CSPLAT_JS}/`) : new URL('../', import.meta.url);
 const { CsplatError, decode } = await import(new URL('decoder.mjs', folder).href);
+const { zlibInflate } = await import(new URL('inflate.mjs', folder).href);
+const inflate = await zlibInflate();
 
 /** @param {ArrayBufferView} array */
 const raw = (array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
 
 /**
- * Decode a file both ways.
+ * Floats by WebAssembly, which has to be right where JavaScript is, and nowhere else.
+ *
+ * @param {Uint8Array} bytes
+ * @param {object} options
+ */
+async function floats(bytes, options) {
+  const compiled = await decode(bytes, options).catch((error) => error);
+  const scene = await decode(bytes, { ...options, inflate }).catch((error) => error);
+  if (compiled instanceof Error !== scene instanceof Error) throw new Error('WebAssembly and JavaScript disagree');
+  if (scene instanceof Error) throw scene;
+  for (const name of FLOATS)
+    if (Buffer.compare(raw(compiled[name]), raw(scene[name])))
+      throw new Error(`WebAssembly and JavaScript disagree about ${name}`);
+  return scene;
+}
+
+/**
+ * Decode a file to floats and to integers.
  *
  * @param {Uint8Array} bytes
  * @param {object} [limits] budgets
  * @returns {Promise<{header: object, arrays: Map<string, ArrayBufferView>}>} arrays by `part.name`
  */
 async function decoded(bytes, limits = {}) {
-  const scene = await decode(bytes, limits);
+  const scene = await floats(bytes, limits);
   const integers = await decode(bytes, { ...limits, form: 'integers' });
   const { header } = scene;
   const facts = {

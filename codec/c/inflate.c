@@ -1,0 +1,306 @@
+/* An inflate for programs without zlib (-DCSPLAT_NO_ZLIB): raw DEFLATE (RFC 1951) under the rules of the specification,
+ * 6.2. No memory is allocated and no byte outside of the two buffers is touched.
+ *
+ * A code is read by tables: one that the next ROOT bits point into, and behind it smaller ones for longer codewords.
+ * SPDX-License-Identifier: Apache-2.0 */
+#include "csplat.h"
+
+#include <string.h>
+
+enum { LITERALS = 288, DISTANCES = 32, LENGTHS = 19, BITS_MAX = 15 };
+enum { LITERAL_ROOT = 10, DISTANCE_ROOT = 8, LENGTH_ROOT = 7 };
+/* Entries of a table for that many symbols and root bits at most, as zlib's program `enough` counts them. */
+enum { LITERAL_ENTRIES = 1334, DISTANCE_ENTRIES = 402, LENGTH_ENTRIES = 128 };
+
+/* An entry of a table: the bits of the codeword (0 to 4), extra bits (8 to 11) and flags (12 to 15), a value above. Of
+ * SUBTABLE the extra bits are those that point into it, and the value its place. */
+enum { LITERAL = 0x8000, SUBTABLE = 0x4000, END = 0x2000, WRONG = 0x1000 };
+
+typedef struct code {
+    uint32_t literals[LITERAL_ENTRIES], distances[DISTANCE_ENTRIES];
+} code;
+
+typedef struct reader {
+    const uint8_t *at, *end;
+    uint64_t bits; /* the next ones, lowest first; 0 behind the end */
+    int count;     /* of them that are there; below 0 when more were taken */
+} reader;
+
+/* At least 56 bits, where the stream has them. */
+static inline void refill(reader *r)
+{
+    if (r->end - r->at >= 8) {
+        uint64_t next = 0;
+        for (int i = 0; i < 8; i++) /* one load */
+            next |= (uint64_t)r->at[i] << 8 * i;
+        r->bits |= next << r->count;
+        r->at += (63 - r->count) >> 3;
+        r->count |= 56;
+    } else
+        while (r->count <= 56 && r->at < r->end) {
+            r->bits |= (uint64_t)*r->at++ << r->count;
+            r->count += 8;
+        }
+}
+
+static inline uint32_t peek(const reader *r, unsigned count)
+{
+    return (uint32_t)r->bits & ((UINT32_C(1) << count) - 1);
+}
+
+static inline void skip(reader *r, unsigned count)
+{
+    r->bits >>= count;
+    r->count -= (int)count;
+}
+
+static uint32_t number(reader *r, unsigned count)
+{
+    uint32_t value;
+    refill(r);
+    value = peek(r, count);
+    skip(r, count);
+    return value;
+}
+
+static uint32_t entry(const uint32_t *table, const reader *r, unsigned root)
+{
+    uint32_t e = table[peek(r, root)];
+    if (e & SUBTABLE)
+        e = table[(e >> 16) + ((uint32_t)(r->bits >> root) & ((1u << (e >> 8 & 15)) - 1))];
+    return e;
+}
+
+/* What symbols stand for. Lengths: 3 to 10 each by itself, then four to each number of extra bits (RFC 1951, 3.2.5). */
+static uint32_t literal_entry(unsigned symbol)
+{
+    unsigned i = symbol - 257, extra = i < 8 ? 0 : i / 4 - 1;
+    if (symbol < 256)
+        return LITERAL | symbol << 16;
+    if (symbol == 256)
+        return END;
+    if (symbol == 285)
+        return 258u << 16;
+    return symbol > 285 ? WRONG : extra << 8 | (3 + (i < 8 ? i : (4 + i % 4) << extra)) << 16;
+}
+
+static uint32_t distance_entry(unsigned symbol)
+{
+    unsigned extra = symbol < 4 ? 0 : symbol / 2 - 1;
+    return symbol > 29 ? WRONG : extra << 8 | (1 + (symbol < 4 ? symbol : (2 + symbol % 2) << extra)) << 16;
+}
+
+static uint32_t length_entry(unsigned symbol)
+{
+    return symbol << 16;
+}
+
+/* Make the table of a code from the lengths of its codewords (COD-6). It may be incomplete where it has one codeword, of
+ * one bit, or none, and at least `least`. */
+static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means)(unsigned), unsigned root, unsigned least,
+                      uint32_t *table)
+{
+    unsigned counts[BITS_MAX + 1] = {0}, places[BITS_MAX + 2] = {0}, used = 0, reversed = 0, next = 1u << root;
+    uint16_t order[LITERALS];
+    uint32_t left = 1u << BITS_MAX; /* of all sequences of BITS_MAX bits those without a codeword */
+    for (unsigned i = 0; i < symbols; i++)
+        counts[lengths[i]]++;
+    counts[0] = 0;
+    for (unsigned bits = 1; bits <= BITS_MAX; bits++) {
+        uint32_t taken = (uint32_t)counts[bits] << (BITS_MAX - bits);
+        if (taken > left)
+            return 0;
+        left -= taken;
+        used += counts[bits];
+        places[bits + 1] = used;
+    }
+    if (left && (used != counts[1] || used < least))
+        return 0;
+    for (unsigned i = 0; left && i < next; i++)
+        table[i] = WRONG;
+    for (unsigned i = 0; i < symbols; i++)
+        if (lengths[i])
+            order[places[lengths[i]]++] = (uint16_t)i;
+    for (unsigned bits = 1, i = 0, sub = 0, prefix = ~0u; i < used; i++) {
+        unsigned bit;
+        uint32_t e;
+        while (!counts[bits])
+            bits++;
+        e = means(order[i]) | bits;
+        if (bits <= root)
+            for (unsigned at = reversed; at < 1u << root; at += 1u << bits)
+                table[at] = e;
+        else {
+            if ((reversed & ((1u << root) - 1)) != prefix) { /* a new subtable, as large as its codewords need */
+                int room;
+                sub = bits - root;
+                room = 1 << sub;
+                while (sub + root < BITS_MAX && (room -= (int)counts[sub + root]) > 0) {
+                    sub++;
+                    room <<= 1;
+                }
+                prefix = reversed & ((1u << root) - 1);
+                table[prefix] = SUBTABLE | sub << 8 | next << 16;
+                next += 1u << sub;
+            }
+            for (unsigned at = reversed >> root; at < 1u << sub; at += 1u << (bits - root))
+                table[(table[prefix] >> 16) + at] = e;
+        }
+        counts[bits]--;
+        bit = 1u << (bits - 1); /* the next codeword, its bits from the last to the first */
+        while (reversed & bit)
+            bit >>= 1;
+        reversed = bit ? (reversed & (bit - 1)) | bit : 0;
+    }
+    return 1;
+}
+
+static int fixed_code(code *c)
+{
+    uint8_t lengths[LITERALS];
+    memset(lengths, 8, 144);
+    memset(lengths + 144, 9, 112);
+    memset(lengths + 256, 7, 24);
+    memset(lengths + 280, 8, 8);
+    make_table(lengths, LITERALS, literal_entry, LITERAL_ROOT, 2, c->literals);
+    memset(lengths, 5, DISTANCES);
+    return make_table(lengths, DISTANCES, distance_entry, DISTANCE_ROOT, 2, c->distances);
+}
+
+/* The head of a dynamic block. */
+static int dynamic_code(reader *r, code *c)
+{
+    static const uint8_t order[LENGTHS] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
+    uint8_t lengths[LITERALS + DISTANCES] = {0};
+    const unsigned literals = 257 + number(r, 5), distances = 1 + number(r, 5), given = 4 + number(r, 4);
+    if (literals > 286 || distances > 30) /* COD-5 */
+        return 0;
+    for (unsigned i = 0; i < given; i++)
+        lengths[order[i]] = (uint8_t)number(r, 3);
+    if (!make_table(lengths, LENGTHS, length_entry, LENGTH_ROOT, 2, c->literals))
+        return 0;
+    memset(lengths, 0, LENGTHS);
+    for (unsigned i = 0; i < literals + distances;) {
+        uint32_t e, symbol, times = 1;
+        refill(r);
+        e = c->literals[peek(r, LENGTH_ROOT)];
+        symbol = e >> 16;
+        skip(r, e & 31);
+        if (symbol == 16)
+            times = 3 + number(r, 2);
+        else if (symbol == 17)
+            times = 3 + number(r, 3);
+        else if (symbol == 18)
+            times = 11 + number(r, 7);
+        if (r->count < 0 || (symbol == 16 && i == 0) || times > literals + distances - i) /* COD-7 */
+            return 0;
+        memset(lengths + i, symbol < 16 ? (int)symbol : symbol == 16 ? lengths[i - 1] : 0, times);
+        i += times;
+    }
+    return lengths[256] && make_table(lengths, literals, literal_entry, LITERAL_ROOT, 1, c->literals) &&
+           make_table(lengths + literals, distances, distance_entry, DISTANCE_ROOT, 0, c->distances);
+}
+
+/* `length` bytes from `distance` before, one after the other: the two may overlap. */
+static inline void copy_match(uint8_t *to, size_t distance, size_t length, size_t room)
+{
+    const uint8_t *from = to - distance;
+    if (distance >= 16 && room >= length + 16)
+        for (size_t i = 0; i < length; i += 16)
+            memcpy(to + i, from + i, 16);
+    else if (distance == 1)
+        memset(to, *from, length);
+    else
+        for (size_t i = 0; i < length; i++)
+            to[i] = from[i];
+}
+
+/* The data of a fixed or dynamic block; how far the output goes then, or `wrong`. */
+static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at, size_t size, size_t wrong)
+{
+    reader r = *reading;
+    for (;;) {
+        size_t length, distance;
+        uint32_t e;
+        refill(&r);
+        e = entry(c->literals, &r, LITERAL_ROOT);
+        for (int i = 0; i < 2 && e & LITERAL && at < size; i++) { /* 2 x 15 bits, and 15 more are looked at */
+            skip(&r, e & 31);
+            out[at++] = (uint8_t)(e >> 16);
+            e = entry(c->literals, &r, LITERAL_ROOT);
+        }
+        if (e & LITERAL) {
+            if (r.count < 0 || at == size)
+                return wrong;
+            continue;
+        }
+        skip(&r, e & 31);
+        if (r.count < 0 || e & WRONG)
+            return wrong;
+        if (e & END)
+            break;
+        refill(&r);
+        length = (e >> 16) + peek(&r, e >> 8 & 15);
+        skip(&r, e >> 8 & 15);
+        e = entry(c->distances, &r, DISTANCE_ROOT);
+        skip(&r, e & 31);
+        distance = (e >> 16) + peek(&r, e >> 8 & 15);
+        skip(&r, e >> 8 & 15);
+        if (r.count < 0 || e & WRONG || distance > at || length > size - at)
+            return wrong;
+        copy_match(out + at, distance, length, size - at);
+        at += length;
+    }
+    *reading = r;
+    return at;
+}
+
+/* A stored block. */
+static size_t stored_data(reader *r, uint8_t *out, size_t at, size_t size, size_t wrong)
+{
+    size_t length, complement;
+    skip(r, (unsigned)r->count & 7);
+    length = number(r, 16);
+    complement = number(r, 16);
+    if (r->count < 0 || length + complement != 0xFFFF || length > size - at)
+        return wrong;
+    r->at -= r->count >> 3; /* what was looked at already */
+    r->bits = 0;
+    r->count = 0;
+    if (length > (size_t)(r->end - r->at))
+        return wrong;
+    memcpy(out + at, r->at, length);
+    r->at += length;
+    return at + length;
+}
+
+int csplat_inflate(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size)
+{
+    const size_t wrong = size + 1;
+    reader r = {coded, coded + coded_size, 0, 0};
+    code c;
+    size_t at = 0;
+    uint32_t head;
+    (void)user;
+    do {
+        head = number(&r, 3);
+        if (r.count < 0)
+            return 0;
+        switch (head >> 1) {
+        case 0:
+            at = stored_data(&r, out, at, size, wrong);
+            break;
+        case 1:
+            at = fixed_code(&c) ? block_data(&r, &c, out, at, size, wrong) : wrong;
+            break;
+        case 2:
+            at = dynamic_code(&r, &c) ? block_data(&r, &c, out, at, size, wrong) : wrong;
+            break;
+        default:
+            at = wrong;
+        }
+        if (at == wrong)
+            return 0;
+    } while (!(head & 1));
+    return at == size && r.at == r.end && r.count < 8;
+}

@@ -1,0 +1,221 @@
+// The decoder in C as WebAssembly (wasm/, codec/c), for floats and packed arrays. Whatever it refuses the modules beside
+// this one decode once more: they say what is wrong, and where.
+
+import { shRows } from './arrays.mjs';
+import * as spec from './spec.mjs';
+
+/**
+ * @typedef {import('./arrays.mjs').FloatArrays} FloatArrays
+ * @typedef {import('./decoder.d.ts').Packed} Packed
+ * @typedef {import('./decoder.d.ts').PackedColumns} PackedColumns
+ * @typedef {import('./decoder.d.ts').PackedGeometry} PackedGeometry
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {Uint8Array<ArrayBuffer>} Bytes
+ * @typedef {Map<number, Bytes>} Parts of the file, by their offset
+ *
+ * What wasm/interface.c exports. Functions return an address, or 0 where they refuse.
+ *
+ * @typedef {object} Exports
+ * @property {WebAssembly.Memory} memory
+ * @property {(size: number) => number} open
+ * @property {() => void} close
+ * @property {() => number} check
+ * @property {(index: number, degree: number) => number} read_tile
+ * @property {(index: number, band: number) => number} read_band
+ * @property {(index: number) => number} read_packed
+ * @property {(index: number, band: number) => number} read_packed_band
+ * @property {(id: number, band: number) => number} read_packed_codebook
+ */
+
+/** csplat_columns and csplat_packed of csplat.h, as they lie in memory. */
+const COLUMNS = { data: 0, width: 4, columns: 8, count: 12, offset: 16, step: 184 };
+const PACKED = { rows: 192, index: 196, indexWidth: 200, codebook: 204, size: 208 };
+const GEOMETRY = ['opacities', 'scales', 'quats', 'means', 'sh0'];
+const ARRAYS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
+
+/** @type {Promise<WebAssembly.Module | null> | null} */
+let compiling = null;
+
+/** @type {WeakRef<CompiledDecoder> | null} one that is closed: its memory is there already */
+let spare = null;
+
+/** The module; null where the platform, or the page's policy, has no WebAssembly of this kind. */
+function compiledModule() {
+  compiling ??= import('./wasm.mjs')
+    .then(({ default: text }) => WebAssembly.compile(Uint8Array.from(atob(text), (byte) => byte.charCodeAt(0))))
+    .catch(() => null);
+  return compiling;
+}
+
+/** Decodes tiles of one file. */
+export class CompiledDecoder {
+  /**
+   * @param {number} fileSize
+   * @param {Bytes} head the file's first bytes
+   * @param {Bytes} index
+   * @returns {Promise<CompiledDecoder | null>} null where the platform cannot, or the file is refused
+   */
+  static async open(fileSize, head, index) {
+    const module = await compiledModule();
+    if (module === null) return null;
+    const decoder = spare?.deref() ?? new CompiledDecoder(module);
+    spare = null;
+    const parts = new Map([[0, head], [spec.HEADER_SIZE, index]]);
+    return decoder.reading(parts, new Set(), () => decoder.exports.open(fileSize)) ? decoder : null;
+  }
+
+  /** @param {WebAssembly.Module} module */
+  constructor(module) {
+    /** @type {Parts} */
+    this.parts = new Map();
+    const read = (/** @type {number} */ offset, /** @type {number} */ size, /** @type {number} */ into) => {
+      const bytes = this.parts.get(offset);
+      if (bytes?.length !== size) return 0;
+      new Uint8Array(this.exports.memory.buffer, into, size).set(bytes);
+      this.seen.add(offset);
+      return 1;
+    };
+    const { exports } = new WebAssembly.Instance(module, { env: { read } });
+    this.exports = /** @type {Exports} */ (/** @type {unknown} */ (exports));
+    /** @type {Set<number>} */
+    this.seen = new Set();
+    /** @type {Map<string, PackedColumns>} entries of codebooks by id and band */
+    this.codebooks = new Map();
+  }
+
+  /**
+   * Decode something. All other methods want to be called from `decode`.
+   *
+   * @template T
+   * @param {Parts} parts what may be read
+   * @param {Set<number>} checked gets the offsets of those that were read, unless something was refused
+   * @param {(decoder: CompiledDecoder) => T} decode
+   * @returns {T}
+   */
+  reading(parts, checked, decode) {
+    this.parts = parts;
+    const made = decode(this);
+    if (made) for (const offset of this.seen) checked.add(offset);
+    this.parts = new Map();
+    this.seen.clear();
+    return made;
+  }
+
+  /** Forget the file. Nothing may be called after it. */
+  close() {
+    this.exports.close();
+    this.codebooks.clear();
+    spare = new WeakRef(this);
+  }
+
+  /** Check and read what no tile needs: codebooks, texts, chunks of unknown types. */
+  check() {
+    return this.exports.check() !== 0;
+  }
+
+  /**
+   * Decode a tile.
+   *
+   * @param {TileRecord} tile
+   * @param {FloatArrays} arrays to fill
+   * @param {number} first splat of the arrays that is the tile's first
+   */
+  readTile({ index, splatCount: n }, arrays, first) {
+    let at = this.exports.read_tile(index, arrays.shDegree);
+    if (at === 0) return false;
+    const { means, quats, scales, opacities, sh0, shN } = arrays;
+    /** @type {[Float32Array, number][]} */
+    const parts = [[means, 3], [quats, 4], [scales, 3], [opacities, 1], [sh0, 3], [shN, 3 * shRows(arrays.shDegree)]];
+    for (const [array, width] of parts) {
+      array.set(new Float32Array(this.exports.memory.buffer, at, width * n), width * first);
+      at += 4 * width * n;
+    }
+    return true;
+  }
+
+  /**
+   * Decode an SH band.
+   *
+   * @param {TileRecord} tile
+   * @param {number} band
+   * @returns {Float32Array | null} [splat, coefficient, channel]
+   */
+  readBand({ index, splatCount }, band) {
+    const at = this.exports.read_band(index, band);
+    return at ? new Float32Array(this.exports.memory.buffer, at, 3 * (2 * band + 1) * splatCount).slice() : null;
+  }
+
+  /**
+   * Decode layer 0 to packed arrays.
+   *
+   * @param {TileRecord} tile
+   * @returns {PackedGeometry | null}
+   */
+  readPacked({ index, splatCount: count }) {
+    const at = this.exports.read_packed(index);
+    if (at === 0) return null;
+    const columns = GEOMETRY.map((name, i) => [name, this.columnsAt(at + i * PACKED.size)]);
+    return { count, ...Object.fromEntries(columns) };
+  }
+
+  /**
+   * Decode an SH band to packed arrays.
+   *
+   * @param {TileRecord} tile
+   * @param {number} band
+   * @returns {Packed | null}
+   */
+  readPackedBand({ index, splatCount }, band) {
+    const at = this.exports.read_packed_band(index, band);
+    if (at === 0) return null;
+    const packed = this.columnsAt(at);
+    const view = new DataView(this.exports.memory.buffer, at);
+    const [rows, indices] = [PACKED.rows, PACKED.index].map((place) => view.getUint32(place, true));
+    const some = rows || indices ? { rows: this.copy(4, rows, view.getUint32(COLUMNS.count, true)) } : {};
+    if (indices === 0) return { ...packed, ...some };
+    const codebook = view.getUint16(PACKED.codebook, true);
+    const entry = this.copy(view.getUint32(PACKED.indexWidth, true), indices, splatCount);
+    const table = this.codebook(codebook, band);
+    return table && { ...packed, ...some, lookup: { codebook, table, index: entry } };
+  }
+
+  /**
+   * @param {number} id
+   * @param {number} band
+   * @returns {PackedColumns | null}
+   */
+  codebook(id, band) {
+    const key = `${id}.${band}`;
+    const known = this.codebooks.get(key);
+    if (known) return known;
+    const at = this.exports.read_packed_codebook(id, band);
+    if (at === 0) return null;
+    const table = this.columnsAt(at);
+    this.codebooks.set(key, table);
+    return table;
+  }
+
+  /** @param {number} at of a csplat_columns */
+  columnsAt(at) {
+    const view = new DataView(this.exports.memory.buffer, at);
+    const [data, width, columns, count] = [COLUMNS.data, COLUMNS.width, COLUMNS.columns, COLUMNS.count].map((place) =>
+      view.getUint32(place, true),
+    );
+    const offsets = Array.from({ length: columns }, (_, i) => Number(view.getBigInt64(COLUMNS.offset + 8 * i, true)));
+    return {
+      columns: this.copy(width, data, columns * count),
+      offsets,
+      step: view.getFloat64(COLUMNS.step, true),
+    };
+  }
+
+  /**
+   * @param {number} width bytes of an element
+   * @param {number} at
+   * @param {number} length
+   * @returns {any}
+   */
+  copy(width, at, length) {
+    return new ARRAYS[/** @type {1 | 2 | 4} */ (width)](this.exports.memory.buffer, at, length).slice();
+  }
+}
