@@ -78,6 +78,10 @@ fuzz-c: ## ten minutes of the same for the decoder in C; needs clang
 		-lz -lm -o out/fuzz/c/fuzz
 	out/fuzz/c/fuzz -max_total_time=600 -max_len=8000 -timeout=10 -artifact_prefix=out/fuzz/c/ out/fuzz/c/corpus \
 		$(wildcard conformance/csplat_conformance/vectors/*/)
+	@mkdir -p out/fuzz/inflate
+	$(CLANG) -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all codec/c/fuzz/inflate.c \
+		-lz -o out/fuzz/inflate/fuzz
+	out/fuzz/inflate/fuzz -max_total_time=60 -max_len=4000 -artifact_prefix=out/fuzz/inflate/
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \

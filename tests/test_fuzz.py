@@ -314,7 +314,7 @@ def test_the_program_says_what_it_did(tmp_path):
     assert (0, "") == (run.returncode, run.stderr)
     assert "js: 12 executions" in run.stdout
     assert "lines of functions" in run.stdout
-    assert "of 28 modules ran" in run.stdout
+    assert "of 29 modules ran" in run.stdout
     assert "0 kinds of findings" in run.stdout
 
 

@@ -69,6 +69,19 @@ export class FloatArrays {
     const { means, quats, scales, opacities, sh0, shN } = this;
     return { means, quats, scales, opacities, sh0, shN };
   }
+
+  /** The arrays, and how many values of a splat each has. */
+  columns() {
+    const { means, quats, scales, opacities, sh0, shN, shDegree } = this;
+    return Object.entries({
+      means: { array: means, width: 3 },
+      quats: { array: quats, width: 4 },
+      scales: { array: scales, width: 3 },
+      opacities: { array: opacities, width: 1 },
+      sh0: { array: sh0, width: 3 },
+      shN: { array: shN, width: 3 * shRows(shDegree) },
+    });
+  }
 }
 
 /**

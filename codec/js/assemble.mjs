@@ -10,6 +10,7 @@ import * as spec from './spec.mjs';
  * @typedef {import('./decoder.d.ts').Limits} Limits
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./tile.mjs').Layer} Layer
+ * @typedef {{shDegree: number, integers: boolean, extra: boolean}} Wanted
  */
 
 /** The arrays of some tiles, one after the other. */
@@ -17,7 +18,7 @@ export class Assembly {
   /**
    * @param {Header} header
    * @param {TileRecord[]} tiles
-   * @param {{shDegree: number, integers: boolean, extra: boolean}} wanted
+   * @param {Wanted} wanted
    * @param {Required<Limits>} limits
    * @param {number} tableBytes of all codebooks
    */
@@ -44,6 +45,19 @@ export class Assembly {
   put({ blocks, extras }, tile, first) {
     for (const block of blocks) this.arrays.put(block, tile, first);
     this.extras.put(extras, first);
+  }
+
+  /**
+   * Copy what another assembly has of one tile, which comes from a worker.
+   *
+   * @param {any} fields of floats
+   * @param {number} first
+   */
+  copy(fields, first) {
+    const { arrays } = this;
+    if (!(arrays instanceof FloatArrays)) return;
+    for (const [name, { array, width }] of arrays.columns()) array.set(fields[name], width * first);
+    for (const [name, values] of Object.entries(this.extras.byName())) values.set(fields.extra[name], first);
   }
 
   fields() {

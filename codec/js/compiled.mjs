@@ -1,8 +1,8 @@
 // The decoder in C as WebAssembly (wasm/, codec/c), for floats and packed arrays. Whatever it refuses the modules beside
 // this one decode once more: they say what is wrong, and where.
 
-import { shRows } from './arrays.mjs';
 import * as spec from './spec.mjs';
+import { WASM } from './wasm.mjs';
 
 /**
  * @typedef {import('./arrays.mjs').FloatArrays} FloatArrays
@@ -41,9 +41,13 @@ let spare = null;
 
 /** The module; null where the platform, or the page's policy, has no WebAssembly of this kind. */
 function compiledModule() {
-  compiling ??= import('./wasm.mjs')
-    .then(({ default: text }) => WebAssembly.compile(Uint8Array.from(atob(text), (byte) => byte.charCodeAt(0))))
-    .catch(() => null);
+  compiling ??= (async () => {
+    try {
+      return await WebAssembly.compile(Uint8Array.from(atob(WASM), (byte) => byte.charCodeAt(0)));
+    } catch {
+      return null;
+    }
+  })();
   return compiling;
 }
 
@@ -123,10 +127,7 @@ export class CompiledDecoder {
   readTile({ index, splatCount: n }, arrays, first) {
     let at = this.exports.read_tile(index, arrays.shDegree);
     if (at === 0) return false;
-    const { means, quats, scales, opacities, sh0, shN } = arrays;
-    /** @type {[Float32Array, number][]} */
-    const parts = [[means, 3], [quats, 4], [scales, 3], [opacities, 1], [sh0, 3], [shN, 3 * shRows(arrays.shDegree)]];
-    for (const [array, width] of parts) {
+    for (const [, { array, width }] of arrays.columns()) {
       array.set(new Float32Array(this.exports.memory.buffer, at, width * n), width * first);
       at += 4 * width * n;
     }

@@ -28,7 +28,12 @@ export interface DecodeOptions {
   signal?: AbortSignal;
   /** Splats so far, and all of them. */
   onProgress?: (done: number, total: number) => void;
-  /** Takes the place of node:zlib or DecompressionStream. */
+  /**
+   * Workers at most that decode tiles at the same time; by default this thread does. Where a page's policy or a bundler
+   * keeps them from starting, this thread does, too, and `workers` of the scene is 0.
+   */
+  workers?: number;
+  /** Takes the place of node:zlib or DecompressionStream, and of WebAssembly and workers, which have an inflate of their own. */
   inflate?: Inflate;
 }
 
@@ -247,6 +252,8 @@ export interface PackedBand {
 export interface Whole extends Description {
   header: Header;
   checks: Checks;
+  /** That decoded tiles; 0 where this thread did. */
+  workers: number;
 }
 export type Scene = Splats & Whole;
 export type IntegerScene = IntegerSplats & Whole;

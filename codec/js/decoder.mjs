@@ -13,6 +13,7 @@ import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from
 import { CsplatReader } from './reader.mjs';
 import * as spec from './spec.mjs';
 import { MemorySource } from './whole.mjs';
+import { fillByWorkers } from './workers.mjs';
 
 export { CsplatError, CsplatReader, FormatError, InputError, LimitError, UnsupportedError };
 
@@ -63,14 +64,22 @@ export async function decode(data, options = {}) {
   const assembly = new Assembly(header, tiles, wanted, reader.limits, reader.tableBytes);
   reader.scratch = reused(shDegree);
   try {
-    let first = 0;
-    for (const record of tiles) {
-      await reader.fill(assembly, record, first, signal);
-      first += record.splatCount;
-      onProgress?.(first, assembly.count);
+    let filled = 0;
+    const done = (/** @type {number} */ splats) => {
+      filled += splats;
+      onProgress?.(filled, assembly.count);
+    };
+    const several = (options.workers ?? 0) > 0 && !integers && !inflate;
+    const workers = several ? await fillByWorkers(reader, tiles, assembly, options.workers ?? 0, done, signal) : 0;
+    if (workers === 0) {
+      filled = 0;
+      for (const record of tiles) {
+        await reader.fill(assembly, record, filled, signal);
+        done(record.splatCount);
+      }
     }
     await reader.checkAll();
-    return { ...assembly.fields(), header, ...(await reader.describe()), checks: reader.checks };
+    return { ...assembly.fields(), header, ...(await reader.describe()), checks: reader.checks, workers };
   } finally {
     reader.compiled?.close();
   }

@@ -32,8 +32,18 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
+ * @typedef {import('./assemble.mjs').Wanted} Wanted
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
+
+/**
+ * Layers of a tile that are wanted.
+ *
+ * @param {TileRecord} record
+ * @param {Wanted} wanted
+ */
+const wantedLayers = ({ layers }, { shDegree, extra }) =>
+  layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
 
 /** Reads parts of a file, and checks the CRC of each. */
 export class CsplatReader {
@@ -63,7 +73,10 @@ export class CsplatReader {
     const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
     const header = readIndex(index, file, limits);
     const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
-    return new CsplatReader(source, header, limits, options.inflate ?? (await platformInflate()), compiled);
+    const inflate = options.inflate ?? (await platformInflate());
+    const reader = new CsplatReader(source, header, limits, inflate, compiled);
+    reader.opening = new Map([[0, head], [spec.HEADER_SIZE, index]]);
+    return reader;
   }
 
   /**
@@ -79,6 +92,8 @@ export class CsplatReader {
     this.limits = limits;
     this.inflate = inflate;
     this.compiled = compiled;
+    /** @type {Map<number, Bytes>} header and index by their offsets */
+    this.opening = new Map();
     /** @type {Set<number>} offsets of the chunks whose CRC was checked */
     this.checked = new Set();
     /** How long reads have waited for bytes so far, each for itself. */
@@ -130,8 +145,8 @@ export class CsplatReader {
    * @param {AbortSignal} [signal]
    */
   async fill(assembly, record, first, signal) {
-    const { shDegree, integers, extra } = assembly.wanted;
-    const places = record.layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
+    const { integers } = assembly.wanted;
+    const places = wantedLayers(record, assembly.wanted);
     const bytes = await Promise.all(places.map((place) => this.fetch(place, signal)));
     const chunks = new Map(places.map((place, i) => [place, bytes[i]]));
     const { arrays } = assembly;
@@ -144,6 +159,22 @@ export class CsplatReader {
       assembly.put(await tile.readLayer(this.opened(chunk, place), place, integers), record, first);
     }
     this.release(tile);
+  }
+
+  /**
+   * Bytes by their offsets for another reader, in a worker: header, index, codebooks; or what a tile has.
+   *
+   * @param {Wanted} wanted
+   * @param {TileRecord} [record]
+   * @returns {Promise<Map<number, Bytes>>}
+   */
+  async partsOf(wanted, record) {
+    const places = record
+      ? wantedLayers(record, wanted)
+      : [...this.codebookChunks.values()].filter(({ layer }) => layer <= wanted.shDegree);
+    const parts = record ? [] : [...this.opening];
+    for (const place of places) parts.push([place.offset, await this.fetch(place)]);
+    return new Map(parts.map(([offset, bytes]) => [offset, bytes.slice()])); // alone in their buffers, which are sent
   }
 
   /**

@@ -21,7 +21,17 @@ __all__ = ["JavaScriptDecoder"]
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
 _OPERATORS = Path("test", "operators.mjs")
 #: Not of the decoder of whole files, which is what vectors ask, or not in JavaScript; or tables that are generated.
-_OTHERS: Final = ("spec.mjs", "reader.mjs", "source.mjs", "whole.mjs", "packed.mjs", "compiled.mjs", "wasm.mjs")
+_OTHERS: Final = (
+    "spec.mjs",
+    "reader.mjs",
+    "source.mjs",
+    "whole.mjs",
+    "packed.mjs",
+    "compiled.mjs",
+    "wasm.mjs",
+    "worker.mjs",
+    "workers.mjs",
+)
 #: Finds the parser that the type check of the decoder (codec/js/package.json) runs with.
 _TYPESCRIPT = ("npx", "--yes", "--package", "typescript@5.9.3", "-c", "command -v tsc")
 

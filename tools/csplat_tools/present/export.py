@@ -178,8 +178,8 @@ def _policy(style: str, script: str) -> str:
     """A Content Security Policy that allows what is inside the page and nothing from elsewhere."""
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)]
     return (
-        f"default-src 'none'; script-src 'sha256-{hashes[0]}'; worker-src blob:; style-src 'sha256-{hashes[1]}';"
-        " img-src data:; connect-src 'none'; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src 'sha256-{hashes[0]}' 'wasm-unsafe-eval'; worker-src blob:;"
+        f" style-src 'sha256-{hashes[1]}'; img-src data:; connect-src 'none'; base-uri 'none'; form-action 'none'"
     )
 
 

@@ -1,0 +1,62 @@
+// Tiles decoded by workers: the same scene, the same refusals; without workers where none starts.
+import assert from 'node:assert/strict';
+import { spawnSync } from 'node:child_process';
+import { test } from 'node:test';
+import { fileURLToPath } from 'node:url';
+
+import { decode, readHeader } from '../decoder.mjs';
+import { forged, hash, manifest, refusal, vector } from './helpers.mjs';
+
+const several = manifest.filter(({ error, expect }) => !error.code && expect.header.tile_count > 1);
+
+test('workers decode every scene of several tiles to the same arrays', async () => {
+  assert.ok(several.length > 10);
+  for (const { name, expect } of several) {
+    const progress = [];
+    const scene = await decode(vector(name), { workers: 2, onProgress: (...now) => progress.push(now) });
+    assert.equal(scene.workers, 2, name);
+    for (const [part, [, , sha]] of Object.entries(expect.floats)) assert.equal(hash(scene[part]), sha, `${name} ${part}`);
+    for (const [part, [, , sha]] of Object.entries(expect.extra)) assert.equal(hash(scene.extra[part]), sha, `${name} ${part}`);
+    const { directory, tiles } = scene.header;
+    assert.equal(scene.checks.chunks, directory.length + tiles.reduce((sum, { layers }) => sum + layers.length, 0));
+    assert.equal(progress.length, tiles.length);
+    assert.deepEqual(progress.at(-1), [scene.count, scene.count]);
+  }
+});
+
+test('tiles in another order and lower degrees come from workers, too', async () => {
+  const file = vector(several.find(({ expect }) => expect.header.sh_degree > 1).name);
+  const options = { tiles: [1, 0], shDegree: 1 };
+  const [one, other] = [await decode(file, { ...options, workers: 2 }), await decode(file, options)];
+  for (const part of ['means', 'shN']) assert.equal(hash(one[part]), hash(other[part]));
+});
+
+test('a damaged tile is refused as without workers', async () => {
+  const file = vector(several[0].name);
+  const { tiles } = readHeader(file);
+  for (const options of [{ workers: 2 }, {}]) {
+    const bad = forged(file, (bytes, view) => view.setUint8(tiles[1].layers[0].offset + 12, 99)); // the layer
+    const error = await refusal(() => decode(bad, options));
+    assert.deepEqual([error.code, error.clause], ['E_INDEX', 'TLE-1']);
+  }
+});
+
+test('an abort ends the work of workers', async () => {
+  const control = new AbortController();
+  const reason = new Error('enough');
+  const onProgress = () => control.abort(reason);
+  const work = decode(vector(several[0].name), { workers: 1, signal: control.signal, onProgress });
+  await assert.rejects(work, reason);
+});
+
+test('where no worker may start, decode does without', () => {
+  const script = `
+    import { readFileSync } from 'node:fs';
+    import { decode } from './decoder.mjs';
+    const { workers, count } = await decode(readFileSync(process.argv[1]), { workers: 2 });
+    console.log(workers, count);`;
+  const path = fileURLToPath(new URL(`../../../conformance/csplat_conformance/vectors/${several[0].file}`, import.meta.url));
+  const words = ['--experimental-permission', '--allow-fs-read=*', '--input-type=module', '-e', script, path];
+  const { stdout, stderr } = spawnSync(process.execPath, words, { cwd: new URL('..', import.meta.url), encoding: 'utf8' });
+  assert.equal(stdout, `0 ${several[0].expect.header.splat_count}\n`, stderr);
+});
