@@ -2037,15 +2037,16 @@ static void put_means(const tile *t, const int32_t *q, size_t n, float *out)
     }
 }
 
-/* Lattice values of rows `from` to `to` of the columns, where the block has them, or those splats. Single precision is exact (7.2). */
-static void put_columns(const block *b, unsigned coefficients, size_t from, size_t to, float *out, size_t stride)
+/* Lattice values of rows `from` to `to` of the columns, where the block has them, or those splats. Single precision is exact (7.2).
+ * Splat `base` is the first of `out`. */
+static void put_columns(const block *b, unsigned coefficients, size_t from, size_t to, size_t base, float *out, size_t stride)
 {
     const float step = (float)b->step;
     const size_t n = b->count;
     for (unsigned k = 0; k < coefficients; k++) {
         const int32_t *red = b->columns + k * n, *green = red + coefficients * n, *blue = green + coefficients * n;
         for (size_t i = from; i < to; i++) {
-            float *p = out + (b->rows ? b->rows[i] : i) * stride + 3 * k;
+            float *p = out + ((b->rows ? b->rows[i] : i) - base) * stride + 3 * k;
             p[0] = (float)red[i] * step;
             p[1] = (float)green[i] * step;
             p[2] = (float)blue[i] * step;
@@ -2054,12 +2055,12 @@ static void put_columns(const block *b, unsigned coefficients, size_t from, size
 }
 
 /* Rows of a codebook, of a number of columns that the compiler knows. */
-static inline void put_entries(const block *b, size_t from, size_t to, unsigned columns, float *out, size_t stride)
+static inline void put_entries(const block *b, size_t from, size_t to, unsigned columns, size_t base, float *out, size_t stride)
 {
     const uint32_t size = b->book->size;
     for (size_t i = from; i < to; i++)
         if (b->index[i] < size)
-            memcpy(out + i * stride, b->values + (size_t)b->index[i] * columns, columns * sizeof *out);
+            memcpy(out + (i - base) * stride, b->values + (size_t)b->index[i] * columns, columns * sizeof *out);
 }
 
 static unsigned coefficients_of(unsigned degree)
@@ -2067,31 +2068,32 @@ static unsigned coefficients_of(unsigned degree)
     return (degree + 1) * (degree + 1) - 1;
 }
 
-/* SH bands `first` to `last` of a tile, [n] rows `stride` floats apart: all bands of a few splats, then of the next. */
-static void put_bands(const block *b, unsigned first, unsigned last, size_t n, float *out, size_t stride)
+/* SH bands `first` to `last` of splats `base` to `end`, rows `stride` floats apart: all bands of a few splats, then of the
+ * next. `row` counts, by band, the rows that the columns are about; it is 0 where `base` is. */
+static void put_bands(const block *b, unsigned first, unsigned last, size_t base, size_t end, size_t *row, float *out,
+                      size_t stride)
 {
-    size_t row[SPEC_SH_DEGREE_MAX + 1] = {0}; /* of rows that the columns are about */
-    for (size_t from = 0; from < n; from += PIECE) {
-        const size_t to = from + PIECE < n ? from + PIECE : n;
+    for (size_t from = base; from < end; from += PIECE) {
+        const size_t to = from + PIECE < end ? from + PIECE : end;
         for (unsigned band = first; band <= last; band++) {
             const block *k = &b[band];
             float *at = out + 3 * (coefficients_of(band - 1) - coefficients_of(first - 1));
             const size_t begin = row[band];
             if (k->index && band == 1)
-                put_entries(k, from, to, 9, at, stride);
+                put_entries(k, from, to, 9, base, at, stride);
             else if (k->index && band == 2)
-                put_entries(k, from, to, 15, at, stride);
+                put_entries(k, from, to, 15, base, at, stride);
             else if (k->index)
-                put_entries(k, from, to, 21, at, stride);
+                put_entries(k, from, to, 21, base, at, stride);
             else if (k->rows || !k->count)
                 for (size_t i = from; i < to; i++)
-                    memset(at + i * stride, 0, 3 * (2 * (size_t)band + 1) * sizeof *at); /* +0 */
+                    memset(at + (i - base) * stride, 0, 3 * (2 * (size_t)band + 1) * sizeof *at); /* +0 */
             while (k->rows && row[band] < k->count && k->rows[row[band]] < to)
                 row[band]++;
             if (k->rows)
-                put_columns(k, 2 * band + 1, begin, row[band], at, stride);
+                put_columns(k, 2 * band + 1, begin, row[band], base, at, stride);
             else if (k->count)
-                put_columns(k, 2 * band + 1, from, to, at, stride);
+                put_columns(k, 2 * band + 1, from, to, base, at, stride);
         }
     }
 }
@@ -2200,13 +2202,13 @@ static int put_floats(csplat *d, const tile *t, unsigned id, const block *b, con
     if (id == OPACITIES && out->opacities)
         put_opacities(d, b->columns, n, out->opacities);
     if (id == SCALES && out->scales)
-        put_columns(b, 1, 0, n, out->scales, 3);
+        put_columns(b, 1, 0, n, 0, out->scales, 3);
     if (id == QUATS && out->quats)
         put_quats(d, b->columns, n, out->quats);
     if (id == MEANS && out->means)
         put_means(t, b->columns, n, out->means);
     if (id == SH0 && out->sh0)
-        put_columns(b, 1, 0, n, out->sh0, 3);
+        put_columns(b, 1, 0, n, 0, out->sh0, 3);
     return 1;
 }
 
@@ -2889,10 +2891,10 @@ static void swap(buffer *a, buffer *b)
     *b = kept;
 }
 
-static int read_tile_floats(csplat *d, const tile *t, unsigned degree, const csplat_floats *out)
+/* A tile: geometry into arrays, SH bands up to a degree as blocks, for put_bands. */
+static int read_tile_blocks(csplat *d, const tile *t, unsigned degree, const csplat_floats *out, block *bands)
 {
     const sink into = {out, NULL, NULL};
-    block bands[SPEC_SH_DEGREE_MAX + 1];
     begin_tile(d);
     TRY(read_geometry(d, t, &into));
     for (unsigned band = 1; band <= degree; band++) {
@@ -2904,8 +2906,16 @@ static int read_tile_floats(csplat *d, const tile *t, unsigned degree, const csp
         swap(&d->rows, &d->band_rows[band]);
         TRY(worked);
     }
+    return 1;
+}
+
+static int read_tile_floats(csplat *d, const tile *t, unsigned degree, const csplat_floats *out)
+{
+    block bands[SPEC_SH_DEGREE_MAX + 1];
+    size_t row[SPEC_SH_DEGREE_MAX + 1] = {0};
+    TRY(read_tile_blocks(d, t, degree, out, bands));
     if (out->shN)
-        put_bands(bands, 1, degree, t->splat_count, out->shN, 3 * (size_t)coefficients_of(degree));
+        put_bands(bands, 1, degree, 0, t->splat_count, row, out->shN, 3 * (size_t)coefficients_of(degree));
     return 1;
 }
 
@@ -2921,11 +2931,12 @@ csplat_code csplat_read_band(csplat *d, uint32_t index, unsigned band, float *ou
 {
     const tile *t;
     block bands[SPEC_SH_DEGREE_MAX + 1];
+    size_t row[SPEC_SH_DEGREE_MAX + 1] = {0};
     if (band < 1 || band > SPEC_SH_DEGREE_MAX)
         return done(d, refuse(d, "an SH band that is not 1 to 3"));
     if (!find_tile(d, index, &t) || !read_band_alone(d, t, band, &bands[band]))
         return d->error.code;
-    put_bands(bands, band, band, t->splat_count, out, 3 * (2 * (size_t)band + 1));
+    put_bands(bands, band, band, 0, t->splat_count, row, out, 3 * (2 * (size_t)band + 1));
     return CSPLAT_OK;
 }
 

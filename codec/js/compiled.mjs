@@ -1,6 +1,7 @@
 // The decoder in C as WebAssembly (wasm/, codec/c), for floats and packed arrays. Whatever it refuses the modules beside
 // this one decode once more: they say what is wrong, and where.
 
+import { shRows } from './arrays.mjs';
 import * as spec from './spec.mjs';
 import { WASM } from './wasm.mjs';
 
@@ -21,6 +22,7 @@ import { WASM } from './wasm.mjs';
  * @property {() => void} close
  * @property {() => number} check
  * @property {(index: number, degree: number) => number} read_tile
+ * @property {(degree: number, from: number, to: number) => number} read_rows
  * @property {(index: number, band: number) => number} read_band
  * @property {(index: number) => number} read_packed
  * @property {(index: number, band: number) => number} read_packed_band
@@ -31,6 +33,7 @@ import { WASM } from './wasm.mjs';
 const COLUMNS = { data: 0, width: 4, columns: 8, count: 12, offset: 16, step: 184 };
 const PACKED = { rows: 192, index: 196, indexWidth: 200, codebook: 204, size: 208 };
 const GEOMETRY = ['opacities', 'scales', 'quats', 'means', 'sh0'];
+const SH_ROWS = 512; // as in wasm/interface.c
 const ARRAYS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
 
 /** @type {Promise<WebAssembly.Module | null> | null} */
@@ -127,9 +130,18 @@ export class CompiledDecoder {
   readTile({ index, splatCount: n }, arrays, first) {
     let at = this.exports.read_tile(index, arrays.shDegree);
     if (at === 0) return false;
-    for (const [, { array, width }] of arrays.columns()) {
-      array.set(new Float32Array(this.exports.memory.buffer, at, width * n), width * first);
+    const { buffer } = this.exports.memory;
+    for (const [name, { array, width }] of arrays.columns()) {
+      if (name === 'shN') continue;
+      array.set(new Float32Array(buffer, at, width * n), width * first);
       at += 4 * width * n;
+    }
+    const { shN, shDegree } = arrays;
+    const width = 3 * shRows(shDegree);
+    for (let from = 0; width && from < n; from += SH_ROWS) {
+      const to = Math.min(n, from + SH_ROWS);
+      const rows = new Float32Array(buffer, this.exports.read_rows(shDegree, from, to), width * (to - from));
+      shN.set(rows, width * (first + from));
     }
     return true;
   }

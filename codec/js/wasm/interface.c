@@ -1,15 +1,13 @@
 /* What the JavaScript decoder (../compiled.mjs) calls of the decoder in C: one file to an instance, its bytes by the
  * import `read`. Messages are left out: what is refused here JavaScript decodes again, to say why.
  * SPDX-License-Identifier: Apache-2.0 */
-#include "csplat.h"
+#include "../../c/csplat.c"
 
-#include <stdarg.h>
-#include <stdio.h>
-#include <stdlib.h>
-
-#define EXPORT(name) __attribute__((export_name(#name))) name
+#define EXPORT(name) __attribute__((export_name(#name))) js_##name
 
 __attribute__((import_module("env"), import_name("read"))) int read_part(double offset, size_t size, void *into);
+
+enum { SH_ROWS = 512 }; /* as in ../compiled.mjs */
 
 /* ../compiled.mjs reads these structures as they lie in memory. */
 typedef char columns_as_expected[sizeof(csplat_columns) == 192 && offsetof(csplat_columns, offset) == 16 ? 1 : -1];
@@ -19,8 +17,9 @@ static csplat *file;
 static csplat_packed_geometry geometry;
 static csplat_packed band_columns;
 static csplat_columns entries;
-static float *values;
-static size_t room;
+static buffer values;
+static block bands[SPEC_SH_DEGREE_MAX + 1];
+static size_t rows_put[SPEC_SH_DEGREE_MAX + 1];
 
 /* In the place of the library's, which would take up more than the decoder. */
 int snprintf(char *out, size_t size, const char *format, ...)
@@ -45,16 +44,6 @@ static int read_from_javascript(void *user, uint64_t offset, size_t size, void *
     return read_part((double)offset, size, into);
 }
 
-/* Room for n splats of so many floats. */
-static float *reserve(size_t n, size_t floats)
-{
-    if (n * floats > room) {
-        free(values);
-        room = (values = malloc(n * floats * sizeof *values)) ? n * floats : 0;
-    }
-    return values;
-}
-
 int EXPORT(open)(double size)
 {
     csplat_source source = {read_from_javascript, NULL, (uint64_t)size};
@@ -63,8 +52,9 @@ int EXPORT(open)(double size)
 
 void EXPORT(close)(void)
 {
+    release(file, values.data);
+    memset(&values, 0, sizeof values);
     csplat_close(file);
-    file = NULL;
 }
 
 int EXPORT(check)(void)
@@ -72,28 +62,36 @@ int EXPORT(check)(void)
     return csplat_check(file) == CSPLAT_OK;
 }
 
-/* A tile's means, quats, scales, opacities, sh0 and shN, one after the other; NULL where it is refused. */
+/* A tile's means, quats, scales, opacities and sh0, one after the other; NULL where it, or an SH band, is refused. */
 const float *EXPORT(read_tile)(uint32_t index, unsigned degree)
 {
-    csplat_tile tile;
-    csplat_floats out;
-    if (csplat_get_tile(file, index, &tile) ||
-        !(out.means = reserve(tile.splat_count, 11 + 3 * ((size_t)degree + 1) * (degree + 1))))
+    const tile *t;
+    csplat_floats out = {0};
+    if (!find_tile(file, index, &t) || !reserve(file, &values, t->splat_count, 14 * sizeof(float)))
         return NULL;
-    out.quats = out.means + 3 * (size_t)tile.splat_count;
-    out.scales = out.quats + 4 * (size_t)tile.splat_count;
-    out.opacities = out.scales + 3 * (size_t)tile.splat_count;
-    out.sh0 = out.opacities + tile.splat_count;
-    out.shN = out.sh0 + 3 * (size_t)tile.splat_count;
-    return csplat_read_tile(file, index, degree, &out) ? NULL : values;
+    out.means = values.data;
+    out.quats = out.means + 3 * (size_t)t->splat_count;
+    out.scales = out.quats + 4 * (size_t)t->splat_count;
+    out.opacities = out.scales + 3 * (size_t)t->splat_count;
+    out.sh0 = out.opacities + t->splat_count;
+    memset(rows_put, 0, sizeof rows_put);
+    return read_tile_blocks(file, t, degree, &out, bands) ? values.data : NULL;
+}
+
+/* SH of the tile's splats `from` to `to`; from the first on, some at a time, so that they stay in the nearest caches. */
+const float *EXPORT(read_rows)(unsigned degree, uint32_t from, uint32_t to)
+{
+    static float rows[SH_ROWS * 3 * 15];
+    put_bands(bands, 1, degree, from, to, rows_put, rows, 3 * (size_t)coefficients_of(degree));
+    return rows;
 }
 
 const float *EXPORT(read_band)(uint32_t index, unsigned band)
 {
-    csplat_tile tile;
-    if (csplat_get_tile(file, index, &tile) || !reserve(tile.splat_count, 3 * (2 * (size_t)band + 1)))
+    const tile *t;
+    if (!find_tile(file, index, &t) || !reserve(file, &values, t->splat_count, 3 * (2 * (size_t)band + 1) * sizeof(float)))
         return NULL;
-    return csplat_read_band(file, index, band, values) ? NULL : values;
+    return csplat_read_band(file, index, band, values.data) ? NULL : values.data;
 }
 
 const csplat_packed_geometry *EXPORT(read_packed)(uint32_t index)
