@@ -377,7 +377,8 @@ struct csplat {
     const uint8_t *index;
     size_t index_size;
     uint64_t table_bytes;
-    /* of the tile that is being read: by attribute the codebook in use, and how many splats it does not serve */
+    /* The tile that was read last; by attribute the codebook whose indices are here, and how many splats it does not serve. */
+    const tile *current;
     const book *used[ATTRIBUTES_END];
     uint32_t escapes_of[ATTRIBUTES_END];
 #ifndef CSPLAT_NO_ZLIB
@@ -1860,6 +1861,7 @@ static int read_indices(csplat *d, cursor *c, const book *b, unsigned id, uint32
 {
     uint32_t *index, highest = 0, escaped = 0;
     stream s;
+    d->used[id] = NULL;
     TRY(read_stream(d, c, n, 4, &s));
     TRY(reserve(d, &d->indices[id], n, sizeof *index));
     index = d->indices[id].data;
@@ -2166,9 +2168,10 @@ static int pack(csplat *d, buffer *into, const int32_t *columns, size_t n, unsig
 }
 /* Tiles (5.2) ---------------------------------------------------------------------------------------------------------- */
 
-static void begin_tile(csplat *d)
+static void begin_tile(csplat *d, const tile *t)
 {
     memset(d->used, 0, sizeof d->used);
+    d->current = t;
 }
 
 static int load_layer(csplat *d, const tile *t, unsigned layer, unsigned blocks, cursor *c)
@@ -2242,6 +2245,7 @@ static int read_geometry(csplat *d, const tile *t, const sink *out)
 {
     cursor c;
     block b;
+    begin_tile(d, t);
     TRY(load_layer(d, t, 0, 5, &c));
     for (unsigned id = OPACITIES; id <= SH0; id++) {
         TRY(read_block(d, &c, t, id, &b));
@@ -2269,11 +2273,23 @@ static int read_band(csplat *d, const tile *t, unsigned band, block *b)
     return at_end(d, &c);
 }
 
-/* An SH band of a tile of which nothing was read: its indices may stand in a lower band. */
+/* Whether bands of the tile may have their indices in a lower one, which was not read last. */
+static int may_lack_indices(const csplat *d, const tile *t, unsigned band)
+{
+    for (unsigned i = 0; i < t->table_count; i++) {
+        const book *k = find_book(d, get_u16(t->tables + 2 * i));
+        if (k && is_sh_book(k) && k->band_first < band && band <= k->band_last && d->used[SH0 + k->band_first] != k)
+            return 1;
+    }
+    return 0;
+}
+
+/* An SH band of a tile, of which others may have been read or not: its indices may stand in a lower band. */
 static int read_band_alone(csplat *d, const tile *t, unsigned band, block *b)
 {
-    begin_tile(d);
-    if (band > 1 && band <= d->info.sh_degree && t->layers[band]) {
+    if (d->current != t)
+        begin_tile(d, t);
+    if (band <= d->info.sh_degree && t->layers[band] && may_lack_indices(d, t, band)) {
         cursor c;
         const book *k;
         TRY(load_layer(d, t, band, 1, &c));
@@ -2895,7 +2911,6 @@ static void swap(buffer *a, buffer *b)
 static int read_tile_blocks(csplat *d, const tile *t, unsigned degree, const csplat_floats *out, block *bands)
 {
     const sink into = {out, NULL, NULL};
-    begin_tile(d);
     TRY(read_geometry(d, t, &into));
     for (unsigned band = 1; band <= degree; band++) {
         int worked;
@@ -2950,7 +2965,6 @@ csplat_code csplat_read_integers(csplat *d, uint32_t index, const csplat_integer
 {
     const sink into = {NULL, out, NULL};
     const tile *t;
-    begin_tile(d);
     if (!find_tile(d, index, &t) || !read_geometry(d, t, &into))
         return d->error.code;
     for (unsigned band = 1; band <= d->info.sh_degree; band++) {
@@ -2970,7 +2984,6 @@ csplat_code csplat_read_packed(csplat *d, uint32_t index, csplat_packed_geometry
     const sink into = {NULL, NULL, out};
     const tile *t;
     memset(out, 0, sizeof *out);
-    begin_tile(d);
     return done(d, find_tile(d, index, &t) && read_geometry(d, t, &into));
 }
 

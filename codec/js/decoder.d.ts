@@ -14,7 +14,7 @@ export interface Limits {
 export type Inflate = (coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>;
 
 export type Form = 'floats' | 'integers';
-/** Of a reader's layers. */
+/** Of a reader's tiles and layers. */
 export type LayerForm = Form | 'packed';
 
 export interface DecodeOptions {
@@ -243,6 +243,11 @@ export interface PackedGeometry {
   sh0: PackedColumns;
 }
 
+/** A tile: layer 0 and, from band 1 on, its SH bands; null for those that it leaves out, whose coefficients are 0. */
+export interface PackedTile extends PackedGeometry {
+  sh: (Packed | null)[];
+}
+
 /** An SH band of a tile; column channel · (2l + 1) + m holds coefficient m. */
 export interface PackedBand {
   count: number;
@@ -319,6 +324,8 @@ export class CsplatReader {
     index: number,
     options?: ReadOptions & { form?: 'floats'; shDegree?: number; extra?: boolean },
   ): Promise<Splats>;
+  /** Integers as narrow as the tile allows, codebooks as tables: to be drawn or kept as they are. */
+  readTile(index: number, options: { form: 'packed'; shDegree?: number; signal?: AbortSignal }): Promise<PackedTile>;
   /** Layer 0: geometry and base colour. */
   readLayer(index: number, layer: 0, options: ReadOptions & { form: 'integers' }): Promise<IntegerSplats>;
   readLayer(index: number, layer: 0, options?: ReadOptions & { form?: 'floats' }): Promise<Splats>;
@@ -333,7 +340,6 @@ export class CsplatReader {
     layer: number,
     options?: ReadOptions & { form?: 'floats' },
   ): Promise<{ sh: Float32Array; count: number } | null>;
-  /** Integers as narrow as the tile allows, codebooks as tables: to be drawn or kept as they are. */
   readLayer(index: number, layer: 0, options: { form: 'packed'; signal?: AbortSignal }): Promise<PackedGeometry>;
   readLayer(
     index: number,

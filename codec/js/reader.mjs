@@ -125,15 +125,35 @@ export class CsplatReader {
    * Read a tile with its SH bands up to a degree.
    *
    * @param {number} index
-   * @param {ReadOptions & {shDegree?: number, extra?: boolean}} [options]
-   * @returns {Promise<any>} the arrays that `decode` gives, of the one tile
+   * @param {{form?: LayerForm, shDegree?: number, extra?: boolean, signal?: AbortSignal}} [options]
+   * @returns {Promise<any>} the arrays that `decode` gives, of the one tile; packed, see decoder.d.ts
    */
   async readTile(index, { shDegree, extra = false, form, signal } = {}) {
     const record = checkedTile(index, this.header);
+    if (form === 'packed') return this.readPackedTile(record, checkedDegree(shDegree, this.header), signal);
     const wanted = { shDegree: checkedDegree(shDegree, this.header), integers: checkedForm(form), extra };
     const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes);
     await this.fill(assembly, record, 0, signal);
     return assembly.fields();
+  }
+
+  /**
+   * @param {TileRecord} record
+   * @param {number} shDegree
+   * @param {AbortSignal} [signal]
+   */
+  async readPackedTile(record, shDegree, signal) {
+    const bands = Array.from({ length: shDegree }, (_, i) => i + 1);
+    const layers = [spec.LAYER_GEOMETRY, ...bands].map((layer) => ({ tile: record.index, layer }));
+    this.prefetch(layers, { signal });
+    const geometry = await this.readLayer(record.index, spec.LAYER_GEOMETRY, { form: 'packed', signal });
+    const sh = [];
+    for (const band of bands) {
+      const read = await this.readLayer(record.index, band, { form: 'packed', signal });
+      sh.push(read && read.sh);
+    }
+    for (const place of record.layers) this.kept.delete(place);
+    return { ...geometry, sh };
   }
 
   /**

@@ -2,7 +2,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { CsplatReader } from '../decoder.mjs';
+import { CsplatReader, decode } from '../decoder.mjs';
 import { zlibInflate } from '../inflate.mjs';
 import { hash, manifest, refusal, vector } from './helpers.mjs';
 
@@ -76,6 +76,14 @@ for (const { name, way, options } of cases) {
         if (band === null) assert.equal(integers, null);
         else assert.equal(hash(colours(integers.sh, band.count)), hash(band.sh), `layer ${layer}`);
       }
+      const { shDegree } = reader.header;
+      const whole = await reader.readTile(index, { form: 'packed' });
+      assert.deepEqual(whole.means, packed.means);
+      assert.equal(whole.sh.length, shDegree);
+      for (const [i, sh] of whole.sh.entries()) {
+        const integers = await reader.readLayer(index, i + 1, { form: 'packed' });
+        assert.deepEqual(sh, integers && integers.sh);
+      }
     }
   });
 }
@@ -106,7 +114,9 @@ test('budgets hold for the form packed', async () => {
   assert.equal((await refusal(() => reader.readLayer(0, 0, { form: 'packed' }))).code, 'E_LIMIT');
 });
 
-test('whole scenes and tiles do not come packed', async () => {
-  const reader = await CsplatReader.open(new Blob([vector('valid/rich')]));
-  assert.equal((await refusal(() => reader.readTile(0, { form: 'packed' }))).code, 'E_INPUT');
+test('a tile comes packed up to a degree, whole scenes do not', async () => {
+  const file = vector('valid/rich');
+  const reader = await CsplatReader.open(new Blob([file]));
+  assert.equal((await reader.readTile(0, { form: 'packed', shDegree: 1 })).sh.length, 1);
+  assert.equal((await refusal(() => decode(file, { form: 'packed' }))).code, 'E_INPUT');
 });
