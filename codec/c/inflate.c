@@ -8,13 +8,13 @@
 #include <string.h>
 
 enum { LITERALS = 288, DISTANCES = 32, LENGTHS = 19, BITS_MAX = 15 };
-enum { LITERAL_ROOT = 10, DISTANCE_ROOT = 8, LENGTH_ROOT = 7 };
+enum { LITERAL_ROOT = 11, DISTANCE_ROOT = 8, LENGTH_ROOT = 7 };
 /* Entries of a table for that many symbols and root bits at most, as zlib's program `enough` counts them. */
-enum { LITERAL_ENTRIES = 1334, DISTANCE_ENTRIES = 402, LENGTH_ENTRIES = 128 };
+enum { LITERAL_ENTRIES = 2342, DISTANCE_ENTRIES = 402, LENGTH_ENTRIES = 128 };
 
-/* An entry of a table: the bits of the codeword (0 to 4), extra bits (8 to 11) and flags (12 to 15), a value above. Of
- * SUBTABLE the extra bits are those that point into it, and the value its place. */
-enum { LITERAL = 0x8000, SUBTABLE = 0x4000, END = 0x2000, WRONG = 0x1000 };
+/* An entry of a table: the bits of the codeword (0 to 4), extra bits (8 to 11) and flags (5, 12 to 15), a value above. Of
+ * SUBTABLE the extra bits are those that point into it, and the value its place; a PAIR is two literals. */
+enum { LITERAL = 0x8000, SUBTABLE = 0x4000, END = 0x2000, WRONG = 0x1000, PAIR = 0x20 };
 
 typedef struct code {
     uint32_t literals[LITERAL_ENTRIES], distances[DISTANCE_ENTRIES];
@@ -155,6 +155,17 @@ static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means
     return 1;
 }
 
+/* Where the bits that point to a literal hold the next one, too, both come from one entry. */
+static int pair_literals(uint32_t *table)
+{
+    for (unsigned i = 1u << LITERAL_ROOT; i-- > 0;) { /* from above: what is looked up is no pair yet */
+        uint32_t e = table[i], next = table[i >> (e & 31)], bits = (e & 31) + (next & 31);
+        if (e & LITERAL && next & LITERAL && bits <= LITERAL_ROOT)
+            table[i] = LITERAL | PAIR | bits | (e & 0xFF0000) | (next & 0xFF0000) << 8;
+    }
+    return 1;
+}
+
 static int fixed_code(code *c)
 {
     uint8_t lengths[LITERALS];
@@ -163,6 +174,7 @@ static int fixed_code(code *c)
     memset(lengths + 256, 7, 24);
     memset(lengths + 280, 8, 8);
     make_table(lengths, LITERALS, literal_entry, LITERAL_ROOT, 2, c->literals);
+    pair_literals(c->literals);
     memset(lengths, 5, DISTANCES);
     return make_table(lengths, DISTANCES, distance_entry, DISTANCE_ROOT, 2, c->distances);
 }
@@ -198,6 +210,7 @@ static int dynamic_code(reader *r, code *c)
         i += times;
     }
     return lengths[256] && make_table(lengths, literals, literal_entry, LITERAL_ROOT, 1, c->literals) &&
+           pair_literals(c->literals) &&
            make_table(lengths + literals, distances, distance_entry, DISTANCE_ROOT, 0, c->distances);
 }
 
@@ -215,6 +228,15 @@ static inline void copy_match(uint8_t *to, size_t distance, size_t length, size_
             to[i] = from[i];
 }
 
+/* One literal or two, and how many; two bytes are written. */
+static inline size_t put_literals(reader *r, uint32_t e, uint8_t *out)
+{
+    skip(r, e & 31);
+    out[0] = (uint8_t)(e >> 16);
+    out[1] = (uint8_t)(e >> 24);
+    return 1 + (e >> 5 & 1);
+}
+
 /* The data of a fixed or dynamic block; how far the output goes then, or `wrong`. */
 static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at, size_t size, size_t wrong)
 {
@@ -224,13 +246,23 @@ static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at
         uint32_t e;
         refill(&r);
         e = entry(c->literals, &r, LITERAL_ROOT);
-        for (int i = 0; i < 2 && e & LITERAL && at < size; i++) { /* 2 x 15 bits, and 15 more are looked at */
-            skip(&r, e & 31);
-            out[at++] = (uint8_t)(e >> 16);
+        if (e & LITERAL && size - at >= 6) { /* up to three times 15 bits and two bytes */
+            at += put_literals(&r, e, out + at);
             e = entry(c->literals, &r, LITERAL_ROOT);
+            if (e & LITERAL) {
+                at += put_literals(&r, e, out + at);
+                e = entry(c->literals, &r, LITERAL_ROOT);
+            }
         }
         if (e & LITERAL) {
-            if (r.count < 0 || at == size)
+            if (size - at >= 2)
+                at += put_literals(&r, e, out + at);
+            else if (at < size && !(e & PAIR)) {
+                skip(&r, e & 31);
+                out[at++] = (uint8_t)(e >> 16);
+            } else
+                return wrong;
+            if (r.count < 0)
                 return wrong;
             continue;
         }
