@@ -72,12 +72,13 @@ wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clan
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400
 
-fuzz-c: ## ten minutes of the same for the decoder in C; needs clang
+fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what it finds for the others; needs clang
 	@mkdir -p out/fuzz/c/corpus
-	$(CLANG) -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all codec/c/fuzz/fuzz.c \
-		-lz -lm -o out/fuzz/c/fuzz
+	$(CLANG) -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all \
+		-fno-sanitize-coverage=trace-cmp codec/c/fuzz/fuzz.c -lz -lm -o out/fuzz/c/fuzz
 	out/fuzz/c/fuzz -max_total_time=600 -max_len=8000 -timeout=10 -artifact_prefix=out/fuzz/c/ out/fuzz/c/corpus \
 		$(wildcard conformance/csplat_conformance/vectors/*/)
+	$(BIN)/python tests/fuzz.py --target others --replay out/fuzz/c/corpus
 	@mkdir -p out/fuzz/inflate
 	$(CLANG) -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all codec/c/fuzz/inflate.c \
 		-lz -o out/fuzz/inflate/fuzz
