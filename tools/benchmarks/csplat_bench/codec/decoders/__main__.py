@@ -95,7 +95,7 @@ def main(
     extra: EXTRA = [],
     presets: PRESETS = "fast,balanced,small",
     places: Annotated[str, typer.Option(help="where decoders run")] = _PLACES,
-    runs: Annotated[int, typer.Option(help="of each decoder on each file")] = 9,
+    runs: Annotated[int, typer.Option(help="of each decoder on each file")] = 7,
     no_peers: Annotated[bool, typer.Option("--no-peers", help="leave decoders of others out")] = False,
     chromium: Annotated[str, typer.Option(help="the program")] = shutil.which("chromium") or "chromium",
     markdown: MARKDOWN = False,
@@ -175,7 +175,7 @@ def measured(scene: Scene, wanted: Sequence[Decoder], files: dict[str, Path], ru
         warm_up = min(10, 1 + _WARM_SPLATS // scene.splat_count)
         for turn in range(1 - warm_up, runs + 1):
             turns.append([running.decode()[0] for running in started])
-            tell(f"{scene.name}: turn {turn} of {runs}")
+            tell(f"{scene.name}: turn {turn} of {runs}" if turn > 0 else f"{scene.name}: warming up")
     columns = list(zip(*turns[warm_up:], strict=True))
     references = {
         one.place: column
@@ -210,7 +210,7 @@ def _table(rows: Sequence[Row], *, markdown: bool) -> str:
 
 
 def _cell(row: Row) -> str:
-    return f"{row.splats / statistics.median(row.seconds) / 1e6:.1f}{optional(row.ratio, ' ({:.2f})'.format, '')}"
+    return f"{row.splats / statistics.median(row.seconds) / 1e6:.3g}{optional(row.ratio, ' ({:.2f})'.format, '')}"
 
 
 if __name__ == "__main__":

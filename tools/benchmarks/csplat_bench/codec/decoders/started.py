@@ -33,7 +33,7 @@ _PACKAGES = {
 
 _PRESETS = ("fast.csplat", "balanced.csplat", "small.csplat")
 _FLOATS = "float32"
-_GEOMETRY = "float32 centres and covariances; colours and SH in bytes"
+_GEOMETRY = "float32 centres, covariances; bytes"
 _LOAD = """async ([timing, module, name, url]) => {
   try {
     const { once } = await import(timing);
@@ -85,14 +85,14 @@ DECODERS = [
     Decoder("native", "csplat C", _PRESETS, _FLOATS, "csplat", "1"),
     Decoder("native", "csplat C, all cores", _PRESETS, _FLOATS, "csplat", _CORES),
     Decoder("native", "SPZ's library in C++", ("v4.spz", "v3.spz"), _FLOATS, "spz", "floats"),
-    Decoder("native", "the same, not unpacked", ("v4.spz",), "quantised, in bytes", "spz", "packed"),
+    Decoder("native", "the same, not unpacked", ("v4.spz",), "bytes", "spz", "packed"),
     Decoder("python", "csplat Python", _PRESETS, _FLOATS, "serve.py", "1"),
     Decoder("python", "csplat Python, all cores", _PRESETS, _FLOATS, "serve.py", _CORES),
     *_in_javascript("node"),
     Decoder("node", "three.js SPLATLoader", ("splat",), _GEOMETRY, "others.mjs", "threeSplat"),
     Decoder("node", "three.js KSPLATLoader", ("ksplat",), _GEOMETRY, "others.mjs", "threeKsplat"),
     *_in_javascript("chromium"),
-    Decoder("chromium", "Spark", ("v3.spz",), "16 bytes, SH in words of few bits", "others.mjs", "spark"),
+    Decoder("chromium", "Spark", ("v3.spz",), "16 bytes; SH in words", "others.mjs", "spark"),
     Decoder("chromium", "GaussianSplats3D", ("v2.spz",), "float32, SH to degree 2", "others.mjs", "gaussianSplats3d"),
 ]  # fmt: skip
 
@@ -122,6 +122,8 @@ def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder
             absent[driver] = str(error)
         except subprocess.CalledProcessError as error:
             absent[driver] = ((error.stderr or "").strip().splitlines() or [str(error)])[0]
+    if "others.mjs" in absent:
+        absent.setdefault("spz", "there are no SPZ without @adobe/spz")
     for name, reason in absent.items():
         if any(name in (one.place, one.driver) for one in wanted):
             tell(f"left out: {name}: {reason}")
