@@ -53,6 +53,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).codec.formats
+	$(BENCH).codec.decoders
 	$(BENCH).rendering
 	$(BENCH).rendering.removal pass
 	$(BENCH).rendering.removal removal --gone 20,40,60,80

@@ -1,13 +1,18 @@
-"""`csplat_bench.codec.decoders`: equal decoders pass, and one that gives anything else is found out."""
+"""`csplat_bench.codec.decoders`: what is compared with what; decoders that agree pass, one that does not is found."""
 
+import json
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
-from benching import bench
 from chromium import absent
 
-from csplat import encode
+from csplat import encode, write_ply
+from csplat_bench.codec.decoders import agree
+from csplat_bench.codec.decoders.__main__ import main, measured
+from csplat_bench.codec.decoders.started import DECODERS
+from csplat_bench.common.scenes import Scene
 
 # A decoder behind the protocol of codec/js/test/adapter.mjs that gives the same answer to every file.
 STUB = """#!{python}
@@ -18,10 +23,6 @@ while head := sys.stdin.buffer.read(4):
 """
 
 
-def run(*words):
-    return bench("codec.decoders", *words, check=False)
-
-
 @pytest.fixture
 def node():
     if shutil.which("node") is None:
@@ -29,16 +30,18 @@ def node():
 
 
 @pytest.mark.usefixtures("node")
-def test_both_decoders_give_the_same(sample_path, tmp_path, make_model):
+def test_both_decoders_give_the_same(sample_path, tmp_path, make_model, capsys):
     (tmp_path / "extra.csplat").write_bytes(encode(make_model(50, 2)))
     (tmp_path / "broken.csplat").write_bytes(encode(make_model(50, 1))[:-1])
-    done = run(sample_path, *sorted(tmp_path.glob("*.csplat")), "--presets", "fast,small")
-    assert 0 == done.returncode, done.stderr
-    lines = done.stdout.splitlines()
-    assert ["equal", "equal"] == [line.split()[-1] for line in lines if line.startswith("sample ")]
+    write_ply(tmp_path / "tiny.ply", make_model(300, 3))
+    assert 0 == agree.main([sample_path, *sorted(tmp_path.glob("*.csplat"))], presets="fast")
+    first = capsys.readouterr().out.splitlines()
+    assert 0 == agree.main([tmp_path / "tiny.ply"], presets="fast,small")
+    lines = [*first, *capsys.readouterr().out.splitlines()]
+    assert ["equal"] * 3 == [line.split()[-1] for line in lines if line.startswith(("sample ", "tiny "))]
     assert any(line.startswith("extra.csplat") and line.endswith("equal") for line in lines)
     assert any(line.startswith("broken.csplat") and "both refuse it, E_TRUNCATED" in line for line in lines)
-    assert "4 of 4 files agree" == lines[-1]
+    assert "3 of 3 files agree" == first[-1]
 
 
 @pytest.mark.parametrize(
@@ -49,12 +52,61 @@ def test_both_decoders_give_the_same(sample_path, tmp_path, make_model):
         ('{"defect": "TypeError: oh"}', "DIFFERENT: JavaScript failed: TypeError: oh"),
     ],
 )
-def test_a_decoder_that_gives_something_else_fails(tmp_path, make_model, answer, expected):
+def test_a_decoder_that_gives_something_else_fails(tmp_path, make_model, answer, expected, capsys):
     stub = tmp_path / "stub"
     stub.write_text(STUB.format(python=sys.executable, answer=answer))
     stub.chmod(0o755)
     (tmp_path / "scene.csplat").write_bytes(encode(make_model(50, 0)))
-    done = run(tmp_path / "scene.csplat", "--node", stub)
-    assert 1 == done.returncode
-    assert expected in done.stdout
-    assert "0 of 1 files agree" in done.stdout
+    assert 1 == agree.main([tmp_path / "scene.csplat"], node=str(stub))
+    said = capsys.readouterr().out
+    assert expected in said
+    assert "0 of 1 files agree" in said
+
+
+class Told:
+    """A decoder that takes as long as it is told, for ever the same seconds in turn, or fails."""
+
+    def __init__(self, seconds):
+        self.seconds = seconds
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def decode(self):
+        if not self.seconds:
+            raise OSError("it does not work here")
+        self.seconds.append(self.seconds.pop(0))
+        return self.seconds[-1], 400
+
+    def growth_bytes(self):
+        return 800
+
+
+def test_a_ratio_is_that_of_one_turn_and_who_fails_is_left_out(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    native = {(one.driver, one.word): one for one in DECODERS if one.place == "native"}
+    seconds = {"csplat": [1.0, 2.0, 4.0], "spz": [5.0, 4.0, 12.0]}  # 5, 2 and 3 times as long
+    wanted = [native["csplat", "1"], native["spz", "floats"], native["spz", "packed"]]
+    files = dict.fromkeys(("fast.csplat", "v4.spz"), tmp_path / "file")
+
+    def start(one, _path):
+        return Told([] if one.word == "packed" else list(seconds[one.driver]))
+
+    ours, theirs = measured(Scene("scene", Path(), 100, 0), wanted, files, 3, start)
+    assert (3.0, 1.0) == (ours.ratio, theirs.ratio)
+    assert sorted(seconds["csplat"]) == sorted(ours.seconds)
+    assert "left out: the same, not unpacked of v4.spz: it does not work here" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("node")
+def test_decoders_are_timed_on_files_of_a_scene(tmp_path, make_model, capsys):
+    write_ply(tmp_path / "scene.ply", make_model(50, 1))
+    words = {"scenes": "", "extra": [tmp_path / "scene.ply"], "presets": "fast", "places": "node", "runs": 1}
+    main(**words, no_peers=True, json=tmp_path / "found.json", cache=tmp_path, peers=tmp_path)
+    (row,) = json.loads((tmp_path / "found.json").read_text())["rows"]
+    assert ("csplat JavaScript", "fast.csplat", 50 * 92) == (row["decoder"], row["file"], row["array_bytes"])
+    assert 1 == len(row["seconds"])
+    assert "scene, 50, SH 1" in capsys.readouterr().out

@@ -1,1 +1,1 @@
-"""What the codec makes of scenes: throughput, memory, size and quality, and whether both decoders agree."""
+"""What the codec makes of scenes: throughput, memory, size, quality; how fast decoders are, and whether ours agree."""

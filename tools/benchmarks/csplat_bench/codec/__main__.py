@@ -1,12 +1,12 @@
-"""Measure the codec: throughput, memory and size, beside what other programs make of the same files.
+"""Measure encoding: throughput, memory and size, beside what other programs make of the same files.
 
     python -m csplat_bench.codec                     # everything that is there; an hour or more
     python -m csplat_bench.codec --quick             # the sample alone, one run
     python -m csplat_bench.codec --scenes lego60k,fox-1M --json out/bench.json
 
-Times are medians. MB = 10^6 bytes. Encode and decode are timed from arrays to bytes and back, in a process of their
-own; "PLY -> file" is a whole process. Peak is how much the process grew at most during its first call, as a multiple
-of the scene's arrays.
+Times are medians. MB = 10^6 bytes. Encoding is timed from arrays to bytes, in a process of its own; "PLY -> file" is a
+whole process. Peak is how much the process grew at most during its first call, as a multiple of the scene's arrays.
+How fast files are decoded: csplat_bench.codec.decoders.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Annotated
 
 import typer
 
-from csplat_bench.codec.process import Run, decoded, encoded
+from csplat_bench.codec.process import Run, encoded
 from csplat_bench.common.command import CACHE, JSON, PEERS, PRESETS, SCENES, THREADS, listed, run
 from csplat_bench.common.measuring import Timing, alone, run_timed
 from csplat_bench.common.peers import CAP_SECONDS, Peer, find_splat_transform, transform
@@ -32,11 +32,10 @@ _LARGE = 2_000_000  # splats: one run, fewer programs
 
 @dataclass(frozen=True)
 class Measured:
-    """A preset: its file, from arrays and back, and a whole process; that is `None` where it reached the cap."""
+    """A preset: its file, from arrays, and in a whole process; that is `None` where it reached the cap."""
 
     size_bytes: int
     encode: Run
-    decode: Run
     whole: Timing | None
 
 
@@ -74,23 +73,21 @@ def _measured(scene: Scene, preset: str, runs: int, threads: int | None, cache: 
     # A preset that clusters takes its time, and the same time each run.
     encode_runs = runs if preset == "fast" or scene.splat_count < _LARGE // 4 else 1
     encode = alone(encoded, scene.path, output, preset, threads, encode_runs)
-    decode = alone(decoded, output, max(runs, 3))
     command = [sys.executable, "-m", "csplat_tools", "encode", str(scene.path), str(output)]
     command += ["--preset", preset, "--force", "--quiet", *(["--threads", str(threads)] if threads else [])]
     whole = run_timed(command, encode_runs, CAP_SECONDS)
-    return Measured(output.stat().st_size, encode, decode, whole)
+    return Measured(output.stat().st_size, encode, whole)
 
 
 def _tables(scene: Scene, runs: int, ours: Mapping[str, Measured], others: Sequence[Peer]) -> str:
     count, ply = scene.splat_count, scene.size_bytes
     sizes = [(*_size_cells(f"csplat {name}", one.size_bytes, one.whole, scene), "") for name, one in ours.items()]
     sizes += [(*_size_cells(one.name, one.size_bytes, one.timing, scene), one.remark) for one in others]
-    ways = [(name, *_way_cells(one.encode, count), *_way_cells(one.decode, count)) for name, one in ours.items()]
-    way = ("Msplats/s", "MB/s", "peak/arrays")
+    ways = [(name, *_way_cells(one.encode, count)) for name, one in ours.items()]
     return laid_out(
         [
             f"\n=== {scene.name}: {count} splats, SH {scene.sh_degree}, PLY {ply / 1e6:.1f} MB, {runs} runs",
-            Table(("from arrays", "enc s", *way, "dec s", *way), ways),
+            Table(("from arrays", "s", "Msplats/s", "MB/s", "peak/arrays"), ways),
             Table(("PLY -> file", "bytes", "B/splat", "times smaller", "wall s", "CPU s", ""), sizes),
         ],
         markdown=False,

@@ -25,7 +25,7 @@ __all__ = ["Timing", "alone", "medians", "peak_bytes", "reset_peak", "run_timed"
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_PROC = Path("/proc/self")
+_PROC = Path("/proc")
 
 
 @dataclass(frozen=True)
@@ -73,24 +73,32 @@ def run_timed(command: Sequence[str], runs: int, cap_seconds: float) -> Timing |
     return medians(timings)
 
 
-def reset_peak() -> int:
-    """Reset the high-water mark where the kernel allows it; return the size before the call, bytes."""
+def reset_peak(process: int | None = None) -> int:
+    """Reset the high-water mark where the kernel allows it; return the size before the call, bytes.
+
+    Args:
+        process: its number; this one if left out. Of another nothing but 0 is known where there is no /proc.
+    """
     with contextlib.suppress(OSError):
-        (_PROC / "clear_refs").write_text("5")
-        resident = _status("VmRSS")
-        if resident is not None and _status("VmHWM") is not None:
+        (_of(process) / "clear_refs").write_text("5")
+        resident = _status("VmRSS", process)
+        if resident is not None and _status("VmHWM", process) is not None:
             return resident
-    return _max_rss()
+    return 0 if process else _max_rss()
 
 
-def peak_bytes() -> int:
+def peak_bytes(process: int | None = None) -> int:
     """Largest resident size since the mark was reset, or ever where it cannot be."""
-    return _status("VmHWM") or _max_rss()
+    return _status("VmHWM", process) or (0 if process else _max_rss())
 
 
-def _status(key: str) -> int | None:
+def _of(process: int | None) -> Path:
+    return _PROC / str(process or "self")
+
+
+def _status(key: str, process: int | None) -> int | None:
     with contextlib.suppress(OSError):
-        for line in (_PROC / "status").read_text().splitlines():
+        for line in (_of(process) / "status").read_text().splitlines():
             name, _, value = line.partition(":")
             if name == key:
                 return int(value.split()[0]) * 1024

@@ -7,7 +7,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
 from csplat_render.judge import Judge
 
-__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "npm_install", "transform"]
+__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "npm_install", "npm_pinned", "transform"]
 
 #: Longest run of another program.
 CAP_SECONDS = 600
@@ -82,6 +82,18 @@ def npm_install(folder: Path, packages: Sequence[str]) -> str:
     except subprocess.CalledProcessError as error:
         return f"npm install failed: {_last_line(error)}"
     return ""
+
+
+def npm_pinned(folder: Path, packages: Mapping[str, str]) -> str:
+    """Install npm packages that a folder does not have, of a version or of all that begin with it; gives the reason
+    where that fails.
+    """
+    absent = []
+    for name, version in packages.items():
+        found = folder / "node_modules" / name / "package.json"
+        if not found.exists() or not f"{json.loads(found.read_text())['version']}.".startswith(f"{version}."):
+            absent.append(f"{name}@{version}")
+    return npm_install(folder, absent) if absent else ""
 
 
 def _node(folder: Path) -> str | None:

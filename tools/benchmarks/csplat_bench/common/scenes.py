@@ -49,7 +49,7 @@ _CROWDS = {
 }
 
 #: By name, what the data folder has in another format.
-_SOG = {"statue": "statue", "angel": "angel.sog", "st-peter": "st-peter.sog"}
+_SOG = {"statue": "statue", "fontaine": "fontaine", "angel": "angel.sog", "st-peter": "st-peter.sog"}
 
 
 @dataclass(frozen=True)

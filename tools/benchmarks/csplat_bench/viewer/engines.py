@@ -33,9 +33,9 @@ import typer
 
 from csplat.decoder import decode
 from csplat.errors import InputError
+from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import listed, run, tell
 from csplat_bench.common.report import table
-from csplat_bench.viewer.page import open_page, serve
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene

@@ -35,11 +35,11 @@ from csplat.ply import read_ply
 from csplat.scene import scene_of
 from csplat.turning import USUAL, in_axes
 from csplat.upright import up_of_axes
+from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
-from csplat_bench.common.peers import npm_install
+from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
-from csplat_bench.viewer.page import open_page, serve
 from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
 from csplat_render import Camera
 from csplat_render.metrics import psnr
@@ -148,8 +148,7 @@ def main(
 def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
     """A browser, and a served folder where it finds the engines and the modules that load files into them."""
     packages = peers / "node_modules"
-    absent = [f"{name}@{version}" for name, version in _PACKAGES.items() if not (packages / name).exists()]
-    failed = npm_install(peers, absent) if absent else ""
+    failed = npm_pinned(peers, _PACKAGES)
     if failed:
         raise InputError(failed)
     with tempfile.TemporaryDirectory(prefix="csplat-owners-") as name, serve(name) as address:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import statistics
 import threading
 from collections.abc import Iterator
@@ -13,22 +11,17 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from csplat.decoder import decode
-from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
 
-__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn", "open_page", "serve"]
+__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn"]
 
 WIDTH, HEIGHT = 640, 480
 
 _VIEWS = 4
 _SORT_ZOOM = 1 / 8  # sorting does not depend on the size of the picture, drawing does
-_PATIENCE = 600_000  # milliseconds
-
-_SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_HARDWARE = ["--ignore-gpu-blocklist", "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface"]
 
 # One engine on a canvas of its own; the camera is [pinhole, width, height].
 _MAKE = """async () => {
@@ -79,36 +72,6 @@ class Drawn(TypedDict):
     wholeMs: float
     pictureFormat: str
     glRenderer: str
-
-
-@contextmanager
-def open_page(chromium: str, *, gpu: bool) -> Iterator[Any]:
-    """Start a browser; yields playwright's page.
-
-    Raises:
-        InputError: playwright is not installed.
-    """
-    try:
-        from playwright.sync_api import sync_playwright
-    except ModuleNotFoundError:
-        raise InputError("playwright is not installed: pip install playwright") from None
-    with sync_playwright() as playwright:
-        arguments = ["--no-sandbox", "--disable-dev-shm-usage", *(_HARDWARE if gpu else _SOFTWARE)]
-        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        page = browser.new_page()
-        page.set_default_timeout(_PATIENCE)
-        yield page
-        browser.close()
-
-
-@contextmanager
-def serve(folder: str | Path) -> Iterator[str]:
-    """Serve the files of a folder, also those that links in it point to; yields its address."""
-    quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(quiet, directory=str(folder))) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}/"
-        server.shutdown()
 
 
 def drawn(page: Any, file: File, runs: int) -> Drawn:

@@ -1,7 +1,7 @@
 """Compare the two decoders bit by bit: SHA-256 of every array, floats and integers, of any files.
 
-    python -m csplat_bench.codec.decoders scene.csplat other.ply ...      # a PLY is encoded with every preset
-    python -m csplat_bench.codec.decoders ../shared/data/ply/*.ply --presets fast,small
+    python -m csplat_bench.codec.decoders.agree scene.csplat other.ply ...      # a PLY is encoded with every preset
+    python -m csplat_bench.codec.decoders.agree ../shared/data/ply/*.ply --presets fast,small
 
 Python decodes each file with `csplat.decoder`, Node.js with `codec/js`; the float arrays of spec 3, the integer arrays
 of spec 9.2 and the extra columns must have the same bytes, and what one refuses the other must refuse with the same

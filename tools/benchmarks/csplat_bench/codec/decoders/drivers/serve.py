@@ -1,0 +1,17 @@
+"""serve.py FILE THREADS: says "ready", then decodes for every line that comes in: seconds, bytes of arrays."""
+
+import sys
+import time
+from pathlib import Path
+
+from csplat.decoder import decode
+
+data, threads = Path(sys.argv[1]).read_bytes(), int(sys.argv[2])
+print("ready", flush=True)
+for _ in sys.stdin:
+    began = time.perf_counter()
+    scene = decode(data, threads=threads)
+    seconds = time.perf_counter() - began
+    arrays = scene.means, scene.quats, scene.scales, scene.opacities, scene.sh0, scene.shN
+    print(seconds, sum(array.nbytes for array in arrays), flush=True)
+    del scene, arrays

@@ -1,0 +1,9 @@
+// One decoding, timed: [seconds, bytes of all arrays]. A gc() in between would undo what was compiled.
+
+export async function once(decode, bytes) {
+  const start = performance.now();
+  const result = await decode(bytes);
+  const seconds = (performance.now() - start) / 1000;
+  const arrays = Object.values(result).filter(ArrayBuffer.isView);
+  return [seconds, arrays.reduce((sum, array) => sum + array.byteLength, 0)];
+}
