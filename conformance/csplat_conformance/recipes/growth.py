@@ -81,6 +81,14 @@ def invalid_growth_recipes() -> list[Recipe]:
             {"TILE.0.128/header.type": b"LATE"},
         ),
         patched(
+            "ancillary_layer_reserved",
+            "a reserved field in the header of a skipped layer",
+            "RES-1 ANC-2",
+            "E_RESERVED",
+            layers,
+            {"TILE.0.128/header.reserved_0": 1},
+        ),
+        patched(
             "ancillary_layer_gap",
             "a skipped layer that leaves a gap",
             "COV-1 ANC-2",

@@ -104,7 +104,7 @@ def _chunks() -> list[Recipe]:
             at="SERR/header.type",
         ),
         whole("codebook_tail", "a byte after the stream", "CDB-2", "E_STREAM", _codebook_tail(), "CODB.2.0/tail"),
-        _unknown_crc(),
+        *_unknown_chunk(),
         patched(
             "chunk_type_differs",
             "CODB in the directory, META in the chunk",
@@ -184,17 +184,27 @@ def _chunks() -> list[Recipe]:
     ]
 
 
-def _unknown_crc() -> Recipe:
+def _unknown_chunk() -> list[Recipe]:
     base = build(scene(chunks=(Chunk(b"priv", payload=b"x", flags=0),)))
-    return patched(
-        "unknown_chunk_crc",
-        "the CRC of an unknown chunk",
-        "CHK-1 CHK-2",
-        "E_CRC",
-        base,
-        {"directory[priv].crc": 7},
-        at="priv/header.type",
-    )
+    return [
+        patched(
+            "unknown_chunk_crc",
+            "the CRC of an unknown chunk",
+            "CHK-1 CHK-2",
+            "E_CRC",
+            base,
+            {"directory[priv].crc": 7},
+            at="priv/header.type",
+        ),
+        patched(
+            "unknown_chunk_reserved",
+            "a reserved field in the header of an unknown chunk",
+            "RES-1",
+            "E_RESERVED",
+            base,
+            {"priv/header.reserved_0": 1},
+        ),
+    ]
 
 
 def _misplaced(name: str, why: str, base: Built, chunks: tuple[str, ...], source: Built | None = None) -> Recipe:
