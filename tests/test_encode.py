@@ -118,6 +118,14 @@ def test_extra_columns_stay_behind_unless_asked_for(make_model):
     assert {} == dict(round_trip(model)[0].extra)
 
 
+def test_more_extra_columns_than_a_file_can_have_are_refused(make_model):
+    model = make_model(2, 0, extra={f"c{i}": np.arange(2, dtype=np.uint8) for i in range(256)})
+    with pytest.raises(InputError, match="256 extra columns, a file has at most 255"):
+        round_trip(model, keep_extra=True)
+    fits = replace(model, extra=dict(list(model.extra.items())[:255]))
+    assert len(round_trip(fits, keep_extra=True)[0].extra) == 255
+
+
 @pytest.mark.parametrize("dtype", ["<i4", ">i4", "<f8", ">f8", ">u2", "i1"])
 def test_extra_columns_keep_their_bits_in_any_byte_order(make_model, dtype):
     bits = np.random.default_rng(0).bytes(20 * np.dtype(dtype).itemsize)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene", "stated_errors"]
 
 
+_EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
 _COLOURS = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
 _SHAPES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
@@ -66,6 +67,8 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     records: list[_spec.ExtraRecord] = []
     if not options.keep_extra:
         return records
+    if len(model.extra) > _EXTRA_COLUMNS_MAX:
+        raise InputError(f"{len(model.extra)} extra columns, a file has at most {_EXTRA_COLUMNS_MAX}")
     ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
     for name, column in model.extra.items():
         text = name.encode()
