@@ -21,7 +21,7 @@ from csplat_conformance.fuzzing import plies, targets
 from csplat_conformance.fuzzing.edges import Edges
 from csplat_conformance.fuzzing.plies import PlyTarget
 from csplat_conformance.fuzzing.ply_mutants import Ply
-from csplat_conformance.fuzzing.targets import DecoderTarget, JsTarget, compared
+from csplat_conformance.fuzzing.targets import DecoderTarget, OthersTarget, compared, missing_others
 from csplat_conformance.fuzzing.validating import ValidatorTarget
 from csplat_conformance.manifest import VECTORS
 from csplat_conformance.mutate import mapped, mutant_of
@@ -162,7 +162,7 @@ def test_a_finding_is_made_smaller(monkeypatch):
     assert [at] == [i for i in range(len(base)) if small[i] != base[i] and i not in sums]
 
 
-# Two decoders --------------------------------------------------------------------------------------
+# Several decoders ----------------------------------------------------------------------------------
 
 
 PASSED = Answer(Status.PASSED, "", {"splat_count": 1}, {"floats.means": (12, "ab")})
@@ -185,29 +185,30 @@ REFUSED = Answer(Status.REFUSED, code="E_CRC", clause="CHK-1")
     ],
 )
 def test_two_decoders_have_to_agree(ours, theirs, name):
-    assert name == compared(ours, theirs)[0]
+    assert name == compared(ours, theirs, "C")[0]
 
 
-@needs_node
-def test_both_decoders_agree_on_mutants():
-    target = JsTarget()
+@pytest.mark.skipif(bool(missing_others()), reason=f"skipped: {missing_others()}")
+def test_all_decoders_agree_on_mutants():
+    target = OthersTarget()
     names = {fuzz.attempt(target, data)[0] for data in cases(target, 2, 100, BASES)}
     target.close()
 
+    assert ["JavaScript", "C"] == list(target.decoders)
     assert {"decoded", "E_INDEX", "E_STREAM"} <= names
     assert "finding" not in names
 
 
 @needs_node
 def test_a_javascript_process_that_ends_is_a_finding_and_starts_again(monkeypatch):
-    target = JsTarget()
+    target = OthersTarget()
     assert ("decoded", "") == fuzz.attempt(target, BASES[0].data)
-    target._node._process.kill()
+    target.decoders["JavaScript"]._process.kill()
 
     assert "JavaScript, crashed" in fuzz.attempt(target, BASES[0].data)[1]
     assert ("decoded", "") == fuzz.attempt(target, BASES[0].data)
-    monkeypatch.setattr(targets, "_JS_MEMORY", 1)
-    assert target.memory().startswith("Node holds")
+    monkeypatch.setattr(targets, "_MEMORY", 1)
+    assert target.memory().startswith("JavaScript holds")
     target.close()
 
 
@@ -308,11 +309,11 @@ def test_edges_are_new_once():
 @needs_node
 def test_the_program_says_what_it_did(tmp_path):
     # Of the target that has most to say; `tests/run.sh` runs all, unguided.
-    words = [sys.executable, str(PROGRAM), "--target", "js", "--count", "12", "--jobs", "1", "--out", str(tmp_path)]
+    words = [sys.executable, str(PROGRAM), "--target", "others", "--count", "12", "--jobs", "1", "--out", str(tmp_path)]
     run = subprocess.run(words, capture_output=True, text=True, check=False)
 
     assert (0, "") == (run.returncode, run.stderr)
-    assert "js: 12 executions" in run.stdout
+    assert "others: 12 executions" in run.stdout
     assert "lines of functions" in run.stdout
     assert "of 29 modules ran" in run.stdout
     assert "0 kinds of findings" in run.stdout

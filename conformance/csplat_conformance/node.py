@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import shutil
 import struct
-import subprocess
 import time
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from csplat.errors import InputError
 from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.report import Status
+from csplat_conformance.serving import Served
 
 __all__ = ["JsDecoder", "js_folder", "missing_javascript"]
 
 _ADAPTER = Path("test", "adapter.mjs")
-_READ = 1 << 16
 _HEAP_MB = 512
 
 
@@ -47,8 +45,8 @@ def missing_javascript() -> str:
     return ""
 
 
-class JsDecoder:
-    """A Node process that decodes what it is sent; started when it is first asked, and anew after a crash.
+class JsDecoder(Served):
+    """A Node process that decodes what it is sent.
 
     Args:
         folder: of the decoder's modules, a copy that may have been changed; None for the checkout's.
@@ -70,96 +68,19 @@ class JsDecoder:
         home = js_folder()
         options = {"limits": limits} if limits else {}
         node = shutil.which("node") or "node"
-        self._words = [node, f"--max-old-space-size={_HEAP_MB}", str(home / _ADAPTER), "--serve", json.dumps(options)]
-        self._environment = os.environ | {"CSPLAT_JS": str(folder or home)}
+        words = [node, f"--max-old-space-size={_HEAP_MB}", str(home / _ADAPTER), "--serve", json.dumps(options)]
+        environment = os.environ | {"CSPLAT_JS": str(folder or home)}
         if coverage is not None:
-            self._environment["NODE_V8_COVERAGE"] = str(coverage)
-        self._timeout = timeout
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Let the process end."""
-        if self._process is not None and self._process.stdin:
-            self._process.stdin.close()
-            try:
-                self._process.wait(self._timeout)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-            if self._process.stdout:
-                self._process.stdout.close()
-        self._process = None
+            environment["NODE_V8_COVERAGE"] = str(coverage)
+        super().__init__(words, timeout, environment)
 
     def ask(self, data: bytes) -> Answer:
         """Decode one file, as floats and as integers."""
         began = time.monotonic()
-        process = self._started()
-        assert process.stdin
-        try:
-            process.stdin.write(struct.pack("<I", len(data)) + data)
-            process.stdin.flush()
-            line = self._line(process, began)
-        except BrokenPipeError:
-            line = b""
-        if line is None:
-            self._end(process)
-            return Answer(Status.HUNG, f"no answer after {self._timeout:g} s", seconds=time.monotonic() - began)
-        if not line.endswith(b"\n"):
-            self._end(process)
-            return Answer(Status.CRASHED, f"the process ended with status {process.returncode}")
+        line = self._answered(struct.pack("<I", len(data)) + data)
+        if isinstance(line, Answer):
+            return line
         return _answer(json.loads(line, parse_int=whole_number), time.monotonic() - began)
-
-    def resident_bytes(self) -> int:
-        """Return what the process holds in memory now; 0 where nobody can tell."""
-        if self._process is None:
-            return 0
-        try:
-            pages = int(Path(f"/proc/{self._process.pid}/statm").read_text(encoding="ascii").split()[1])
-        except OSError:
-            return 0
-        return pages * os.sysconf("SC_PAGE_SIZE")
-
-    def _started(self) -> subprocess.Popen[bytes]:
-        if self._process is None:
-            self._process = subprocess.Popen(  # noqa: S603 - node, found on the path, and our adapter
-                self._words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env=self._environment,
-            )
-        return self._process
-
-    def _line(self, process: subprocess.Popen[bytes], began: float) -> bytes | None:
-        """Return a line, what there is of it when the process ended, or None when it takes too long."""
-        assert process.stdout
-        line = b""
-        while not line.endswith(b"\n"):
-            left = began + self._timeout - time.monotonic()
-            if left <= 0 or not select.select([process.stdout], [], [], left)[0]:
-                return None
-            part = os.read(process.stdout.fileno(), _READ)
-            if not part:
-                return line
-            line += part
-        return line
-
-    def _end(self, process: subprocess.Popen[bytes]) -> None:
-        process.kill()
-        process.wait()
-        for stream in (process.stdin, process.stdout):
-            try:
-                if stream:
-                    stream.close()
-            except BrokenPipeError:
-                continue
-        self._process = None
 
 
 def _answer(found: dict[str, Any], seconds: float) -> Answer:

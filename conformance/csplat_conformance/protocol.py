@@ -20,7 +20,7 @@ from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Status
 
-__all__ = ["ask", "last_words"]
+__all__ = ["answered", "ask", "last_words"]
 
 _WORDS_MAX = 200  # characters of a program's own message
 _PARTS = ("integers", "floats", "extra")
@@ -39,12 +39,23 @@ def ask(command: str, path: Path, timeout: float, *, keep_floats: bool = False) 
         outdir = Path(folder) / "out"
         outdir.mkdir()
         ended = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
-        if ended.status is not None:
-            return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)
-        left = sorted(entry.name for entry in outdir.iterdir())
-        if ended.returncode == 1:
-            return _refusal(ended, left)
-        return _decoded(outdir, left, ended.seconds, keep_floats=keep_floats)
+        return answered(ended, outdir, keep_floats=keep_floats)
+
+
+def answered(ended: Ended, outdir: Path, *, keep_floats: bool = False) -> Answer:
+    """Read what a decoder left.
+
+    Args:
+        ended: how it ended.
+        outdir: the folder it was given.
+        keep_floats: as of `ask`.
+    """
+    if ended.status is not None:
+        return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)
+    left = sorted(entry.name for entry in outdir.iterdir())
+    if ended.returncode == 1:
+        return _refusal(ended, left)
+    return _decoded(outdir, left, ended.seconds, keep_floats=keep_floats)
 
 
 def _refusal(ended: Ended, left: list[str]) -> Answer:

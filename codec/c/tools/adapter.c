@@ -3,7 +3,8 @@
  *     csplat conformance decoder --cmd 'csplat_adapter {input} {outdir}'
  *
  * Without arguments it takes them from standard input, line by line in turn, and answers each pair with a line of JSON, {}
- * where the file was decoded: so that tests need not start a process for each file.
+ * where the file was decoded: so that tests need not start a process for each file. Three numbers are budgets: splats, bytes,
+ * bytes of a text.
  *
  * The file is decoded as a whole and tile by tile; from memory and through a callback; to floats, integers and packed
  * arrays. Where two of these disagree the adapter ends with status 2. */
@@ -15,6 +16,7 @@
 #include <string.h>
 
 static const char *directory;
+static csplat_options options;
 static unsigned char *data;
 static size_t size;
 
@@ -256,12 +258,12 @@ static int answer(const char *path)
     if (fread(data, 1, size, input) != size)
         die("cannot read");
     fclose(input);
-    if (csplat_open_memory(&file, data, size, NULL, &error))
+    if (csplat_open_memory(&file, data, size, &options, &error))
         refuse(&error);
     else if (csplat_decode(file, 3, &scene))
         refuse(csplat_last_error(file));
     else {
-        if (csplat_open(&other, &source, NULL, &error))
+        if (csplat_open(&other, &source, &options, &error))
             die("through a callback it is refused");
         put_all(file, other, scene);
         csplat_close(other);
@@ -281,8 +283,12 @@ int main(int count, char **arguments)
         directory = arguments[2];
         return answer(arguments[1]);
     }
-    if (count != 1)
-        die("usage: csplat_adapter [INPUT OUTDIR]");
+    if (count == 4) {
+        options.splats_max = strtoull(arguments[1], NULL, 10);
+        options.bytes_max = strtoull(arguments[2], NULL, 10);
+        options.json_bytes_max = strtoull(arguments[3], NULL, 10);
+    } else if (count != 1)
+        die("usage: csplat_adapter [INPUT OUTDIR | SPLATS BYTES JSON_BYTES]");
     directory = folder;
     while (fgets(path, sizeof path, stdin) && fgets(folder, sizeof folder, stdin)) {
         path[strcspn(path, "\n")] = folder[strcspn(folder, "\n")] = '\0';

@@ -1,4 +1,4 @@
-"""What is fuzzed: the Python decoder, and the JavaScript decoder against it."""
+"""What is fuzzed: the Python decoder, and those in JavaScript and C against it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ from csplat_conformance.answers import Answer
 from csplat_conformance.builder import Built, build
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.mutate import mapped, mutant_of
+from csplat_conformance.native import CDecoder, missing_c
 from csplat_conformance.recipes import all_recipes
 from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
+from csplat_conformance.serving import Served
 
-__all__ = ["JS_LIMITS", "LIMITS", "Case", "DecoderTarget", "JsTarget", "Target"]
+__all__ = ["C_LIMITS", "JS_LIMITS", "LIMITS", "Case", "DecoderTarget", "OthersTarget", "Target", "missing_others"]
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
 _SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
 #: The same by their names in JavaScript.
 JS_LIMITS = {"splats": _SMALL.splats, "bytes": _SMALL.bytes, "jsonBytes": _SMALL.json_bytes}
+C_LIMITS = (_SMALL.splats, _SMALL.bytes, _SMALL.json_bytes)
 _LARGEST_SEED = 3000  # bytes: small files make many cases a second
-_JS_MEMORY = 700_000_000  # bytes; a heap of 512 MiB, and Node
+_MEMORY = 700_000_000  # bytes of another process; a heap of 512 MiB, and Node
 
 
 @dataclass(frozen=True)
@@ -149,40 +152,61 @@ class DecoderTarget:
         """Nothing was started."""
 
 
-class JsTarget(DecoderTarget):
-    """The JavaScript decoder against the Python one: same verdict, same arrays; another code is only counted.
+def missing_others() -> dict[str, str]:
+    """Return why other decoders cannot run here, by language."""
+    found = {"JavaScript": node.missing_javascript(), "C": missing_c()}
+    return {name: why for name, why in found.items() if why}
+
+
+class OthersTarget(DecoderTarget):
+    """The decoders in JavaScript and C against the Python one: same verdict, same arrays; another code is only counted.
 
     Args:
         scratch: folder for the coverage that Node writes.
+
+    Attributes:
+        decoders: those that can run here, by language.
     """
 
-    name = "js"
+    name = "others"
 
     def __init__(self, scratch: Path | None = None) -> None:
         self._scratch = scratch
-        self._node = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
+        self.decoders: dict[str, Served] = {}
+        missing = missing_others()
+        if "JavaScript" not in missing:
+            self.decoders["JavaScript"] = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
+        if "C" not in missing:
+            self.decoders["C"] = CDecoder(limits=C_LIMITS)
 
     def attempt(self, data: bytes) -> tuple[str, str]:
-        """Decode with both and compare."""
-        theirs = self._node.ask(data)
-        if theirs.status not in (Status.PASSED, Status.REFUSED):
-            return "finding", f"JavaScript, {theirs.status}: {theirs.message}"
+        """Decode with all and compare."""
         ours = adapter.answer(data, _SMALL, threads=1)  # one thread: so it is traced, and quicker
         if ours.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"Python, {ours.status}: {ours.message}"
-        return compared(ours, theirs)
+        became = {ours.code or "decoded"}
+        for name, other in self.decoders.items():
+            theirs = other.ask(data)
+            if theirs.status not in (Status.PASSED, Status.REFUSED):
+                return "finding", f"{name}, {theirs.status}: {theirs.message}"
+            found, what = compared(ours, theirs, name)
+            if what:
+                return found, what
+            became.add(found)
+        return next(name for name in (_spec.ERROR_LIMIT, "another code", *became) if name in became), ""
 
     def memory(self) -> str:
-        """Look at Node's resident memory."""
-        held = self._node.resident_bytes()
-        return f"Node holds {held:,} bytes" if held > _JS_MEMORY else ""
+        """Look at the resident memory of the others."""
+        held = {name: one.resident_bytes() for name, one in self.decoders.items()}
+        return next((f"{name} holds {size:,} bytes" for name, size in held.items() if size > _MEMORY), "")
 
     def close(self) -> None:
-        """Let Node end, which writes its coverage."""
-        self._node.close()
+        """Let them end; Node writes its coverage."""
+        for one in self.decoders.values():
+            one.close()
 
     def coverage(self) -> str:
-        """Return the share of the decoder's text that ran."""
+        """Return the share of the JavaScript decoder's text that ran."""
         return js_coverage(self._scratch) if self._scratch else ""
 
 
@@ -212,20 +236,20 @@ def _agreed(data: bytes, count: int) -> tuple[str, str]:
     return "decoded", ""
 
 
-def compared(ours: Answer, theirs: Answer) -> tuple[str, str]:
-    """Compare the answers of two decoders."""
+def compared(ours: Answer, theirs: Answer, name: str) -> tuple[str, str]:
+    """Compare the answers of Python and of the decoder of this name."""
     codes = (ours.code, theirs.code)
     if _spec.ERROR_LIMIT in codes:
         return _spec.ERROR_LIMIT, ""
     if ours.status != theirs.status:
         words = [f"{one.status} {one.code} {one.clause or ''}".strip() for one in (ours, theirs)]
-        return "finding", f"Python {words[0]}, JavaScript {words[1]}"
+        return "finding", f"Python {words[0]}, {name} {words[1]}"
     if ours.status is Status.REFUSED:
         return (ours.code if codes[0] == codes[1] else "another code"), ""
     if dict(ours.header) != dict(theirs.header):
-        return "finding", "the headers differ"
+        return "finding", f"{name}: the headers differ"
     differ = [key for key in {*ours.arrays, *theirs.arrays} if ours.arrays.get(key) != theirs.arrays.get(key)]
-    return ("finding", f"arrays differ: {', '.join(sorted(differ))}") if differ else ("decoded", "")
+    return ("finding", f"{name}: arrays differ: {', '.join(sorted(differ))}") if differ else ("decoded", "")
 
 
 def js_coverage(folder: Path) -> str:

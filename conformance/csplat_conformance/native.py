@@ -1,0 +1,106 @@
+"""The C decoder in a long-lived process, asked file after file."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from csplat.errors import InputError
+from csplat_conformance.answers import Answer
+from csplat_conformance.process import Ended
+from csplat_conformance.protocol import answered
+from csplat_conformance.serving import Served
+
+__all__ = ["CDecoder", "c_folder", "compile_c", "missing_c"]
+
+_ADAPTER = Path("tools", "adapter.c")
+_MEMORY = 3_000_000  # kibibytes of address space: an allocation without bound fails at once
+
+
+def c_folder() -> Path:
+    """Return the folder of the C decoder: only a checkout has it.
+
+    Raises:
+        InputError: neither this package nor the working folder belongs to a checkout.
+    """
+    for root in (Path(__file__).parents[2], Path.cwd()):
+        folder = root / "codec" / "c"
+        if (folder / _ADAPTER).is_file():
+            return folder
+    raise InputError("the C decoder is not here: only a checkout has it and its adapter")
+
+
+def missing_c() -> str:
+    """Return why the C decoder cannot run here, or an empty string."""
+    if shutil.which("cc") is None:
+        return "cc, a C compiler, is not installed"
+    try:
+        c_folder()
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def compile_c(out: Path, *words: str | Path) -> None:
+    """Compile sources or link objects.
+
+    Args:
+        out: the file to write.
+        words: what else the command line has.
+
+    Raises:
+        InputError: the compiler is not here, or does not take them.
+    """
+    missing = missing_c()
+    if missing:
+        raise InputError(missing)
+    command = ["cc", "-std=c99", "-O1", "-w", f"-I{c_folder()}", *map(str, words), "-o", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own sources
+    if done.returncode:
+        raise InputError(f"cc cannot compile the C decoder: {done.stderr.strip().splitlines()[:1]}")
+
+
+class CDecoder(Served):
+    """A process of the adapter that decodes the files it is told of.
+
+    Args:
+        program: the adapter, compiled; None to compile the checkout's.
+        limits: budgets: splats, bytes, bytes of a text; the registry's if left out.
+        timeout: seconds for one file.
+
+    Raises:
+        InputError: it cannot be compiled.
+    """
+
+    def __init__(self, program: Path | None = None, limits: Sequence[int] = (), timeout: float = 20.0) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="csplat-c-")
+        home = Path(self._folder.name)
+        self._input, self._outdir = home / "input", home / "out"
+        if program is None:
+            program = home / "adapter"
+            compile_c(program, c_folder() / _ADAPTER, c_folder() / "csplat.c", "-lz", "-lm")
+        shell = f'ulimit -v {_MEMORY}; exec "$0" "$@"'
+        super().__init__(["sh", "-c", shell, str(program), *map(str, limits)], timeout)
+
+    def ask(self, data: bytes) -> Answer:
+        """Decode one file, as floats and as integers."""
+        began = time.monotonic()
+        self._input.write_bytes(data)
+        self._outdir.mkdir()
+        try:
+            line = self._answered(f"{self._input}\n{self._outdir}\n".encode())
+            if isinstance(line, Answer):
+                return line
+            ended = Ended(None, line != b"{}\n", line, b"", time.monotonic() - began)
+            return answered(ended, self._outdir)
+        finally:
+            shutil.rmtree(self._outdir)
+
+    def close(self) -> None:
+        """Let the process end, and remove what it wrote."""
+        super().close()
+        self._folder.cleanup()
