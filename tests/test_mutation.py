@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from chromium import absent
 
 from csplat.errors import InputError
 from csplat_conformance.manifest import load
@@ -11,8 +12,11 @@ from csplat_conformance.mutation import __main__ as command
 from csplat_conformance.mutation import judging, python
 from csplat_conformance.mutation.javascript import JavaScriptDecoder
 from csplat_conformance.mutation.mutants import Fate, Mutant, Result, sample, score, table
+from csplat_conformance.mutation.native import NativeDecoder
 from csplat_conformance.mutation.operators import python_mutants
 from csplat_conformance.mutation.python import PythonDecoder
+from csplat_conformance.mutation.tokens import c_mutants
+from csplat_conformance.native import missing_c
 from csplat_conformance.node import missing_javascript
 
 BY_NAME = {vector.name: vector for vector in load()}
@@ -172,3 +176,35 @@ def test_javascript_is_changed_by_its_syntax(few, monkeypatch):
     assert Result(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)
     few("valid/one_splat")
     assert Fate.SAME is decoder.attempt(tail).fate
+
+
+# C -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "changed"),
+    [
+        ("x = a < b;", {"x = a <= b;", "x = a >= b;"}),
+        ("x = a * *p - -b;", {"x = a / *p - -b;", "x = a * *p + -b;"}),
+        ('char *p = a ? !b : "1"; /* 1 < 2 */', {'char *p = a ? b : "1"; /* 1 < 2 */'}),
+        ("x |= 0x1Fu;", {"x &= 0x1Fu;", "x |= (0x1Fu + 1);", "x |= (0x1Fu - 1);"}),
+        ("{ f(g(a)); }", {"{ ; }"}),
+        ("if (a)\n return fail(d, 1, b + c);\nx;", {"if (a)\n ;\nx;"}),
+        ("return a || fail(d, 1);", {"return a && fail(d, 1);", "return a || 1;"}),
+        ("#define A 1 + \\\n 2\n/* begin generated: */ 3 /* end generated */", set()),
+    ],
+)
+def test_each_token_of_c_is_changed_alone(text, changed):
+    assert changed == {one.apply(text) for one in c_mutants("a.c", text)}
+
+
+def test_c_is_compiled_and_changed(few):
+    if missing_c():
+        absent(missing_c())
+    decoder = NativeDecoder([])
+    few("valid/one_splat", "invalid/tile_tail")
+    (tail,) = (one for one in decoder.mutants if "bytes follow the end" in one.old)
+
+    assert decoder.valid(tail)
+    assert not decoder.valid(replace(tail, new="("))
+    assert Result(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)

@@ -3,6 +3,7 @@
 Usage:
     python -m csplat_conformance.mutation                                  # 400 mutants of the Python decoder
     python -m csplat_conformance.mutation --decoder javascript --jobs 2    # wants node, and typescript by npx
+    python -m csplat_conformance.mutation --decoder c --count 150          # wants cc and zlib
 
 A mutant is caught where a vector fails. Whatever passes them all reads damaged files, too: one that differs from the
 right decoder there is missed by the vectors; the others may be equivalent, or out of the vectors' reach, or show
@@ -23,6 +24,7 @@ from csplat.errors import InputError
 from csplat_conformance.mutation.javascript import JavaScriptDecoder
 from csplat_conformance.mutation.judging import fuzzed, vectors
 from csplat_conformance.mutation.mutants import Decoder, Fate, Mutant, Result, sample, score, table
+from csplat_conformance.mutation.native import NativeDecoder
 from csplat_conformance.mutation.python import PythonDecoder
 
 __all__ = ["main"]
@@ -31,6 +33,7 @@ _FILES = 2000
 _DECODERS: Final[dict[str, Callable[[Sequence[bytes]], Decoder]]] = {
     "python": PythonDecoder,
     "javascript": JavaScriptDecoder,
+    "c": NativeDecoder,
 }
 _decoder: Decoder  # of a worker, which is forked with it
 

@@ -126,6 +126,28 @@ def _numbers() -> list[Recipe]:
                 records={SH0: _lattice(1.75 * 2.0**120)},
             ),
         ),
+        *(
+            _recipe(
+                f"exponents_{name}",
+                f"{which} exponents of SIGNED and SPARSE: steps of 2^{power} and some more",
+                "LAT-1",
+                scene(
+                    1,
+                    [
+                        tile(
+                            2,
+                            3,
+                            1,
+                            {
+                                SH0: signed([[0, 1, 0], [1, -1, 0], [-1, 0, 1]], exponent=power + 6),
+                                SH0 + 1: sparse((1, 0, 1), [[1, 0, -1] * 3] * 2, exponent=power + 7),
+                            },
+                        )
+                    ],
+                ),
+            )
+            for name, which, power in (("least", "the smallest", -126), ("most", "the largest", 127))
+        ),
         _recipe(
             "single_step_smallest",
             "scales and colours whose step is the smallest normal number of binary32",

@@ -70,6 +70,12 @@ def _later_blocks() -> list[Recipe]:
             "TILE.0.2/sh2",
         ),
         later(
+            "band_of_one_before",
+            "band 2 by the codebook before that of band 1",
+            colours(book(2, indices), book(1), _bands(1), _bands(2)),
+            "TILE.0.2/sh2",
+        ),
+        later(
             "shape_more_escapes",
             "rotations with two escapes and their integers, where scales have one",
             shapes(first, book(1, (), signed(quat_rows(8, 2))), _shape(1)),
@@ -108,7 +114,7 @@ def _later_blocks() -> list[Recipe]:
 def _parts() -> list[Recipe]:
     """Indices, summands and escape blocks."""
     block = book(1, (0, 1), summands=(-50, -40))
-    wide = replace(block, how=Stream(5))
+    wide = replace(block, summands=(-50, -50), how=Stream(5))
     summand, escape = "TILE.0.0/scales.summand", "TILE.0.1/sh1.escape"
 
     def shape(first: Block, second: Block | None = None) -> Scene:

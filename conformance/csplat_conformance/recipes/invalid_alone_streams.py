@@ -17,6 +17,7 @@ from csplat_conformance.samples import (
     scene,
     sh_attribute,
     signed,
+    sparse,
     tile,
 )
 from csplat_conformance.scene import PAIRS, Block, Chunk, Codebook, Extra, Scene, Stream
@@ -35,7 +36,7 @@ def alone_stream_recipes() -> list[Recipe]:
         return whole(name, why, clause, "E_STREAM", made, f"{_STREAM}.{field}")
 
     def entries(name: str, why: str, clause: str, field: str, size: int, how: Stream) -> Recipe:
-        table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)}, how=how)
+        table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: [[0] * 6] * 2}, how=how)
         changes = {"codebook[3].size": size}
         return patched(
             name,
@@ -91,7 +92,7 @@ def alone_stream_recipes() -> list[Recipe]:
             "signed integers of five bytes",
             "STR-2",
             "E_STREAM",
-            scene(tiles=[tile(changes={SH0: signed([[1, 2, 3]] * 2, Stream(5))})]),
+            scene(tiles=[tile(changes={SH0: signed([[0, 0, 0]] * 2, Stream(5))})]),
             "TILE.0.0/sh0.stream.width",
         ),
         whole(
@@ -99,8 +100,16 @@ def alone_stream_recipes() -> list[Recipe]:
             "indices of five bytes",
             "STR-2",
             "E_STREAM",
-            _band_by(book(3, (0, 1), how=Stream(5))),
+            _band_by(book(3, (0, 0), how=Stream(5))),
             "TILE.0.1/sh1.indices.width",
+        ),
+        whole(
+            "width_5_of_sparse",
+            "integers of some splats of five bytes",
+            "STR-2",
+            "E_STREAM",
+            _band_by(sparse((1, 0), [[0] * 9], Stream(5))),
+            "TILE.0.1/sh1.stream.width",
         ),
         entries("width_5_of_entries", "entries of five bytes", "STR-2", "width", 2, Stream(5)),
         whole(

@@ -50,6 +50,7 @@ def _blocks() -> list[Recipe]:
     cut = scene(tiles=[replace(one, tails=((0, b"\0"),))])
     two = build(scene(1, [tile(degree=1)]))
     exponent = "TILE.0.0/sh0.params.exponent"
+    zeros = scene(tiles=[tile(changes={SH0: signed([[0, 0, 0]] * 2, exponent=134)})])
     return [
         whole("blocks_swapped", "rotations before scales", "TLE-2", "E_STREAM", swapped, "TILE.0.0/quats.attribute"),
         whole("block_missing", "layer 0 without sh0", "TLE-2", "E_STREAM", four, "TILE.0.0/head.block_count"),
@@ -89,14 +90,14 @@ def _blocks() -> list[Recipe]:
             base,
             {coding("quats"): _spec.CODING_OFFSET},
         ),
-        patched("lattice_exponent_high", "the step overflows binary32", "LAT-1", "E_VALUE", base, {exponent: 134}),
+        whole("lattice_exponent_high", "the step overflows binary32", "LAT-1", "E_VALUE", zeros, exponent),
         patched(
             "lattice_exponent_low",
             "the step is subnormal in binary32",
             "LAT-1",
             "E_VALUE",
             base,
-            {exponent: -123},
+            {exponent: -121},
         ),
         patched("lattice_exponent_highest", "the largest exponent", "LAT-1", "E_VALUE", base, {exponent: 32767}),
         patched("lattice_exponent_lowest", "the smallest exponent", "LAT-1", "E_VALUE", base, {exponent: -32768}),
@@ -216,6 +217,7 @@ def _values() -> list[Recipe]:
         ),
         quats("quat_component", "a component of M + 1", "QUA-1", [m + 1, 0, 0]),
         quats("quat_component_negative", "a component of −M − 1", "QUA-1", [0, -m - 1, 0]),
+        quats("quat_component_last", "a third component of M + 1", "QUA-1", [0, 0, m + 1]),
         quats("quat_component_smallest", "a component of −2^15", "QUA-1", [0, 0, -(2**15)]),
         quats("quat_radicand", "R below 0", "QUA-2", [m, m, 1]),
         quats("quat_all_m", "three components of M", "QUA-2", [-m, m, -m]),
@@ -254,13 +256,15 @@ def _sparse() -> list[Recipe]:
 
     made = one(sparse((1, 0, 1), rows))
     base, few, many = build(made), {f"{params}.present_count": 1}, {f"{params}.present_count": 4}
+    zeros = one(sparse((1, 0, 1), [[0] * 9] * 2, exponent=135))
     escape = one(book(1, (0, 2, 1), sparse((1,), rows[:1])))
     table = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: rows_of(2, 2, 9, -9, 9)}, (1, 1))
     far = one(sparse((1, 0, 1), [[2**20] * 9] * 2, Stream(4)))
     limit = far.attributes | {sh1: Attribute(_spec.MAPPING_LATTICE, 2.0**115)}
     return [
         patched("sparse_count", "four of three splats", "SPA-1", "E_VALUE", base, many),
-        patched("sparse_exponent", "the step overflows", "LAT-1", "E_VALUE", base, {f"{params}.exponent": 140}),
+        whole("sparse_exponent", "the step overflows", "LAT-1", "E_VALUE", zeros, f"{params}.exponent"),
+        patched("sparse_exponent_low", "a subnormal step", "LAT-1", "E_VALUE", base, {f"{params}.exponent": -120}),
         patched("sparse_fewer", "less than the mask names", "SPA-2", "E_RANGE", base, few, at=mask),
         range_("missing", "the mask names one splat, two have values", "SPA-2", (1, 0, 0)),
         range_("several", "the mask names three splats, two have values", "SPA-2", (1, 1, 1)),

@@ -14,7 +14,6 @@ from csplat_conformance.scene import Chunk, Scene, StatedErrors
 __all__ = ["bad_text_recipes", "good_text_recipes"]
 
 _META, _CAMS, _OPTS = _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS
-_SMILE = "😀".encode()
 
 #: What JSN-1 refuses, by the name of the vector: the text and what is wrong with it.
 _BAD: Final = {
@@ -75,8 +74,10 @@ _BAD: Final = {
     "pair_low": (b'{"a":"\\udfff"}', "a low half alone"),
     "pair_parted": (b'{"a":"\\ud83d \\ude00"}', "a space between the halves"),
     "pair_in_name": (b'{"\\udbff":1}', "a high half alone in a name"),
-    "twice_by_pair": (b'{"\\ud83d\\ude00":1,"' + _SMILE + b'":2}', "a name twice, once as a pair of escapes"),
+    "twice_by_pair": (b'{"\\ud83f\\udfff":1,"\xf0\x9f\xbf\xbf":2}', "a name twice, once as a pair of escapes"),
     "twice_by_two_pairs": (b'{"\\ud83d\\ude00":1,"\\uD83D\\uDE00":2}', "a name twice as pairs of escapes"),
+    "twice_by_two_bytes": (b'{"\\u07ff":1,"\xdf\xbf":2}', "a name twice, once as an escape of U+07FF"),
+    "twice_by_three_bytes": (b'{"\\u2fff":1,"\xe2\xbf\xbf":2}', "a name twice, once as an escape of U+2FFF"),
     "twice_empty": (b'{"":1,"":2}', "the empty name twice"),
     "twice_inside": (b'{"a":[[],{"b":1,"c":0,"b":1}]}', "a name twice in an object within an array"),
     "twice_prototype": (b'{"__proto__":1,"__proto__":1}', "a name that some languages treat apart, twice"),
@@ -102,6 +103,7 @@ _GOOD: Final = b"""\t\r\n { "numbers" : [ 0 , -0 , 9 , -9 , 19 , 90.9 , -0.99 , 
 "__proto__" : 0 , "constructor" : 0 ,
 "escapes" : "\\" \\\\ \\/ \\b \\f \\n \\r \\t \\u0123 \\u4567 \\u89AB \\uCDEF \\uabcd \\u0000 \\u001f",
 "pairs" : "\\ud800\\udc00\\udbff\\udfff\\uD83D\\uDE00 \\ud7ff \\ue000 \\uffff", "siblings" : [[],[],[],{},{}] ,
+"\\u07ff" : 0 , "\\u0800" : 0 , "\\u1800" : 0 , "\\u2800" : 0 ,
 "not ASCII" : "\x7f\xc2\x80\xc3\xa9\xe2\x80\xa8\xef\xbb\xbf\xef\xbf\xbf\xf4\x8f\xbf\xbf" } \n\r\t"""
 
 
@@ -125,6 +127,12 @@ def good_text_recipes() -> list[Recipe]:
         _stated("error_rms_at_bounds", "each rms as large as its max allows", StatedErrors(2, 0, 3, 0, at_bounds)),
         _stated("error_rms_zero", "an rms of 0 and a max of 0, of every measure", StatedErrors(2, 0, 3, 0, zeros)),
         _stated("error_minus_zero", "max and rms of −0, together and beside 0", StatedErrors(2, 0, 3, 0, signs)),
+        _valid(
+            "error_counts_of_none",
+            "all splats of the source are gone",
+            "SER-4",
+            scene(tiles=[], chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(5, 5)),)),
+        ),
         _stated("error_counts_large", "2^64 − 1 splats in the source", StatedErrors(large, large - 2), "SER-4"),
     ]
 

@@ -1,0 +1,75 @@
+"""Mutants of the C decoder, each compiled and asked in a process of its own."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from csplat.errors import InputError
+from csplat_conformance.fuzzing.targets import C_LIMITS
+from csplat_conformance.mutation.judging import difference, failing, verdict
+from csplat_conformance.mutation.mutants import Fate, Mutant, Result
+from csplat_conformance.mutation.tokens import c_mutants
+from csplat_conformance.native import CDecoder, c_folder, compile_c
+
+__all__ = ["NativeDecoder"]
+
+_SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
+_SOURCE, _ADAPTER = "csplat.c", "adapter.o"
+
+
+class NativeDecoder:
+    """The C decoder and its mutants.
+
+    Attributes:
+        texts: its source by the name of the file.
+        mutants: all of them.
+
+    Args:
+        files: fuzzed ones.
+
+    Raises:
+        InputError: the compiler or the decoder is not here.
+    """
+
+    def __init__(self, files: Sequence[bytes]) -> None:
+        self._files = files
+        self.texts = {_SOURCE: (c_folder() / _SOURCE).read_text(encoding="utf-8")}
+        self.mutants = c_mutants(_SOURCE, self.texts[_SOURCE])
+        with tempfile.TemporaryDirectory(prefix="csplat-adapter-") as name:
+            path = Path(name) / _ADAPTER
+            compile_c(path, "-c", c_folder() / "tools" / "adapter.c")
+            self._adapter = path.read_bytes()
+        self._wanted = []
+        if files:
+            with CDecoder(limits=C_LIMITS) as right:
+                self._wanted = [verdict(right.ask(data)) for data in files]
+
+    def valid(self, mutant: Mutant) -> bool:
+        """Whether it is a program."""
+        with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
+            try:
+                compile_c(Path(name) / "nothing", "-fsyntax-only", self._written(mutant, Path(name)))
+            except InputError:
+                return False
+        return True
+
+    def attempt(self, mutant: Mutant) -> Result:
+        """Run the vectors, then the fuzzed files, which have smaller budgets."""
+        with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
+            program, adapter = Path(name) / "adapter", Path(name) / _ADAPTER
+            adapter.write_bytes(self._adapter)
+            compile_c(program, self._written(mutant, Path(name)), adapter, "-lz", "-lm")
+            with CDecoder(program, timeout=_SECONDS) as decoder:
+                caught = failing(decoder.ask)
+            if caught:
+                return Result(mutant, Fate.CAUGHT, caught)
+            with CDecoder(program, C_LIMITS, _SECONDS) as decoder:
+                missed = difference(decoder.ask, self._files, self._wanted)
+            return Result(mutant, Fate.MISSED if missed else Fate.SAME, missed)
+
+    def _written(self, mutant: Mutant, folder: Path) -> Path:
+        path = folder / _SOURCE
+        path.write_text(mutant.apply(self.texts[_SOURCE]), encoding="utf-8")
+        return path
