@@ -193,7 +193,8 @@ static int read_otherwise(csplat *file)
         band = malloc(tile.splat_count * 21 * sizeof(float));
         if (!integers.means || !integers.quats || !integers.sh[0] || !band)
             abort();
-        for (unsigned l = info->sh_degree; l; l--) {
+        for (unsigned k = 1; k <= info->sh_degree; k++) { /* from either end: a band may find its indices in a lower one */
+            const unsigned l = (info->file_size + i) % 2 ? k : info->sh_degree + 1 - k;
             accepted &= csplat_read_packed_band(file, i, l, &packed) == CSPLAT_OK;
             if (packed.index)
                 accepted &= csplat_read_packed_codebook(file, packed.codebook, l, &table) == CSPLAT_OK;
