@@ -15,9 +15,10 @@ from csplat_conformance.process import Ended
 from csplat_conformance.protocol import answered
 from csplat_conformance.serving import Served
 
-__all__ = ["CDecoder", "c_folder", "compile_c", "missing_c"]
+__all__ = ["ADAPTER", "SOURCES", "CDecoder", "c_folder", "compile_c", "missing_c"]
 
-_ADAPTER = Path("tools", "adapter.c")
+ADAPTER = Path("tools", "adapter.c")
+SOURCES = ("csplat.c", "inflate.c")  # of the decoder, which then wants no library
 _MEMORY = 3_000_000  # kibibytes of address space: an allocation without bound fails at once
 
 
@@ -29,7 +30,7 @@ def c_folder() -> Path:
     """
     for root in (Path(__file__).parents[2], Path.cwd()):
         folder = root / "codec" / "c"
-        if (folder / _ADAPTER).is_file():
+        if (folder / ADAPTER).is_file():
             return folder
     raise InputError("the C decoder is not here: only a checkout has it and its adapter")
 
@@ -58,7 +59,7 @@ def compile_c(out: Path, *words: str | Path) -> None:
     missing = missing_c()
     if missing:
         raise InputError(missing)
-    command = ["cc", "-std=c99", "-O1", "-w", f"-I{c_folder()}", *map(str, words), "-o", str(out)]
+    command = ["cc", "-std=c99", "-O1", "-w", "-DCSPLAT_NO_ZLIB", f"-I{c_folder()}", *map(str, words), "-o", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own sources
     if done.returncode:
         raise InputError(f"cc cannot compile the C decoder: {done.stderr.strip().splitlines()[:1]}")
@@ -82,7 +83,7 @@ class CDecoder(Served):
         self._input, self._outdir = home / "input", home / "out"
         if program is None:
             program = home / "adapter"
-            compile_c(program, c_folder() / _ADAPTER, c_folder() / "csplat.c", "-lz", "-lm")
+            compile_c(program, *(c_folder() / name for name in (ADAPTER, *SOURCES)), "-lm")
         shell = f'ulimit -v {_MEMORY}; exec "$0" "$@"'
         super().__init__(["sh", "-c", shell, str(program), *map(str, limits)], timeout)
 

@@ -170,21 +170,31 @@ static int read_bytes(void *user, uint64_t offset, size_t size, void *into)
 static int read_otherwise(csplat *file)
 {
     const csplat_info *info = csplat_get_info(file);
-    int accepted = csplat_check(file) == CSPLAT_OK;
+    int accepted = csplat_check(file) == CSPLAT_OK, found;
+    csplat_stated_errors errors;
     csplat_columns table;
+    const char *text;
+    size_t length;
+    for (int which = 0; which < 3; which++)
+        accepted &= csplat_read_text(file, (csplat_text)which, &text, &length) == CSPLAT_OK;
+    accepted &= csplat_read_stated_errors(file, &errors, &found) == CSPLAT_OK;
     for (uint32_t i = 0; i < info->tile_count; i++) {
         csplat_integers integers = {0};
         csplat_packed_geometry geometry;
         csplat_packed packed;
         csplat_tile tile;
+        int32_t exponents[8];
         float *band;
         csplat_get_tile(file, i, &tile);
         integers.means = malloc(tile.splat_count * 3 * sizeof(int64_t));
+        integers.quats = malloc(tile.splat_count * 3 * sizeof(int32_t));
         integers.sh[0] = malloc(tile.splat_count * 9 * sizeof(int64_t));
+        integers.exponents = exponents;
         band = malloc(tile.splat_count * 21 * sizeof(float));
-        if (!integers.means || !integers.sh[0] || !band)
+        if (!integers.means || !integers.quats || !integers.sh[0] || !band)
             abort();
-        for (unsigned l = info->sh_degree; l; l--) {
+        for (unsigned k = 1; k <= info->sh_degree; k++) { /* from either end: a band may find its indices in a lower one */
+            const unsigned l = (info->file_size + i) % 2 ? k : info->sh_degree + 1 - k;
             accepted &= csplat_read_packed_band(file, i, l, &packed) == CSPLAT_OK;
             if (packed.index)
                 accepted &= csplat_read_packed_codebook(file, packed.codebook, l, &table) == CSPLAT_OK;
@@ -194,6 +204,7 @@ static int read_otherwise(csplat *file)
         accepted &= csplat_read_integers(file, i, &integers) == CSPLAT_OK;
         accepted &= csplat_read_extras(file, i, NULL) == CSPLAT_OK;
         free(integers.means);
+        free(integers.quats);
         free(integers.sh[0]);
         free(band);
     }

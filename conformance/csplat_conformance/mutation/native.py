@@ -11,19 +11,18 @@ from csplat_conformance.fuzzing.targets import C_LIMITS
 from csplat_conformance.mutation.judging import difference, failing, verdict
 from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.mutation.tokens import c_mutants
-from csplat_conformance.native import CDecoder, c_folder, compile_c
+from csplat_conformance.native import ADAPTER, SOURCES, CDecoder, c_folder, compile_c
 
 __all__ = ["NativeDecoder"]
 
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
-_SOURCE, _ADAPTER = "csplat.c", "adapter.o"
 
 
 class NativeDecoder:
     """The C decoder and its mutants.
 
     Attributes:
-        texts: its source by the name of the file.
+        texts: its sources by the names of their files.
         mutants: all of them.
 
     Args:
@@ -35,12 +34,9 @@ class NativeDecoder:
 
     def __init__(self, files: Sequence[bytes]) -> None:
         self._files = files
-        self.texts = {_SOURCE: (c_folder() / _SOURCE).read_text(encoding="utf-8")}
-        self.mutants = c_mutants(_SOURCE, self.texts[_SOURCE])
-        with tempfile.TemporaryDirectory(prefix="csplat-adapter-") as name:
-            path = Path(name) / _ADAPTER
-            compile_c(path, "-c", c_folder() / "tools" / "adapter.c")
-            self._adapter = path.read_bytes()
+        self.texts = {name: (c_folder() / name).read_text(encoding="utf-8") for name in SOURCES}
+        self.mutants = [mutant for name, text in self.texts.items() for mutant in c_mutants(name, text)]
+        self._objects: dict[str, bytes] = {}
         self._wanted = []
         if files:
             with CDecoder(limits=C_LIMITS) as right:
@@ -58,9 +54,11 @@ class NativeDecoder:
     def attempt(self, mutant: Mutant) -> Result:
         """Run the vectors, then the fuzzed files, which have smaller budgets."""
         with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
-            program, adapter = Path(name) / "adapter", Path(name) / _ADAPTER
-            adapter.write_bytes(self._adapter)
-            compile_c(program, self._written(mutant, Path(name)), adapter, "-lz", "-lm")
+            program, objects = Path(name) / "adapter", []
+            for other in {str(ADAPTER), *SOURCES} - {mutant.file}:
+                objects.append(Path(name) / f"{Path(other).stem}.o")
+                objects[-1].write_bytes(self._object(other))
+            compile_c(program, self._written(mutant, Path(name)), *objects, "-lm")
             with CDecoder(program, timeout=_SECONDS) as decoder:
                 caught = failing(decoder.ask)
             if caught:
@@ -69,7 +67,15 @@ class NativeDecoder:
                 missed = difference(decoder.ask, self._files, self._wanted)
             return Result(mutant, Fate.MISSED if missed else Fate.SAME, missed)
 
+    def _object(self, name: str) -> bytes:
+        if name not in self._objects:
+            with tempfile.TemporaryDirectory(prefix="csplat-object-") as folder:
+                path = Path(folder) / "object"
+                compile_c(path, "-c", c_folder() / name)
+                self._objects[name] = path.read_bytes()
+        return self._objects[name]
+
     def _written(self, mutant: Mutant, folder: Path) -> Path:
-        path = folder / _SOURCE
-        path.write_text(mutant.apply(self.texts[_SOURCE]), encoding="utf-8")
+        path = folder / mutant.file
+        path.write_text(mutant.apply(self.texts[mutant.file]), encoding="utf-8")
         return path
