@@ -74,7 +74,10 @@ class Decoder:
 
 def _in_javascript(place: str) -> list[Decoder]:
     return [
-        Decoder(place, "csplat JavaScript", _PRESETS, _FLOATS, "csplat.mjs", "plain"),
+        Decoder(place, "csplat WebAssembly", _PRESETS, _FLOATS, "csplat.mjs", "compiled"),
+        Decoder(place, "csplat WebAssembly, all cores", _PRESETS, _FLOATS, "csplat.mjs", "workers"),
+        Decoder(place, "csplat WebAssembly, packed", _PRESETS, "narrow integers", "csplat.mjs", "packed"),
+        Decoder(place, "csplat JavaScript alone", _PRESETS, _FLOATS, "csplat.mjs", "plain"),
         Decoder(place, "@adobe/spz", ("v4.spz",), _FLOATS, "others.mjs", "adobe"),
         Decoder(place, "three.js SPZLoader", ("v4.spz",), _GEOMETRY, "others.mjs", "threeSpz"),
     ]
@@ -84,6 +87,7 @@ def _in_javascript(place: str) -> list[Decoder]:
 DECODERS = [
     Decoder("native", "csplat C", _PRESETS, _FLOATS, "csplat", "1"),
     Decoder("native", "csplat C, all cores", _PRESETS, _FLOATS, "csplat", _CORES),
+    Decoder("native", "csplat C, inflate.c", _PRESETS, _FLOATS, "csplat-own", "1"),
     Decoder("native", "SPZ's library in C++", ("v4.spz", "v3.spz"), _FLOATS, "spz", "floats"),
     Decoder("native", "the same, not unpacked", ("v4.spz",), "bytes", "spz", "packed"),
     Decoder("python", "csplat Python", _PRESETS, _FLOATS, "serve.py", "1"),
@@ -105,7 +109,7 @@ def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder
         peers: folder for npm packages, sources and programs.
         chromium: the program.
     """
-    ways = {"csplat": _build_csplat, "spz": _build_spz, "others.mjs": _build_bundle}
+    ways = {"csplat": _build_csplat, "csplat-own": _build_csplat_own, "spz": _build_spz, "others.mjs": _build_bundle}
     drivers = {one.driver for one in wanted}
     if "spz" in drivers:
         drivers.add("others.mjs")  # which writes the SPZ
@@ -133,6 +137,11 @@ def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder
 def _build_csplat(peers: Path) -> None:
     sources = [f"-I{_C}", DRIVERS / "csplat.c", _C / "csplat.c"]
     _run(["cc", "-O3", *sources, "-lz", "-lm", "-lpthread", "-o", _program(peers, "csplat")])
+
+
+def _build_csplat_own(peers: Path) -> None:
+    sources = [f"-I{_C}", "-DCSPLAT_NO_ZLIB", DRIVERS / "csplat.c", _C / "csplat.c", _C / "inflate.c"]
+    _run(["cc", "-O3", *sources, "-lm", "-lpthread", "-o", _program(peers, "csplat-own")])
 
 
 def _build_spz(peers: Path) -> None:
