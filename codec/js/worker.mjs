@@ -39,13 +39,18 @@ async function answer(request) {
 const buffers = ({ fields = {} }) =>
   [...Object.values(fields), ...Object.values(fields.extra ?? {})].filter(ArrayBuffer.isView).map(({ buffer }) => buffer);
 
+/** @param {any} port that requests come from and answers go to */
+function serve(port) {
+  const listen = async (/** @type {Request} */ request) => {
+    const given = await answer(request).catch(() => ({}));
+    port.postMessage(given, buffers(given));
+  };
+  if (port.on) port.on('message', listen);
+  else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));
+}
+
+// No await out here: bundlers that make a classic script of a worker know none.
 const { process } = /** @type {{process?: {versions?: {node?: string}}}} */ (globalThis);
 const name = 'node:worker_threads';
-/** @type {any} */
-const port = process?.versions?.node ? (await import(/* webpackIgnore: true */ /* @vite-ignore */ name)).parentPort : globalThis;
-const listen = async (/** @type {Request} */ request) => {
-  const given = await answer(request).catch(() => ({}));
-  port.postMessage(given, buffers(given));
-};
-if (port.on) port.on('message', listen);
-else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));
+if (process?.versions?.node === undefined) serve(globalThis);
+else import(/* webpackIgnore: true */ /* @vite-ignore */ name).then(({ parentPort }) => serve(parentPort));

@@ -75,9 +75,9 @@ async function start() {
   if (process?.versions?.node === undefined) {
     return new Correspondent(new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' }));
   }
-  const name = 'node:worker_threads'; // a variable, so that bundlers for browsers do not look for it
+  const [name, side] = ['node:worker_threads', './worker.mjs']; // so that bundlers for browsers do not look for them
   const threads = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
-  return new Correspondent(new threads.Worker(new URL('./worker.mjs', import.meta.url)));
+  return new Correspondent(new threads.Worker(new URL(side, import.meta.url)));
 }
 
 /**
