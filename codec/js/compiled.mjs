@@ -49,7 +49,9 @@ function compiledModule() {
       const text = atob(WASM);
       const bytes = new Uint8Array(text.length);
       for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i); // Uint8Array.from takes several times as long
-      return await WebAssembly.compile(bytes);
+      const module = await WebAssembly.compile(bytes);
+      spare = new WeakRef(new CompiledDecoder(module)); // here, not before, WebKit heeds the policy
+      return module;
     } catch {
       return null;
     }

@@ -10,7 +10,7 @@ import { ERROR_UNSUPPORTED } from './spec.mjs';
 const CHUNK_BYTES = 1 << 20; // output of one step of zlib at most
 const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream: at most 16 MiB come out of it unasked
 
-/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2. Browsers do not say it. */
+/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2; in Chromium, too. */
 const CLAUSES = new Map([
   ['symbols', 'COD-5'], // too many length or distance symbols
   ['set', 'COD-6'], // invalid code lengths set, invalid literal/lengths set, invalid distances set
@@ -37,7 +37,8 @@ export class InflateError extends Error {
 /** @param {unknown} error of the platform */
 function refused(error) {
   const message = error instanceof Error ? error.message : String(error);
-  return new InflateError(message, 0, CLAUSES.get(message.split(' ').at(-1) ?? ''));
+  const [last] = /[\w-]*(?=\W*$)/.exec(message) ?? [''];
+  return new InflateError(message, 0, CLAUSES.get(last));
 }
 
 /** @type {Promise<Inflate> | null} */
