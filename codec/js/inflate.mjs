@@ -10,7 +10,7 @@ import { ERROR_UNSUPPORTED } from './spec.mjs';
 const CHUNK_BYTES = 1 << 20; // output of one step of zlib at most
 const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream: at most 16 MiB come out of it unasked
 
-/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2; in Chromium, too. */
+/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2; in Chromium and Firefox, too. */
 const CLAUSES = new Map([
   ['symbols', 'COD-5'], // too many length or distance symbols
   ['set', 'COD-6'], // invalid code lengths set, invalid literal/lengths set, invalid distances set

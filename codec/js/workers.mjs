@@ -1,11 +1,11 @@
-// Tiles decoded by workers, for `decode` with the option `workers`. worker.mjs is their side.
+// Tiles decoded by workers, for `decode` with the option `workers`. csplat-worker.mjs is their side.
 
 /**
  * @typedef {import('./assemble.mjs').Assembly} Assembly
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./reader.mjs').CsplatReader} CsplatReader
- * @typedef {import('./worker.mjs').Answer} Answer
- * @typedef {import('./worker.mjs').Request} Request
+ * @typedef {import('./csplat-worker.mjs').Answer} Answer
+ * @typedef {import('./csplat-worker.mjs').Request} Request
  */
 
 const IDLE_MS = 5000; // a worker without work ends after so long: to start one takes as long as to decode 100,000 splats
@@ -73,9 +73,9 @@ function giveBack(worker) {
 async function start() {
   const { process } = /** @type {{process?: {versions?: {node?: string}}}} */ (globalThis);
   if (process?.versions?.node === undefined) {
-    return new Correspondent(new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' }));
+    return new Correspondent(new Worker(new URL('./csplat-worker.mjs', import.meta.url), { type: 'module' }));
   }
-  const [name, side] = ['node:worker_threads', './worker.mjs']; // so that bundlers for browsers do not look for them
+  const [name, side] = ['node:worker_threads', './csplat-worker.mjs']; // so that bundlers for browsers do not look for them
   const threads = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
   return new Correspondent(new threads.Worker(new URL(side, import.meta.url)));
 }

@@ -29,7 +29,7 @@ _OTHERS: Final = (
     "packed.mjs",
     "compiled.mjs",
     "wasm.mjs",
-    "worker.mjs",
+    "csplat-worker.mjs",
     "workers.mjs",
 )
 #: Finds the parser that the type check of the decoder (codec/js/package.json) runs with.
