@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from csplat import EncodeOptions, decode, encode, read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
+FAST = EncodeOptions(preset="fast")
 
 # What `points.mjs` uses of three.js. Types of the arguments are checked; how three.js draws is its own affair.
 THREE = """
@@ -54,7 +56,7 @@ import { loadPoints } from './points.mjs';
 import { stream } from './stream.mjs';
 
 const [url, directions] = JSON.parse(process.argv[2]);
-const scene = await decode(await (await fetch(url)).arrayBuffer());
+const scene = await decode(await (await fetch(url)).arrayBuffer(), { workers: 2 });
 const points = await loadPoints(url);
 const tiles = [];
 const bands = [];
@@ -63,6 +65,7 @@ await stream(url, {
   addBand: (first, layer, sh) => bands.push([first, layer, sh.length]),
 });
 console.log(JSON.stringify({
+  workers: scene.workers,
   position: Array.from(points.geometry.attributes.position.array),
   colour: Array.from(points.geometry.attributes.color.array),
   sizes: Object.values(points.geometry.attributes).map(({ itemSize }) => itemSize),
@@ -81,7 +84,7 @@ def samples(language):
 
 @pytest.fixture(scope="module")
 def model(request):
-    return decode(encode(read_ply(request.getfixturevalue("sample_path"))))
+    return decode(encode(read_ply(request.getfixturevalue("sample_path")), FAST))
 
 
 @pytest.fixture
@@ -92,18 +95,30 @@ def results(site, tmp_path, model):
     for text in samples("js"):
         name = re.match(r"// (\w+\.mjs)\n", text)[1]
         (tmp_path / name).write_text(text, "utf-8")
-    modules = tmp_path / "node_modules"
-    (modules / "three").mkdir(parents=True)
-    (modules / "three" / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
-    (modules / "three" / "three.mjs").write_text(THREE)
-    (modules / "csplat-decoder").symlink_to(ROOT / "codec" / "js")
+    install_decoder(tmp_path)
+    three = tmp_path / "node_modules" / "three"
+    three.mkdir()
+    (three / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
+    (three / "three.mjs").write_text(THREE)
     (tmp_path / "run.mjs").write_text(RUN)
-    site.add("/scene.csplat", encode(model, EncodeOptions(preset="fast", tile_splats=4000)))
+    site.add("/scene.csplat", encode(model, replace(FAST, tile_splats=4000)))
     words = json.dumps([site.url("/scene.csplat"), directions(20).tolist()])
     done = subprocess.run([node, "run.mjs", words], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert 0 == done.returncode, done.stderr
     assert {200, 206} == set(site.statuses("/scene.csplat"))
     return json.loads(done.stdout), decode(site._files["/scene.csplat"])
+
+
+def install_decoder(folder):
+    """Install the package of the decoder as a user gets it: packed, without what is not shipped."""
+    npm = shutil.which("npm")
+    if npm is None:
+        absent("the package of the decoder needs npm, which is not installed")
+    words = [npm, "--silent", "--offline", "--no-audit", "--no-fund"]
+    packed = subprocess.run(
+        [*words, "pack", ROOT / "codec" / "js"], cwd=folder, check=True, capture_output=True, text=True
+    )
+    subprocess.run([*words, "install", f"./{packed.stdout.strip()}"], cwd=folder, check=True)
 
 
 def directions(count):
@@ -114,6 +129,7 @@ def directions(count):
 def test_the_samples_in_javascript(results):
     given, scene = results
     count = len(scene)
+    assert 2 == given["workers"]
     assert [3, 4] == given["sizes"]
     np.testing.assert_array_equal(scene.means.ravel(), np.array(given["position"], np.float32))
     colours = np.array(given["colour"]).reshape(count, 4)
@@ -167,7 +183,7 @@ def check_stream(given, scene):
 
 
 def test_the_sample_in_python(tmp_path, model):
-    (tmp_path / "scene.csplat").write_bytes(encode(model))
+    (tmp_path / "scene.csplat").write_bytes(encode(model, FAST))
     (program,) = samples("python")
     assert len([line for line in program.splitlines() if line.strip()]) <= 5
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -177,7 +193,7 @@ def test_the_sample_in_python(tmp_path, model):
 def test_the_engine_without_a_page(tab, site, model):
     (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
     site.add("/show.mjs", sample.encode())
-    site.add("/scene.csplat", encode(model))
+    site.add("/scene.csplat", encode(model, FAST))
     page = b"<!doctype html><title>x</title><link rel=icon href=data:,><canvas width=160 height=120></canvas>"
     tab.page.goto(site.add("/page.html", page))
     pixels = tab.page.evaluate(
