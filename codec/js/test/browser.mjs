@@ -1,5 +1,5 @@
-// Run browser.html under the policies that a page may have, in headless Chromium: `node codec/js/test/browser.mjs`; or
-// `xvfb-run -a node codec/js/test/browser.mjs firefox-esr`, `… /usr/lib/x86_64-linux-gnu/webkit2gtk-4.1/MiniBrowser`.
+// Run browser.html under two policies, in headless Chromium: `node codec/js/test/browser.mjs`; in other engines:
+// `node codec/js/test/browser.mjs firefox-esr`, `xvfb-run -a node … /usr/lib/x86_64-linux-gnu/webkit2gtk-4.1/MiniBrowser`.
 import { spawn } from 'node:child_process';
 import { mkdtempSync, readFileSync, rmSync } from 'node:fs';
 import { createServer } from 'node:http';

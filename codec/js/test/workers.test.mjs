@@ -1,8 +1,10 @@
 // Tiles decoded by workers: the same scene, the same refusals; without workers where none starts.
 import assert from 'node:assert/strict';
 import { spawnSync } from 'node:child_process';
+import { once } from 'node:events';
 import { test } from 'node:test';
 import { fileURLToPath } from 'node:url';
+import { Worker } from 'node:worker_threads';
 
 import { decode, readHeader } from '../decoder.mjs';
 import { forged, hash, manifest, refusal, vector } from './helpers.mjs';
@@ -47,6 +49,15 @@ test('an abort ends the work of workers', async () => {
   const onProgress = () => control.abort(reason);
   const work = decode(vector(several[0].name), { workers: 1, signal: control.signal, onProgress });
   await assert.rejects(work, reason);
+});
+
+const noRequire = !process.features.require_module && 'this Node cannot require modules';
+test('a classic script can be made of the worker: no module awaits out in the open', { skip: noRequire }, async () => {
+  const path = fileURLToPath(new URL('../csplat-worker.mjs', import.meta.url));
+  const worker = new Worker(`require(${JSON.stringify(path)})`, { eval: true });
+  worker.postMessage({ tile: 0, parts: new Map() });
+  assert.deepEqual(await once(worker, 'message'), [{}]); // refused, for there is no file
+  await worker.terminate();
 });
 
 test('where no worker may start, decode does without', () => {
