@@ -29,7 +29,7 @@ export interface DecodeOptions {
   /** Splats so far, and all of them. */
   onProgress?: (done: number, total: number) => void;
   /**
-   * Workers at most that decode a scene of several tiles; by default this thread does. Where a page's policy or a bundler
+   * Workers at most that decode, a tile each at a time; by default this thread does. Where a page's policy or a bundler
    * keeps them from starting, this thread does, too, and `workers` of the scene is 0.
    */
   workers?: number;

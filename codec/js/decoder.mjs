@@ -69,7 +69,7 @@ export async function decode(data, options = {}) {
       filled += splats;
       onProgress?.(filled, assembly.count);
     };
-    const several = (options.workers ?? 0) > 0 && tiles.length > 1 && !integers && !inflate;
+    const several = (options.workers ?? 0) > 0 && !integers && !inflate;
     const workers = several ? await fillByWorkers(reader, tiles, assembly, options.workers ?? 0, done, signal) : 0;
     if (workers === 0) {
       filled = 0;
