@@ -235,6 +235,7 @@ export class CsplatReader {
    * @param {AbortSignal} [signal]
    */
   async layerByCompiled(record, place, chunk, packed, signal) {
+    if (this.compiled === null) return null;
     const { layer } = place;
     const chunks = new Map([[place, chunk]]);
     // Bands of one codebook share the indices of the lowest of them, which is kept for the others.

@@ -113,6 +113,7 @@ export async function fillByWorkers(reader, tiles, assembly, count, done, signal
       const parts = await reader.partsOf(wanted, tile);
       const answer = await worker.ask({ tile: tile.index, parts }, [...parts.values()].map(({ buffer }) => buffer));
       if (!answer?.fields) return false;
+      for (const offset of parts.keys()) reader.checked.add(offset);
       assembly.copy(answer.fields, places.get(tile) ?? 0);
       done(tile.splatCount);
     }
