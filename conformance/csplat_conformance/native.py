@@ -69,26 +69,27 @@ class CDecoder(Served):
     """A process of the adapter that decodes the files it is told of.
 
     Args:
-        program: the adapter, compiled; None to compile the checkout's.
+        program: the adapter, compiled; None for the checkout's, which is compiled when it is first asked.
         limits: budgets: splats, bytes, bytes of a text; the registry's if left out.
         timeout: seconds for one file.
-
-    Raises:
-        InputError: it cannot be compiled.
     """
 
     def __init__(self, program: Path | None = None, limits: Sequence[int] = (), timeout: float = 20.0) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="csplat-c-")
         home = Path(self._folder.name)
         self._input, self._outdir = home / "input", home / "out"
-        if program is None:
-            program = home / "adapter"
-            compile_c(program, *(c_folder() / name for name in (ADAPTER, *SOURCES)), "-lm")
+        self._program = program or home / "adapter"
         shell = f'ulimit -v {_MEMORY}; exec "$0" "$@"'
-        super().__init__(["sh", "-c", shell, str(program), *map(str, limits)], timeout)
+        super().__init__(["sh", "-c", shell, str(self._program), *map(str, limits)], timeout)
 
     def ask(self, data: bytes) -> Answer:
-        """Decode one file, as floats and as integers."""
+        """Decode one file, as floats and as integers.
+
+        Raises:
+            InputError: the adapter cannot be compiled.
+        """
+        if not self._program.exists():
+            compile_c(self._program, *(c_folder() / name for name in (ADAPTER, *SOURCES)), "-lm")
         began = time.monotonic()
         self._input.write_bytes(data)
         self._outdir.mkdir()

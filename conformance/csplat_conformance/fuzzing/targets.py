@@ -21,7 +21,7 @@ from csplat_conformance.builder import Built, build
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.mutate import mapped, mutant_of
 from csplat_conformance.native import CDecoder, missing_c
-from csplat_conformance.recipes import all_recipes
+from csplat_conformance.recipes import sound_recipes
 from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 from csplat_conformance.serving import Served
@@ -106,7 +106,7 @@ class DecoderTarget:
         """Return the valid vectors with all their fields, and the given files."""
         # By the sizes of the vectors: to build all of them for those that are small takes two seconds.
         small = {vector.name for vector in load() if (VECTORS / vector.file).stat().st_size <= _LARGEST_SEED}
-        scenes = [recipe.scene for recipe in all_recipes() if recipe.scene is not None and recipe.name in small]
+        scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
         return [build(scene) for scene in scenes] + [mapped(p.read_bytes()) for p in paths]
 
     def mutant(self, rng: random.Random, corpus: Sequence[Built]) -> Case:

@@ -37,10 +37,8 @@ class NativeDecoder:
         self.texts = {name: (c_folder() / name).read_text(encoding="utf-8") for name in SOURCES}
         self.mutants = [mutant for name, text in self.texts.items() for mutant in c_mutants(name, text)]
         self._objects: dict[str, bytes] = {}
-        self._wanted = []
-        if files:
-            with CDecoder(limits=C_LIMITS) as right:
-                self._wanted = [verdict(right.ask(data)) for data in files]
+        with CDecoder(limits=C_LIMITS) as right:
+            self._wanted = [verdict(right.ask(data)) for data in files]
 
     def valid(self, mutant: Mutant) -> bool:
         """Whether it is a program."""

@@ -35,12 +35,12 @@ from csplat_conformance.reference import expected
 from csplat_conformance.samples import Recipe
 from csplat_conformance.scene import Scene
 
-__all__ = ["all_recipes", "exact_floats"]
+__all__ = ["all_recipes", "exact_floats", "sound_recipes"]
 
 
-def all_recipes() -> list[Recipe]:
-    """Return every recipe, in the order of the manifest."""
-    valid = (
+def sound_recipes() -> list[Recipe]:
+    """Return those of valid files, in a twentieth of the time: the others are built here to be broken."""
+    makers = (
         valid_recipes,
         valid_stream_recipes,
         combined_recipes,
@@ -52,7 +52,12 @@ def all_recipes() -> list[Recipe]:
         good_text_recipes,
         rendered_recipes,
     )
-    invalid = (
+    return [recipe for make in makers for recipe in make()]
+
+
+def all_recipes() -> list[Recipe]:
+    """Return every recipe, in the order of the manifest."""
+    makers = (
         header_recipes,
         boundary_recipes,
         index_recipes,
@@ -71,7 +76,7 @@ def all_recipes() -> list[Recipe]:
         invalid_growth_recipes,
         bad_text_recipes,
     )
-    return [recipe for make in (*valid, *invalid) for recipe in make()]
+    return [*sound_recipes(), *(recipe for make in makers for recipe in make())]
 
 
 @lru_cache(maxsize=8)
@@ -84,4 +89,4 @@ def exact_floats(name: str) -> dict[str, NDArray[Any]]:
 
 @cache
 def _scenes() -> dict[str, Scene | None]:
-    return {recipe.name: recipe.scene for recipe in all_recipes()}
+    return {recipe.name: recipe.scene for recipe in sound_recipes()}
