@@ -4,7 +4,7 @@ import { CsplatReader } from './reader.mjs';
 
 /**
  * @typedef {Map<number, Uint8Array<ArrayBuffer>>} Parts of the file, by their offsets
- * @typedef {import('./assemble.mjs').Wanted} Wanted
+ * @typedef {{form?: import('./decoder.d.ts').LayerForm, shDegree: number, extra: boolean}} Wanted of a tile
  * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts}} Request
  * @typedef {{fields?: any}} Answer the arrays of a tile; without them where it was refused
  */
@@ -13,8 +13,10 @@ import { CsplatReader } from './reader.mjs';
 let parts = new Map();
 /** @type {Wanted} */
 let wanted;
-/** @type {CsplatReader | undefined} */
+/** @type {CsplatReader} */
 let reader;
+/** @type {Set<object>} tables of codebooks that were sent */
+let sent = new Set();
 
 /**
  * @param {Request} request
@@ -26,24 +28,37 @@ async function answer(request) {
     wanted = request.wanted;
     const read = async (/** @type {number} */ offset) => /** @type {Uint8Array<ArrayBuffer>} */ (parts.get(offset));
     reader = await CsplatReader.open({ read });
+    sent = new Set();
     return {};
   }
   for (const [offset, bytes] of request.parts) parts.set(offset, bytes);
-  const { shDegree, extra } = wanted;
-  const fields = await /** @type {CsplatReader} */ (reader).readTile(request.tile, { shDegree, extra });
+  /** @type {any} */
+  const fields = await reader.readTile(request.tile, /** @type {{form: 'packed', shDegree: number}} */ (wanted));
   for (const offset of request.parts.keys()) parts.delete(offset);
+  for (const { lookup } of (fields.sh ?? []).filter(Boolean)) {
+    if (lookup && sent.has(lookup.table)) delete lookup.table;
+    else if (lookup) sent.add(lookup.table);
+  }
   return { fields };
 }
 
-/** @param {Answer} given */
-const buffers = ({ fields = {} }) =>
-  [...Object.values(fields), ...Object.values(fields.extra ?? {})].filter(ArrayBuffer.isView).map(({ buffer }) => buffer);
+/**
+ * All arrays of an answer but tables of codebooks, which stay.
+ *
+ * @param {object} value
+ * @returns {ArrayBuffer[]}
+ */
+const buffers = (value) =>
+  Object.entries(value).flatMap(([name, one]) => {
+    if (ArrayBuffer.isView(one)) return [/** @type {ArrayBuffer} */ (one.buffer)];
+    return name !== 'table' && typeof one === 'object' && one !== null ? buffers(one) : [];
+  });
 
 /** @param {any} port that requests come from and answers go to */
 function serve(port) {
   const listen = async (/** @type {Request} */ request) => {
     const given = await answer(request).catch(() => ({}));
-    port.postMessage(given, buffers(given));
+    port.postMessage(given, [...new Set(buffers(given))]);
   };
   if (port.on) port.on('message', listen);
   else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));

@@ -13,7 +13,7 @@ import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from
 import { CsplatReader } from './reader.mjs';
 import * as spec from './spec.mjs';
 import { MemorySource } from './whole.mjs';
-import { fillByWorkers } from './workers.mjs';
+import { byWorkers } from './workers.mjs';
 
 export { CsplatError, CsplatReader, FormatError, InputError, LimitError, UnsupportedError };
 
@@ -21,6 +21,7 @@ export { CsplatError, CsplatReader, FormatError, InputError, LimitError, Unsuppo
  * @typedef {import('./decoder.d.ts').DecodeOptions} DecodeOptions
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./tile.mjs').SceneContext} SceneContext
  */
 
@@ -65,21 +66,31 @@ export async function decode(data, options = {}) {
   reader.scratch = reused(shDegree);
   try {
     let filled = 0;
-    const done = (/** @type {number} */ splats) => {
-      filled += splats;
+    const done = (/** @type {TileRecord} */ { splatCount }) => {
+      filled += splatCount;
       onProgress?.(filled, assembly.count);
     };
-    const several = (options.workers ?? 0) > 0 && !integers && !inflate;
-    const workers = several ? await fillByWorkers(reader, tiles, assembly, options.workers ?? 0, done, signal) : 0;
-    if (workers === 0) {
-      filled = 0;
-      for (const record of tiles) {
-        await reader.fill(assembly, record, filled, signal);
-        done(record.splatCount);
-      }
+    const places = new Map();
+    let first = 0;
+    for (const tile of tiles) {
+      places.set(tile, first);
+      first += tile.splatCount;
+    }
+    const waiting = [...tiles].reverse();
+    const workers = new Set();
+    const most = integers || inflate ? 0 : (options.workers ?? 0);
+    for await (const { tile, fields, worker } of byWorkers(reader, waiting, wanted, most, signal)) {
+      assembly.copy(fields, places.get(tile));
+      workers.add(worker);
+      done(tile);
+    }
+    for (let tile = waiting.pop(); tile; tile = waiting.pop()) {
+      await reader.fill(assembly, tile, places.get(tile), signal);
+      done(tile);
     }
     await reader.checkAll();
-    return { ...assembly.fields(), header, ...(await reader.describe()), checks: reader.checks, workers };
+    const checks = reader.checks;
+    return { ...assembly.fields(), header, ...(await reader.describe()), checks, workers: workers.size };
   } finally {
     reader.compiled?.close();
   }

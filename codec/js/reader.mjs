@@ -9,11 +9,12 @@ import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
-import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
+import { checkedDegree, checkedForm, checkedLimits, checkedTile, checkedTiles } from './options.mjs';
 import { packLayer } from './packed.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
+import { byWorkers } from './workers.mjs';
 
 const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
 
@@ -30,9 +31,9 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').ReaderOptions} ReaderOptions
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./decoder.d.ts').TilesOptions} TilesOptions
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
- * @typedef {import('./assemble.mjs').Wanted} Wanted
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
 
@@ -40,7 +41,7 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * Layers of a tile that are wanted.
  *
  * @param {TileRecord} record
- * @param {Wanted} wanted
+ * @param {{shDegree: number, extra: boolean}} wanted
  */
 const wantedLayers = ({ layers }, { shDegree, extra }) =>
   layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
@@ -75,6 +76,7 @@ export class CsplatReader {
     const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
     const inflate = options.inflate ?? (await platformInflate());
     const reader = new CsplatReader(source, header, limits, inflate, compiled);
+    reader.inflates = options.inflate !== undefined;
     reader.opening = new Map([[0, head], [spec.HEADER_SIZE, index]]);
     return reader;
   }
@@ -94,6 +96,8 @@ export class CsplatReader {
     this.compiled = compiled;
     /** @type {Map<number, Bytes>} header and index by their offsets */
     this.opening = new Map();
+    /** Whether the caller brings the inflate, which workers cannot have. */
+    this.inflates = false;
     /** @type {Set<number>} offsets of the chunks whose CRC was checked */
     this.checked = new Set();
     /** How long reads have waited for bytes so far, each for itself. */
@@ -157,6 +161,25 @@ export class CsplatReader {
   }
 
   /**
+   * Read tiles one after the other, or in workers; then in the order in which they are done.
+   *
+   * @param {TilesOptions} [options]
+   * @returns {AsyncGenerator<any, void>} what `readTile` gives, with the tile's `index`
+   */
+  async *readTiles({ tiles, shDegree, extra = false, form, workers = 0, signal } = {}) {
+    const waiting = [...checkedTiles(tiles, this.header)].reverse();
+    const wanted = { form, shDegree: checkedDegree(shDegree, this.header), extra: extra && form !== 'packed' };
+    const most = (form !== 'packed' && checkedForm(form)) || this.inflates ? 0 : workers;
+    for await (const { tile, fields } of byWorkers(this, waiting, wanted, most, signal)) {
+      yield { index: tile.index, ...fields };
+    }
+    for (let tile = waiting.pop(); tile; tile = waiting.pop()) {
+      signal?.throwIfAborted();
+      yield { index: tile.index, ...(await this.readTile(tile.index, { ...wanted, signal })) };
+    }
+  }
+
+  /**
    * Decode a tile into arrays.
    *
    * @param {Assembly} assembly
@@ -184,7 +207,7 @@ export class CsplatReader {
   /**
    * Bytes by their offsets for another reader, in a worker: header, index, codebooks; or what a tile has.
    *
-   * @param {Wanted} wanted
+   * @param {{shDegree: number, extra: boolean}} wanted
    * @param {TileRecord} [record]
    * @returns {Promise<Map<number, Bytes>>}
    */
