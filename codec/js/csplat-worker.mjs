@@ -1,11 +1,12 @@
 // The side of the worker: see workers.mjs.
 
-import { CsplatReader } from './reader.mjs';
+import { buffersOf } from './arrays.mjs';
+import { Reader } from './reader.mjs';
 
 /**
  * @typedef {Map<number, Uint8Array<ArrayBuffer>>} Parts of the file, by their offsets
  * @typedef {{form?: import('./decoder.d.ts').LayerForm, shDegree: number, extra: boolean}} Wanted of a tile
- * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts}} Request
+ * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts, spare?: any}} Request `spare`: fields whose memory may be used again
  * @typedef {{fields?: any}} Answer the arrays of a tile; without them where it was refused
  */
 
@@ -13,7 +14,7 @@ import { CsplatReader } from './reader.mjs';
 let parts = new Map();
 /** @type {Wanted} */
 let wanted;
-/** @type {CsplatReader} */
+/** @type {Reader} */
 let reader;
 /** @type {Set<object>} tables of codebooks that were sent */
 let sent = new Set();
@@ -27,13 +28,13 @@ async function answer(request) {
     parts = request.open;
     wanted = request.wanted;
     const read = async (/** @type {number} */ offset) => /** @type {Uint8Array<ArrayBuffer>} */ (parts.get(offset));
-    reader = await CsplatReader.open({ read });
+    reader = await Reader.open({ read });
     sent = new Set();
     return {};
   }
   for (const [offset, bytes] of request.parts) parts.set(offset, bytes);
   /** @type {any} */
-  const fields = await reader.readTile(request.tile, /** @type {{form: 'packed', shDegree: number}} */ (wanted));
+  const fields = await reader.readTile(request.tile, /** @type {any} */ (wanted), request.spare);
   for (const offset of request.parts.keys()) parts.delete(offset);
   for (const { lookup } of (fields.sh ?? []).filter(Boolean)) {
     if (lookup && sent.has(lookup.table)) delete lookup.table;
@@ -42,23 +43,11 @@ async function answer(request) {
   return { fields };
 }
 
-/**
- * All arrays of an answer but tables of codebooks, which stay.
- *
- * @param {object} value
- * @returns {ArrayBuffer[]}
- */
-const buffers = (value) =>
-  Object.entries(value).flatMap(([name, one]) => {
-    if (ArrayBuffer.isView(one)) return [/** @type {ArrayBuffer} */ (one.buffer)];
-    return name !== 'table' && typeof one === 'object' && one !== null ? buffers(one) : [];
-  });
-
 /** @param {any} port that requests come from and answers go to */
 function serve(port) {
   const listen = async (/** @type {Request} */ request) => {
     const given = await answer(request).catch(() => ({}));
-    port.postMessage(given, [...new Set(buffers(given))]);
+    port.postMessage(given, buffersOf(given));
   };
   if (port.on) port.on('message', listen);
   else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));

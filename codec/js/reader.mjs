@@ -9,12 +9,11 @@ import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { platformInflate } from './inflate.mjs';
-import { checkedDegree, checkedForm, checkedLimits, checkedTile, checkedTiles } from './options.mjs';
+import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile.mjs';
-import { byWorkers } from './workers.mjs';
 
 const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
 
@@ -31,7 +30,6 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').ReaderOptions} ReaderOptions
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
- * @typedef {import('./decoder.d.ts').TilesOptions} TilesOptions
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
@@ -47,13 +45,13 @@ const wantedLayers = ({ layers }, { shDegree, extra }) =>
   layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
 
 /** Reads parts of a file, and checks the CRC of each. */
-export class CsplatReader {
+export class Reader {
   /**
    * Open a file: one request for header and index of all but huge files.
    *
    * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
    * @param {ReaderOptions} [options]
-   * @returns {Promise<CsplatReader>}
+   * @returns {Promise<Reader>} one of the class that it is called on
    */
   static async open(from, options = {}) {
     const { signal } = options;
@@ -75,7 +73,7 @@ export class CsplatReader {
     const header = readIndex(index, file, limits);
     const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
     const inflate = options.inflate ?? (await platformInflate());
-    const reader = new CsplatReader(source, header, limits, inflate, compiled);
+    const reader = new this(source, header, limits, inflate, compiled);
     reader.inflates = options.inflate !== undefined;
     reader.opening = new Map([[0, head], [spec.HEADER_SIZE, index]]);
     return reader;
@@ -130,13 +128,14 @@ export class CsplatReader {
    *
    * @param {number} index
    * @param {{form?: LayerForm, shDegree?: number, extra?: boolean, signal?: AbortSignal}} [options]
+   * @param {any} [spare] what it gave before, of floats: its memory may be used again
    * @returns {Promise<any>} the arrays that `decode` gives, of the one tile; packed, see decoder.d.ts
    */
-  async readTile(index, { shDegree, extra = false, form, signal } = {}) {
+  async readTile(index, { shDegree, extra = false, form, signal } = {}, spare) {
     const record = checkedTile(index, this.header);
     if (form === 'packed') return this.readPackedTile(record, checkedDegree(shDegree, this.header), signal);
     const wanted = { shDegree: checkedDegree(shDegree, this.header), integers: checkedForm(form), extra };
-    const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes);
+    const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes, spare);
     await this.fill(assembly, record, 0, signal);
     return assembly.fields();
   }
@@ -158,25 +157,6 @@ export class CsplatReader {
     }
     for (const place of record.layers) this.kept.delete(place);
     return { ...geometry, sh };
-  }
-
-  /**
-   * Read tiles one after the other, or in workers; then in the order in which they are done.
-   *
-   * @param {TilesOptions} [options]
-   * @returns {AsyncGenerator<any, void>} what `readTile` gives, with the tile's `index`
-   */
-  async *readTiles({ tiles, shDegree, extra = false, form, workers = 0, signal } = {}) {
-    const waiting = [...checkedTiles(tiles, this.header)].reverse();
-    const wanted = { form, shDegree: checkedDegree(shDegree, this.header), extra: extra && form !== 'packed' };
-    const most = (form !== 'packed' && checkedForm(form)) || this.inflates ? 0 : workers;
-    for await (const { tile, fields } of byWorkers(this, waiting, wanted, most, signal)) {
-      yield { index: tile.index, ...fields };
-    }
-    for (let tile = waiting.pop(); tile; tile = waiting.pop()) {
-      signal?.throwIfAborted();
-      yield { index: tile.index, ...(await this.readTile(tile.index, { ...wanted, signal })) };
-    }
   }
 
   /**

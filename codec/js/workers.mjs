@@ -1,8 +1,10 @@
-// Tiles decoded by workers. csplat-worker.mjs is their side.
+// Tiles decoded by workers. csplat-worker.mjs is their side, and imports nothing that imports this: bundlers would not end.
+
+import { buffersOf } from './arrays.mjs';
 
 /**
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
- * @typedef {import('./reader.mjs').CsplatReader} CsplatReader
+ * @typedef {import('./reader.mjs').Reader} Reader
  * @typedef {import('./csplat-worker.mjs').Answer} Answer
  * @typedef {import('./csplat-worker.mjs').Request} Request
  * @typedef {import('./csplat-worker.mjs').Wanted} Wanted
@@ -34,13 +36,12 @@ class Correspondent {
 
   /**
    * @param {Request} request
-   * @param {ArrayBuffer[]} transfer
    * @returns {Promise<Answer | null>} null where the worker has failed, or never started
    */
-  ask(request, transfer) {
+  ask(request) {
     return new Promise((resolve) => {
       this.answered = resolve;
-      this.worker.postMessage(request, transfer);
+      this.worker.postMessage(request, buffersOf(request));
     });
   }
 }
@@ -84,19 +85,20 @@ async function start() {
 /**
  * Let a worker decode a tile. Where it refuses, or has failed, the result has no fields.
  *
- * @param {CsplatReader} reader
+ * @param {Reader} reader
  * @param {Correspondent} worker
  * @param {TileRecord} tile
  * @param {Wanted} wanted
  * @param {boolean} isFirst
+ * @param {any} spare fields of another tile, whose memory the worker may use again
  * @returns {Promise<{worker: Correspondent, tile: TileRecord, fields?: any}>}
  */
-async function decodeTile(reader, worker, tile, wanted, isFirst) {
+async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
   try {
-    if (isFirst && (await worker.ask({ open: await reader.partsOf(wanted), wanted }, [])) === null) return { worker, tile };
+    if (isFirst && (await worker.ask({ open: await reader.partsOf(wanted), wanted })) === null) return { worker, tile };
     const parts = await reader.partsOf(wanted, tile);
     const offsets = [...parts.keys()];
-    const answer = await worker.ask({ tile: tile.index, parts }, [...parts.values()].map(({ buffer }) => buffer));
+    const answer = await worker.ask({ tile: tile.index, parts, spare });
     if (answer?.fields) for (const offset of offsets) reader.checked.add(offset);
     return { worker, tile, fields: answer?.fields };
   } catch {
@@ -107,14 +109,15 @@ async function decodeTile(reader, worker, tile, wanted, isFirst) {
 /**
  * Decode tiles in workers.
  *
- * @param {CsplatReader} reader
+ * @param {Reader} reader
  * @param {TileRecord[]} waiting from the last to the first; what is left there afterwards no worker could decode
  * @param {Wanted} wanted
  * @param {number} count workers at most
  * @param {AbortSignal} [signal]
+ * @param {any[]} [spares] fields that the caller has copied and gives back
  * @returns {AsyncGenerator<{tile: TileRecord, fields: any, worker: object}, void>} in the order in which they are done
  */
-export async function* byWorkers(reader, waiting, wanted, count, signal) {
+export async function* byWorkers(reader, waiting, wanted, count, signal, spares = []) {
   /** @type {Map<Correspondent, ReturnType<typeof decodeTile>>} */
   const jobs = new Map();
   /** @type {Map<string, PackedColumns>} */
@@ -123,7 +126,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal) {
     for (const tile of waiting.splice(Math.max(0, waiting.length - count)).reverse()) {
       const worker = await take().catch(() => null);
       if (worker === null) waiting.push(tile);
-      else jobs.set(worker, decodeTile(reader, worker, tile, wanted, true));
+      else jobs.set(worker, decodeTile(reader, worker, tile, wanted, true, undefined));
     }
     while (jobs.size) {
       const { worker, tile, fields } = await Promise.race(jobs.values());
@@ -139,7 +142,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal) {
         jobs.delete(worker);
         giveBack(worker);
       } else {
-        jobs.set(worker, decodeTile(reader, worker, next, wanted, false));
+        jobs.set(worker, decodeTile(reader, worker, next, wanted, false, spares.pop()));
       }
       restore(fields, tables);
       yield { tile, fields, worker };
