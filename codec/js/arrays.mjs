@@ -34,14 +34,19 @@ export class FloatArrays {
   /**
    * @param {number} count splats
    * @param {number} shDegree
+   * @param {Partial<Record<string, Float32Array>>} [spare] arrays whose memory may be used again
    */
-  constructor(count, shDegree) {
-    this.means = new Float32Array(3 * count);
-    this.quats = new Float32Array(4 * count);
-    this.scales = new Float32Array(3 * count);
-    this.opacities = new Float32Array(count);
-    this.sh0 = new Float32Array(3 * count);
-    this.shN = new Float32Array(3 * count * shRows(shDegree)); // "coefficients of a band left out are +0"
+  constructor(count, shDegree, spare = {}) {
+    const room = (/** @type {string} */ name, /** @type {number} */ length) => {
+      const buffer = spare[name]?.buffer;
+      return buffer && buffer.byteLength >= 4 * length ? new Float32Array(buffer, 0, length) : new Float32Array(length);
+    };
+    this.means = room('means', 3 * count);
+    this.quats = room('quats', 4 * count);
+    this.scales = room('scales', 3 * count);
+    this.opacities = room('opacities', count);
+    this.sh0 = room('sh0', 3 * count);
+    this.shN = room('shN', 3 * count * shRows(shDegree)).fill(0); // "coefficients of a band left out are +0"
     this.shDegree = shDegree;
   }
 
@@ -212,4 +217,23 @@ export function bandArray(block, n, integers) {
   const out = new Float32Array(width * n);
   putColour(out, width, 0, 0, block, n, ldexp(attribute.step, exponent));
   return out;
+}
+
+/**
+ * Buffers of all arrays in a message but tables of codebooks, which stay.
+ *
+ * @param {object} message
+ * @returns {ArrayBuffer[]} each once
+ */
+export function buffersOf(message) {
+  /** @type {Set<ArrayBuffer>} */
+  const found = new Set();
+  const visit = (/** @type {object} */ value) => {
+    for (const [name, one] of value instanceof Map ? value : Object.entries(value)) {
+      if (ArrayBuffer.isView(one)) found.add(/** @type {ArrayBuffer} */ (one.buffer));
+      else if (name !== 'table' && typeof one === 'object' && one !== null) visit(one);
+    }
+  };
+  visit(message);
+  return [...found];
 }

@@ -21,8 +21,9 @@ export class Assembly {
    * @param {Wanted} wanted
    * @param {Required<Limits>} limits
    * @param {number} tableBytes of all codebooks
+   * @param {any} [spare] fields of another one, of floats, whose memory may be used again
    */
-  constructor(header, tiles, wanted, limits, tableBytes) {
+  constructor(header, tiles, wanted, limits, tableBytes, spare) {
     const { shDegree, integers, extra } = wanted;
     const count = tiles.reduce((sum, tile) => sum + tile.splatCount, 0);
     const extras = extra ? header.extras : [];
@@ -32,7 +33,7 @@ export class Assembly {
     this.arrays = allocate(() =>
       integers
         ? new IntegerArrays(count, shDegree, tiles, spec.ATTRIBUTE_SH0 + shDegree)
-        : new FloatArrays(count, shDegree),
+        : new FloatArrays(count, shDegree, spare),
     );
     this.extras = allocate(() => new ExtraArrays(count, extras));
   }

@@ -1,11 +1,12 @@
 // The side of the worker: see workers.mjs.
 
-import { CsplatReader } from './reader.mjs';
+import { buffersOf } from './arrays.mjs';
+import { Reader } from './reader.mjs';
 
 /**
  * @typedef {Map<number, Uint8Array<ArrayBuffer>>} Parts of the file, by their offsets
- * @typedef {import('./assemble.mjs').Wanted} Wanted
- * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts}} Request
+ * @typedef {{form?: import('./decoder.d.ts').LayerForm, shDegree: number, extra: boolean}} Wanted of a tile
+ * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts, spare?: any}} Request `spare`: fields whose memory may be used again
  * @typedef {{fields?: any}} Answer the arrays of a tile; without them where it was refused
  */
 
@@ -13,8 +14,10 @@ import { CsplatReader } from './reader.mjs';
 let parts = new Map();
 /** @type {Wanted} */
 let wanted;
-/** @type {CsplatReader | undefined} */
+/** @type {Reader} */
 let reader;
+/** @type {Set<object>} tables of codebooks that were sent */
+let sent = new Set();
 
 /**
  * @param {Request} request
@@ -25,25 +28,26 @@ async function answer(request) {
     parts = request.open;
     wanted = request.wanted;
     const read = async (/** @type {number} */ offset) => /** @type {Uint8Array<ArrayBuffer>} */ (parts.get(offset));
-    reader = await CsplatReader.open({ read });
+    reader = await Reader.open({ read });
+    sent = new Set();
     return {};
   }
   for (const [offset, bytes] of request.parts) parts.set(offset, bytes);
-  const { shDegree, extra } = wanted;
-  const fields = await /** @type {CsplatReader} */ (reader).readTile(request.tile, { shDegree, extra });
+  /** @type {any} */
+  const fields = await reader.readTile(request.tile, /** @type {any} */ (wanted), request.spare);
   for (const offset of request.parts.keys()) parts.delete(offset);
+  for (const { lookup } of (fields.sh ?? []).filter(Boolean)) {
+    if (lookup && sent.has(lookup.table)) delete lookup.table;
+    else if (lookup) sent.add(lookup.table);
+  }
   return { fields };
 }
-
-/** @param {Answer} given */
-const buffers = ({ fields = {} }) =>
-  [...Object.values(fields), ...Object.values(fields.extra ?? {})].filter(ArrayBuffer.isView).map(({ buffer }) => buffer);
 
 /** @param {any} port that requests come from and answers go to */
 function serve(port) {
   const listen = async (/** @type {Request} */ request) => {
     const given = await answer(request).catch(() => ({}));
-    port.postMessage(given, buffers(given));
+    port.postMessage(given, buffersOf(given));
   };
   if (port.on) port.on('message', listen);
   else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));

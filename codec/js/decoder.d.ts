@@ -303,6 +303,18 @@ export interface ReadOptions {
   signal?: AbortSignal;
 }
 
+export interface TilesOptions {
+  /** Indices; all tiles by default. */
+  tiles?: Iterable<number>;
+  form?: LayerForm;
+  shDegree?: number;
+  /** Extra columns; not of packed tiles. */
+  extra?: boolean;
+  /** Workers at most, as for `decode`; a reader with an `inflate` of the caller has none. */
+  workers?: number;
+  signal?: AbortSignal;
+}
+
 export interface LayerRequest {
   tile: number;
   layer: number;
@@ -326,6 +338,10 @@ export class CsplatReader {
   ): Promise<Splats>;
   /** Integers as narrow as the tile allows, codebooks as tables: to be drawn or kept as they are. */
   readTile(index: number, options: { form: 'packed'; shDegree?: number; signal?: AbortSignal }): Promise<PackedTile>;
+  /** What readTile gives of each tile, and its `index`: one after the other, or with workers as they are done. */
+  readTiles(options: TilesOptions & { form: 'packed' }): AsyncGenerator<PackedTile & { index: number }, void>;
+  readTiles(options: TilesOptions & { form: 'integers' }): AsyncGenerator<IntegerSplats & { index: number }, void>;
+  readTiles(options?: TilesOptions & { form?: 'floats' }): AsyncGenerator<Splats & { index: number }, void>;
   /** Layer 0: geometry and base colour. */
   readLayer(index: number, layer: 0, options: ReadOptions & { form: 'integers' }): Promise<IntegerSplats>;
   readLayer(index: number, layer: 0, options?: ReadOptions & { form?: 'floats' }): Promise<Splats>;

@@ -10,17 +10,19 @@ import { readFileHeader } from './container.mjs';
 import { CsplatError, FormatError, InputError, LimitError, UnsupportedError, fault } from './errors.mjs';
 import { readIndex } from './index.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from './options.mjs';
-import { CsplatReader } from './reader.mjs';
+import { Reader } from './reader.mjs';
 import * as spec from './spec.mjs';
 import { MemorySource } from './whole.mjs';
-import { fillByWorkers } from './workers.mjs';
+import { byWorkers } from './workers.mjs';
 
-export { CsplatError, CsplatReader, FormatError, InputError, LimitError, UnsupportedError };
+export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
 
 /**
  * @typedef {import('./decoder.d.ts').DecodeOptions} DecodeOptions
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./decoder.d.ts').TilesOptions} TilesOptions
  * @typedef {import('./tile.mjs').SceneContext} SceneContext
  */
 
@@ -56,7 +58,7 @@ export async function decode(data, options = {}) {
   const { limits, inflate, signal, onProgress } = options;
   const source = new MemorySource(toBytes(data));
   const integers = checkedForm(options.form);
-  const reader = await CsplatReader.open(source, { limits, inflate });
+  const reader = await Reader.open(source, { limits, inflate });
   const { header } = reader;
   const tiles = checkedTiles(options.tiles, header);
   const shDegree = checkedDegree(options.shDegree, header);
@@ -65,23 +67,67 @@ export async function decode(data, options = {}) {
   reader.scratch = reused(shDegree);
   try {
     let filled = 0;
-    const done = (/** @type {number} */ splats) => {
-      filled += splats;
+    const done = (/** @type {TileRecord} */ { splatCount }) => {
+      filled += splatCount;
       onProgress?.(filled, assembly.count);
     };
-    const several = (options.workers ?? 0) > 0 && !integers && !inflate;
-    const workers = several ? await fillByWorkers(reader, tiles, assembly, options.workers ?? 0, done, signal) : 0;
-    if (workers === 0) {
-      filled = 0;
-      for (const record of tiles) {
-        await reader.fill(assembly, record, filled, signal);
-        done(record.splatCount);
-      }
+    const places = new Map();
+    let first = 0;
+    for (const tile of tiles) {
+      places.set(tile, first);
+      first += tile.splatCount;
+    }
+    const waiting = [...tiles].reverse();
+    const workers = new Set();
+    /** @type {object[]} */
+    const spares = [];
+    const most = integers || inflate ? 0 : (options.workers ?? 0);
+    for await (const { tile, fields, worker } of byWorkers(reader, waiting, wanted, most, signal, spares)) {
+      assembly.copy(fields, places.get(tile));
+      spares.push({ ...fields, extra: {} });
+      workers.add(worker);
+      done(tile);
+    }
+    for (let tile = waiting.pop(); tile; tile = waiting.pop()) {
+      await reader.fill(assembly, tile, places.get(tile), signal);
+      done(tile);
     }
     await reader.checkAll();
-    return { ...assembly.fields(), header, ...(await reader.describe()), checks: reader.checks, workers };
+    const checks = reader.checks;
+    return { ...assembly.fields(), header, ...(await reader.describe()), checks, workers: workers.size };
   } finally {
     reader.compiled?.close();
+  }
+}
+
+/** Reads parts of a file, and checks the CRC of each. */
+export class CsplatReader extends Reader {
+  /**
+   * @param {Parameters<typeof Reader.open>[0]} from
+   * @param {Parameters<typeof Reader.open>[1]} [options]
+   * @returns {Promise<CsplatReader>}
+   */
+  static open(from, options) {
+    return /** @type {Promise<CsplatReader>} */ (super.open(from, options));
+  }
+
+  /**
+   * Read tiles one after the other, or in workers; then in the order in which they are done.
+   *
+   * @param {TilesOptions} [options]
+   * @returns {AsyncGenerator<any, void>} what `readTile` gives, with the tile's `index`
+   */
+  async *readTiles({ tiles, shDegree, extra = false, form, workers = 0, signal } = {}) {
+    const waiting = [...checkedTiles(tiles, this.header)].reverse();
+    const wanted = { form, shDegree: checkedDegree(shDegree, this.header), extra: extra && form !== 'packed' };
+    const most = (form !== 'packed' && checkedForm(form)) || this.inflates ? 0 : workers;
+    for await (const { tile, fields } of byWorkers(this, waiting, wanted, most, signal)) {
+      yield { index: tile.index, ...fields };
+    }
+    for (let tile = waiting.pop(); tile; tile = waiting.pop()) {
+      signal?.throwIfAborted();
+      yield { index: tile.index, ...(await this.readTile(tile.index, { ...wanted, signal })) };
+    }
   }
 }
 

@@ -32,7 +32,6 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
- * @typedef {import('./assemble.mjs').Wanted} Wanted
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
 
@@ -40,19 +39,19 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  * Layers of a tile that are wanted.
  *
  * @param {TileRecord} record
- * @param {Wanted} wanted
+ * @param {{shDegree: number, extra: boolean}} wanted
  */
 const wantedLayers = ({ layers }, { shDegree, extra }) =>
   layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
 
 /** Reads parts of a file, and checks the CRC of each. */
-export class CsplatReader {
+export class Reader {
   /**
    * Open a file: one request for header and index of all but huge files.
    *
    * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
    * @param {ReaderOptions} [options]
-   * @returns {Promise<CsplatReader>}
+   * @returns {Promise<Reader>} one of the class that it is called on
    */
   static async open(from, options = {}) {
     const { signal } = options;
@@ -74,7 +73,8 @@ export class CsplatReader {
     const header = readIndex(index, file, limits);
     const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
     const inflate = options.inflate ?? (await platformInflate());
-    const reader = new CsplatReader(source, header, limits, inflate, compiled);
+    const reader = new this(source, header, limits, inflate, compiled);
+    reader.inflates = options.inflate !== undefined;
     reader.opening = new Map([[0, head], [spec.HEADER_SIZE, index]]);
     return reader;
   }
@@ -94,6 +94,8 @@ export class CsplatReader {
     this.compiled = compiled;
     /** @type {Map<number, Bytes>} header and index by their offsets */
     this.opening = new Map();
+    /** Whether the caller brings the inflate, which workers cannot have. */
+    this.inflates = false;
     /** @type {Set<number>} offsets of the chunks whose CRC was checked */
     this.checked = new Set();
     /** How long reads have waited for bytes so far, each for itself. */
@@ -126,13 +128,14 @@ export class CsplatReader {
    *
    * @param {number} index
    * @param {{form?: LayerForm, shDegree?: number, extra?: boolean, signal?: AbortSignal}} [options]
+   * @param {any} [spare] what it gave before, of floats: its memory may be used again
    * @returns {Promise<any>} the arrays that `decode` gives, of the one tile; packed, see decoder.d.ts
    */
-  async readTile(index, { shDegree, extra = false, form, signal } = {}) {
+  async readTile(index, { shDegree, extra = false, form, signal } = {}, spare) {
     const record = checkedTile(index, this.header);
     if (form === 'packed') return this.readPackedTile(record, checkedDegree(shDegree, this.header), signal);
     const wanted = { shDegree: checkedDegree(shDegree, this.header), integers: checkedForm(form), extra };
-    const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes);
+    const assembly = new Assembly(this.header, [record], wanted, this.limits, this.tableBytes, spare);
     await this.fill(assembly, record, 0, signal);
     return assembly.fields();
   }
@@ -184,7 +187,7 @@ export class CsplatReader {
   /**
    * Bytes by their offsets for another reader, in a worker: header, index, codebooks; or what a tile has.
    *
-   * @param {Wanted} wanted
+   * @param {{shDegree: number, extra: boolean}} wanted
    * @param {TileRecord} [record]
    * @returns {Promise<Map<number, Bytes>>}
    */

@@ -1,11 +1,14 @@
-// Tiles decoded by workers, for `decode` with the option `workers`. csplat-worker.mjs is their side.
+// Tiles decoded by workers. csplat-worker.mjs is their side, and imports nothing that imports this: bundlers would not end.
+
+import { buffersOf } from './arrays.mjs';
 
 /**
- * @typedef {import('./assemble.mjs').Assembly} Assembly
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
- * @typedef {import('./reader.mjs').CsplatReader} CsplatReader
+ * @typedef {import('./reader.mjs').Reader} Reader
  * @typedef {import('./csplat-worker.mjs').Answer} Answer
  * @typedef {import('./csplat-worker.mjs').Request} Request
+ * @typedef {import('./csplat-worker.mjs').Wanted} Wanted
+ * @typedef {import('./decoder.d.ts').PackedColumns} PackedColumns
  */
 
 const IDLE_MS = 5000; // a worker without work ends after so long: to start one takes as long as to decode 100,000 splats
@@ -33,13 +36,12 @@ class Correspondent {
 
   /**
    * @param {Request} request
-   * @param {ArrayBuffer[]} transfer
    * @returns {Promise<Answer | null>} null where the worker has failed, or never started
    */
-  ask(request, transfer) {
+  ask(request) {
     return new Promise((resolve) => {
       this.answered = resolve;
-      this.worker.postMessage(request, transfer);
+      this.worker.postMessage(request, buffersOf(request));
     });
   }
 }
@@ -81,53 +83,88 @@ async function start() {
 }
 
 /**
+ * Let a worker decode a tile. Where it refuses, or has failed, the result has no fields.
+ *
+ * @param {Reader} reader
+ * @param {Correspondent} worker
+ * @param {TileRecord} tile
+ * @param {Wanted} wanted
+ * @param {boolean} isFirst
+ * @param {any} spare fields of another tile, whose memory the worker may use again
+ * @returns {Promise<{worker: Correspondent, tile: TileRecord, fields?: any}>}
+ */
+async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
+  try {
+    if (isFirst && (await worker.ask({ open: await reader.partsOf(wanted), wanted })) === null) return { worker, tile };
+    const parts = await reader.partsOf(wanted, tile);
+    const offsets = [...parts.keys()];
+    const answer = await worker.ask({ tile: tile.index, parts, spare });
+    if (answer?.fields) for (const offset of offsets) reader.checked.add(offset);
+    return { worker, tile, fields: answer?.fields };
+  } catch {
+    return { worker, tile }; // what is wrong shows itself again where there is no worker
+  }
+}
+
+/**
  * Decode tiles in workers.
  *
- * @param {CsplatReader} reader
- * @param {TileRecord[]} tiles
- * @param {Assembly} assembly
+ * @param {Reader} reader
+ * @param {TileRecord[]} waiting from the last to the first; what is left there afterwards no worker could decode
+ * @param {Wanted} wanted
  * @param {number} count workers at most
- * @param {(splats: number) => void} done called with those of each tile when they are there
  * @param {AbortSignal} [signal]
- * @returns {Promise<number>} workers that took part; 0 where the platform starts none, or one has failed: then nothing counts
+ * @param {any[]} [spares] fields that the caller has copied and gives back
+ * @returns {AsyncGenerator<{tile: TileRecord, fields: any, worker: object}, void>} in the order in which they are done
  */
-export async function fillByWorkers(reader, tiles, assembly, count, done, signal) {
-  const { wanted } = assembly;
-  /** @type {Map<TileRecord, number>} */
-  const places = new Map();
-  let first = 0;
-  for (const tile of tiles) {
-    places.set(tile, first);
-    first += tile.splatCount;
-  }
-  const waiting = [...tiles].reverse();
-  /** @type {Correspondent[]} */
-  const workers = [];
-  const work = async () => {
-    const worker = await take();
-    workers.push(worker);
-    const opening = { open: await reader.partsOf(wanted), wanted };
-    if ((await worker.ask(opening, [])) === null) return false;
-    for (let tile = waiting.pop(); tile !== undefined; tile = waiting.pop()) {
-      signal?.throwIfAborted();
-      const parts = await reader.partsOf(wanted, tile);
-      const answer = await worker.ask({ tile: tile.index, parts }, [...parts.values()].map(({ buffer }) => buffer));
-      if (!answer?.fields) return false;
-      for (const offset of parts.keys()) reader.checked.add(offset);
-      assembly.copy(answer.fields, places.get(tile) ?? 0);
-      done(tile.splatCount);
-    }
-    return true;
-  };
+export async function* byWorkers(reader, waiting, wanted, count, signal, spares = []) {
+  /** @type {Map<Correspondent, ReturnType<typeof decodeTile>>} */
+  const jobs = new Map();
+  /** @type {Map<string, PackedColumns>} */
+  const tables = new Map();
   try {
-    const outcomes = await Promise.all(Array.from({ length: Math.min(count, tiles.length) }, work));
-    const worked = outcomes.every(Boolean);
-    for (const worker of workers.splice(0, worked ? workers.length : 0)) giveBack(worker);
-    return worked ? outcomes.length : 0;
-  } catch {
-    signal?.throwIfAborted();
-    return 0;
+    for (const tile of waiting.splice(Math.max(0, waiting.length - count)).reverse()) {
+      const worker = await take().catch(() => null);
+      if (worker === null) waiting.push(tile);
+      else jobs.set(worker, decodeTile(reader, worker, tile, wanted, true, undefined));
+    }
+    while (jobs.size) {
+      const { worker, tile, fields } = await Promise.race(jobs.values());
+      signal?.throwIfAborted();
+      if (fields === undefined) {
+        worker.worker.terminate();
+        jobs.delete(worker);
+        waiting.push(tile);
+        continue;
+      }
+      const next = waiting.pop();
+      if (next === undefined) {
+        jobs.delete(worker);
+        giveBack(worker);
+      } else {
+        jobs.set(worker, decodeTile(reader, worker, next, wanted, false, spares.pop()));
+      }
+      restore(fields, tables);
+      yield { tile, fields, worker };
+    }
   } finally {
-    for (const { worker } of workers) worker.terminate();
+    for (const { worker } of jobs.keys()) worker.terminate();
+  }
+}
+
+/**
+ * What messages do not carry: the prototype of the extra columns, and that codebooks, which a worker sends once each, are
+ * the same objects for all tiles.
+ *
+ * @param {any} fields changed
+ * @param {Map<string, PackedColumns>} tables
+ */
+function restore(fields, tables) {
+  if (fields.extra) fields.extra = Object.assign(Object.create(null), fields.extra);
+  for (const [band, packed] of (fields.sh ?? []).entries()) {
+    if (!packed?.lookup) continue;
+    const key = `${packed.lookup.codebook}.${band}`;
+    if (!tables.has(key)) tables.set(key, packed.lookup.table);
+    packed.lookup.table = tables.get(key);
   }
 }

@@ -123,15 +123,16 @@ def cases() -> Iterator[Case]:
 
 
 def boundary_recipes() -> list[Recipe]:
-    """Return the recipes of the cases that are vectors: of a mask, its first bit alone."""
+    """Return the recipes of the cases that are vectors: of a mask, its first bit, and the last beyond a byte."""
     result = []
-    seen: set[Mask] = set()
     for case in cases():
         rule = case.rule
-        if (rule.structure, rule.field) in _NO_VECTORS or rule in seen:
+        if (rule.structure, rule.field) in _NO_VECTORS:
             continue
         if isinstance(rule, Mask):
-            seen.add(rule)
+            bits = [bit for bit in range(rule.bits) if not rule.listed >> bit & 1]
+            if case.suffix not in (f"bit_{bits[0]}", f"bit_{bits[-1] if rule.bits > 8 else bits[0]}"):
+                continue
         of = f"_{rule.of.lower().replace(' ', '_')}" if rule.of else ""
         result.append(
             patched(

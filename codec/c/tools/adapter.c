@@ -87,11 +87,19 @@ static int from_memory(void *user, uint64_t offset, size_t count, void *into)
     return 1;
 }
 
+static int64_t element_of(const csplat_columns *c, size_t row, unsigned column)
+{
+    const size_t at = (size_t)column * c->count + row;
+    return c->offset[column] + (int64_t)(c->width == 1   ? ((const uint8_t *)c->data)[at]
+                                         : c->width == 2 ? ((const uint16_t *)c->data)[at]
+                                                         : ((const uint32_t *)c->data)[at]);
+}
+
 /* An integer of a packed attribute of splat i of a tile; `table` is its codebook, if it has one. */
 static int64_t packed_integer(const csplat_packed *p, const csplat_columns *table, size_t i, unsigned column, size_t *row)
 {
     const csplat_columns *from = &p->columns;
-    size_t at = i, element;
+    size_t at = i;
     if (p->index) {
         at = p->index_width == 1   ? ((const uint8_t *)p->index)[i]
              : p->index_width == 2 ? ((const uint16_t *)p->index)[i]
@@ -108,10 +116,7 @@ static int64_t packed_integer(const csplat_packed *p, const csplat_columns *tabl
         }
     } else if (!p->index && p->columns.count == 0)
         return 0;
-    element = (size_t)column * from->count + at;
-    return from->offset[column] + (int64_t)(from->width == 1   ? ((const uint8_t *)from->data)[element]
-                                            : from->width == 2 ? ((const uint16_t *)from->data)[element]
-                                                               : ((const uint32_t *)from->data)[element]);
+    return element_of(from, at, column);
 }
 
 /* Whether packed values are the integers [n][columns], colours of `coefficients`. */
@@ -127,11 +132,22 @@ static void compare(const csplat_packed *p, const csplat_columns *table, size_t 
     }
 }
 
+/* Whether a packed attribute of layer 0 has the integers [n][columns], which are no colours. */
+static void compare_levels(const csplat_packed *p, size_t n, unsigned columns, const uint32_t *integers)
+{
+    size_t row = 0;
+    for (size_t i = 0; i < columns * n; i++)
+        if (packed_integer(p, NULL, i / columns, (unsigned)(i % columns), &row) != (int32_t)integers[i])
+            die("packed levels differ from the integers");
+}
+
 static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degree, const csplat_integers *integers)
 {
     csplat_packed_geometry g;
     if (csplat_read_packed(file, tile, &g))
         die("the packed form is refused");
+    compare_levels(&g.opacities, n, 1, integers->opacities);
+    compare_levels(&g.quats, n, 3, (const uint32_t *)integers->quats);
     compare(&g.scales, NULL, n, 3, 1, integers->scales);
     compare(&g.means, NULL, n, 3, 1, integers->means);
     compare(&g.sh0, NULL, n, 3, 1, integers->sh0);
@@ -142,6 +158,9 @@ static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degre
             die("a packed band is refused");
         if (p.index && csplat_read_packed_codebook(file, p.codebook, band, &table))
             die("a packed codebook is refused");
+        for (unsigned k = 0; k < table.columns; k++) /* a row of zeros follows the entries */
+            if (element_of(&table, table.count - 1, k))
+                die("a packed codebook does not end with zeros");
         compare(&p, &table, n, 3 * (2 * band + 1), 2 * band + 1, integers->sh[band - 1]);
     }
 }
@@ -157,6 +176,15 @@ static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, co
     if (csplat_read_tile(file, tile, scene->sh_degree, &out) || memcmp(means, scene->values.means + 3 * first, 12 * n) ||
         memcmp(shN, scene->values.shN + 3 * k * first, 12 * k * n))
         die("a tile differs from the whole");
+    for (unsigned axis = 0; axis < 3; axis++) { /* [TIL-10]: some splats lie on each side of the box */
+        float low = means[axis], high = low;
+        for (size_t i = 1; i < n; i++) {
+            low = means[3 * i + axis] < low ? means[3 * i + axis] : low;
+            high = means[3 * i + axis] > high ? means[3 * i + axis] : high;
+        }
+        if (low != t->min[axis] || high != t->max[axis])
+            die("the box of a tile is not that of its splats");
+    }
     for (unsigned l = scene->sh_degree; l >= 1; l--) {
         if (csplat_read_band(file, tile, l, band))
             die("a band is refused");

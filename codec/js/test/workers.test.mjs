@@ -6,7 +6,7 @@ import { test } from 'node:test';
 import { fileURLToPath } from 'node:url';
 import { Worker } from 'node:worker_threads';
 
-import { decode, readHeader } from '../decoder.mjs';
+import { CsplatReader, decode, readHeader } from '../decoder.mjs';
 import { forged, hash, manifest, refusal, vector } from './helpers.mjs';
 
 const several = manifest.filter(({ error, expect }) => !error.code && expect.header.tile_count > 1);
@@ -58,6 +58,35 @@ test('a classic script can be made of the worker: no module awaits out in the op
   worker.postMessage({ tile: 0, parts: new Map() });
   assert.deepEqual(await once(worker, 'message'), [{}]); // refused, for there is no file
   await worker.terminate();
+});
+
+test('tiles come from workers in each form', async () => {
+  const file = vector('valid/combined_codebooks').buffer;
+  for (const form of ['floats', 'packed', 'integers']) {
+    const reader = await CsplatReader.open(file);
+    const seen = new Map();
+    for await (const { index, ...tile } of reader.readTiles({ form, workers: 2 })) {
+      seen.set(index, tile);
+      assert.deepEqual(tile, await reader.readTile(index, { form }), form);
+    }
+    assert.equal(seen.size, reader.header.tiles.length);
+    if (form !== 'packed') continue;
+    const lookups = [...seen.values()].flatMap(({ sh }) => sh.flatMap((one, band) => (one?.lookup ? [[`${one.lookup.codebook}.${band}`, one.lookup.table]] : [])));
+    const tables = new Map(lookups);
+    assert.ok(lookups.length > tables.size);
+    for (const [key, table] of lookups) assert.equal(table, tables.get(key)); // one object for all tiles
+  }
+});
+
+test('a loop over tiles may end early', async () => {
+  const reader = await CsplatReader.open(vector(several[0].name).buffer);
+  for await (const { index } of reader.readTiles({ workers: 2 })) {
+    assert.ok(index < reader.header.tiles.length);
+    break;
+  }
+  let count = 0;
+  for await (const { means } of reader.readTiles({ workers: 2, tiles: [1] })) count += means.length;
+  assert.equal(count, 3 * reader.header.tiles[1].splatCount);
 });
 
 test('where no worker may start, decode does without', () => {

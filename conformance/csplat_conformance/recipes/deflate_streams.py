@@ -154,6 +154,9 @@ def sound_streams() -> list[Case]:
             _long(_FARTHEST, 76, 5),
         ),
         case(
+            "copies", "matches that overlap what they copy, and such that do not, of some length", "COD-8", *_copies()
+        ),
+        case(
             "length_258_as_284",
             "a length of 258 as symbol 284 and 31",
             "COD-8",
@@ -168,6 +171,18 @@ def sound_streams() -> list[Case]:
             bytes([7, 8]),
         ),
     ]
+
+
+def _copies() -> tuple[Deflate, bytes]:
+    """Forty literals, and matches; and what they give."""
+    stream, output = Deflate().fixed().literals(*range(40)), bytearray(range(40))
+    for distance, length in ((2, 20), (15, 40), (16, 17), (17, 33), (31, 48), (40, 35)):
+        extra = max(0, (distance - 1).bit_length() - 2)
+        symbol = 2 * extra + (distance - 1 >> extra)
+        stream.match(length, symbol).number(distance - 1 & (1 << extra) - 1, extra)
+        for _ in range(length):
+            output.append(output[-distance])
+    return stream, bytes(output)
 
 
 def broken_streams() -> list[Case]:

@@ -111,6 +111,14 @@ def alone_stream_recipes() -> list[Recipe]:
             _band_by(sparse((1, 0), [[0] * 9], Stream(5))),
             "TILE.0.1/sh1.stream.width",
         ),
+        whole(
+            "width_2_of_mask",
+            "a mask of two bytes for each that it has",
+            "STR-2",
+            "E_STREAM",
+            _band_by(sparse((1, 0), [[0] * 9], mask_how=Stream(2))),
+            "TILE.0.1/sh1.mask.width",
+        ),
         entries("width_5_of_entries", "entries of five bytes", "STR-2", "width", 2, Stream(5)),
         whole(
             "width_9_of_raw", "a column of nine bytes", "STR-2", "E_STREAM", column, "TILE.0.8/extra[0].stream.width"

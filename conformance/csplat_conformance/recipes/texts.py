@@ -72,6 +72,9 @@ _BAD: Final = {
     "pair_reversed": (b'{"a":"\\ude00\\ud83d"}', "a surrogate pair, low half first"),
     "pair_high_twice": (b'{"a":"\\ud83d\\ud83d\\ude00"}', "two high halves before a low one"),
     "pair_low": (b'{"a":"\\udfff"}', "a low half alone"),
+    "pair_beyond": (b'{"a":"\\ud83d\\ue000"}', "a high half, and a character behind the low ones"),
+    "pair_low_first": (b'{"a":"\\udc00"}', "the first of the low halves alone"),
+    "pair_high_last": (b'{"a":"\\ud83d\\udbff"}', "a high half, and the last of the high halves"),
     "pair_parted": (b'{"a":"\\ud83d \\ude00"}', "a space between the halves"),
     "pair_in_name": (b'{"\\udbff":1}', "a high half alone in a name"),
     "twice_by_pair": (b'{"\\ud83f\\udfff":1,"\xf0\x9f\xbf\xbf":2}', "a name twice, once as a pair of escapes"),
@@ -82,6 +85,10 @@ _BAD: Final = {
     "twice_inside": (b'{"a":[[],{"b":1,"c":0,"b":1}]}', "a name twice in an object within an array"),
     "twice_prototype": (b'{"__proto__":1,"__proto__":1}', "a name that some languages treat apart, twice"),
     "utf_8_long": (b'{"a":"\xc0\xaf"}', "a character in more bytes than it needs"),
+    "utf_8_long_last": (b'{"a":"\xc1\xbf"}', "U+007F in two bytes"),
+    "utf_8_long_three": (b'{"a":"\xe0\x9f\xbf"}', "U+07FF in three bytes"),
+    "utf_8_long_four": (b'{"a":"\xf0\x8f\xbf\xbf"}', "U+FFFF in four bytes"),
+    "utf_8_five": (b'{"a":"\xf5\x80\x80\x80"}', "a byte that would begin U+140000"),
     "utf_8_alone": (b'{"a":"\x80"}', "a byte that continues nothing"),
     "utf_8_cut": (b'{"a":"\xe2\x82"}', "a character that is cut short"),
     "utf_8_beyond": (b'{"a":"\xf4\x90\x80\x80"}', "a character beyond U+10FFFF"),
@@ -104,6 +111,7 @@ _GOOD: Final = b"""\t\r\n { "numbers" : [ 0 , -0 , 9 , -9 , 19 , 90.9 , -0.99 , 
 "escapes" : "\\" \\\\ \\/ \\b \\f \\n \\r \\t \\u0123 \\u4567 \\u89AB \\uCDEF \\uabcd \\u0000 \\u001f",
 "pairs" : "\\ud800\\udc00\\udbff\\udfff\\uD83D\\uDE00 \\ud7ff \\ue000 \\uffff", "siblings" : [[],[],[],{},{}] ,
 "\\u07ff" : 0 , "\\u0800" : 0 , "\\u1800" : 0 , "\\u2800" : 0 ,
+"ends" : "\xdf\xbf\xe0\xa0\x80\xed\x9f\xbf\xee\x80\x80\xf0\x90\x80\x80" ,
 "not ASCII" : "\x7f\xc2\x80\xc3\xa9\xe2\x80\xa8\xef\xbb\xbf\xef\xbf\xbf\xf4\x8f\xbf\xbf" } \n\r\t"""
 
 

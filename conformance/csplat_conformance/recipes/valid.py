@@ -312,12 +312,16 @@ def _files() -> list[Recipe]:
         ),
         _recipe(
             "unknown_chunks",
-            "private and unknown chunks, twice the same, one empty, with any id and layer: skipped",
+            "private and unknown chunks, twice the same, some like known ones, with any id and layer: skipped",
             "DIR-1 DIR-3 CHK-2",
             scene(
                 chunks=(
                     Chunk(b"priv", payload=b"abc", flags=_spec.CHUNK_FLAG_SAFE_TO_COPY),
                     Chunk(b"Z ~!", flags=0, id=1, layer=3),
+                    *(
+                        Chunk(kind[:3] + b"X", flags=0)
+                        for kind in (_spec.CHUNK_TILE, _spec.CHUNK_CODEBOOK, _spec.CHUNK_METADATA)
+                    ),
                     Chunk(b"priv", payload=b"d", flags=0, id=65535, layer=255),
                 )
             ),
