@@ -15,6 +15,7 @@ const NAME = 'csplat';
 const ROW_BYTES = 32; // centre and scales as float32, colour, alpha and rotation as bytes
 const SH_BYTES = 16; // of a splat in one texture
 const SH_ZERO = 128;
+const WORKERS = 2; // as many as the decoder uses at most
 
 const say = onceSaid('csplat for Babylon.js');
 
@@ -95,8 +96,8 @@ async function arraysOf(reader, width) {
   }));
   const alpha = alphaOf(header);
   const signed = (/** @type {number} */ value) => 127.5 * value + 127.5;
-  for (const { index, first } of header.tiles) {
-    const tile = await reader.readTile(index, { form: 'packed' });
+  for await (const tile of reader.readTiles({ form: 'packed', workers: WORKERS })) {
+    const { first } = header.tiles[tile.index];
     putColumns(tile.means, centreAt, first, (value) => value);
     putColumns(tile.scales, scalesAt, first, Math.exp);
     putBand(tile.sh0, colourAt, first, (value) => 255 * displayColour(value));

@@ -11,6 +11,7 @@ import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovar
 
 const SH_WORDS = [0, 3, 4, 6]; // of a splat in a band, four coefficients each
 const SH_ZERO = 0x80808080;
+const WORKERS = 2; // as many as the decoder uses at most
 
 const say = onceSaid('CSPLATLoader');
 
@@ -93,8 +94,10 @@ async function geometryOf(reader, signal) {
   const [red, green, blue, alphaAt] = places(colours, 4, 0, 4);
   const bandAt = bands.map(({ buffer }, i) => places(new Uint8ClampedArray(buffer), 4 * SH_WORDS[i + 1], 0, 3 * (2 * i + 3)));
   const alpha = alphaOf(header);
-  for (const { index, first } of header.tiles) {
-    const tile = await reader.readTile(index, { form: 'packed', signal });
+  const layers = Array.from({ length: shDegree + 1 }, (_, layer) => layer);
+  reader.prefetch(header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))), { signal });
+  for await (const tile of reader.readTiles({ form: 'packed', workers: WORKERS, signal })) {
+    const { first } = header.tiles[tile.index];
     putColumns(tile.means, centreAt, first, (value) => value);
     putCovariances(tile, header, covariances, first);
     putBand(tile.sh0, [red, green, blue], first, (value) => 255 * displayColour(value));
