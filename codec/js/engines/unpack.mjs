@@ -1,0 +1,286 @@
+// Packed tiles as numbers of any kind and layout: what the adapters for other people's engines have in common.
+
+/**
+ * @typedef {import('../decoder.d.ts').AttributeRecord} AttributeRecord
+ * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('../decoder.d.ts').Packed} Packed
+ * @typedef {import('../decoder.d.ts').PackedColumns} PackedColumns
+ * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
+ * @typedef {Float32Array | Float64Array | Uint8Array | Uint8ClampedArray | Uint16Array | Uint32Array} Numbers
+ * @typedef {{array: Numbers, stride: number, start: number}} Place of a value: splat i's is array[i * stride + start]
+ * @typedef {(value: number) => number} Change of a value into the engine's; integers of `opacities` come as they are
+ */
+
+const SH_C0 = 0.28209479177387814;
+const ROWS_AT_ONCE = 1024;
+
+/** Of a display, 0 to 1 for what can be shown. @param {number} sh0 */
+export const displayColour = (sh0) => 0.5 + SH_C0 * sh0;
+
+/** Alpha from the integers of `opacities`. @param {Header} header @returns {Change} */
+export function alphaOf({ attributes }) {
+  const { levels, mapping } = /** @type {AttributeRecord} */ (attributes.find(({ name }) => name === 'opacities'));
+  return mapping === 'square' ? (q) => (q * q) / (levels * levels) : (q) => q / levels;
+}
+
+/**
+ * Places of values that lie beside each other.
+ *
+ * @param {Numbers} array
+ * @param {number} stride
+ * @param {number} start
+ * @param {number} [width]
+ * @returns {Place[]}
+ */
+export const places = (array, stride, start, width = 3) =>
+  Array.from({ length: width }, (_, column) => ({ array, stride, start: start + column }));
+
+/**
+ * Put the columns of one attribute where the engine has them.
+ *
+ * @param {PackedColumns} packed
+ * @param {Place[]} to for each column
+ * @param {number} first splat
+ * @param {Change} change
+ */
+export function putColumns(packed, to, first, change) {
+  const n = packed.columns.length / to.length;
+  const columns = to.map(({ array }, c) => {
+    const column = packed.columns.subarray(c * n, (c + 1) * n);
+    const value = valueOf(packed, c, change);
+    return { column, value, table: tableOf(column, value, array) };
+  });
+  inBlocks(n, to, (from, end, { array, stride, start }, c) => {
+    const { column, value, table } = columns[c];
+    if (table) return gather(array, (first + from) * stride + start, stride, table, column, from, end);
+    for (let i = from, at = (first + from) * stride + start; i < end; i++, at += stride) array[at] = value(column[i]);
+  });
+}
+
+/**
+ * Put an SH band where the engine has it. Coefficients that are not in the file are left as they are.
+ *
+ * @param {Packed} band
+ * @param {Place[]} to for each value of a splat, coefficient after coefficient, R, G, B of each
+ * @param {number} first splat
+ * @param {Change} change
+ */
+export function putBand(band, to, first, change) {
+  const rows = to.length / 3;
+  const columns = to.map((_, c) => to[3 * (c % rows) + Math.floor(c / rows)]);
+  if (!band.rows) return putColumns(band, columns, first, change);
+  if (band.lookup) {
+    const { table, index } = band.lookup;
+    const size = table.columns.length / to.length;
+    const tables = columns.map(({ array }, c) => {
+      const entries = alike(array, size);
+      const value = valueOf(table, c, change);
+      for (let i = 0; i < size; i++) entries[i] = value(table.columns[c * size + i]);
+      return entries;
+    });
+    inBlocks(index.length, columns, (from, end, { array, stride, start }, c) =>
+      gather(array, (first + from) * stride + start, stride, tables[c], index, from, end),
+    );
+  }
+  const n = band.rows.length;
+  for (const [c, { array, stride, start }] of columns.entries()) {
+    const value = valueOf(band, c, change);
+    for (let i = 0; i < n; i++) array[(first + band.rows[i]) * stride + start] = value(band.columns[c * n + i]);
+  }
+}
+
+/**
+ * Put rotations: unit quaternions, w x y z.
+ *
+ * @param {PackedColumns} quats
+ * @param {Header} header
+ * @param {Place[]} to for w, x, y, z
+ * @param {number} first splat
+ * @param {Change} change
+ */
+export function putQuats(quats, header, to, first, change) {
+  const n = quats.columns.length / 3;
+  const read = quatReader(quats, header);
+  const quat = new Float64Array(4);
+  for (let i = 0; i < n; i++) {
+    read(i, quat);
+    for (let c = 0; c < 4; c++) to[c].array[(first + i) * to[c].stride + to[c].start] = change(quat[c]);
+  }
+}
+
+/**
+ * Put covariance matrices: xx, xy, xz, yy, yz, zz, beside each other.
+ *
+ * @param {PackedTile} tile
+ * @param {Header} header
+ * @param {Float32Array} out
+ * @param {number} first splat
+ */
+export function putCovariances({ count, quats, scales }, header, out, first) {
+  const variances = new Float64Array(3 * count);
+  for (let c = 0; c < 3; c++) {
+    const column = scales.columns.subarray(c * count, (c + 1) * count);
+    const value = valueOf(scales, c, (scale) => Math.exp(2 * scale));
+    const table = tableOf(column, value, variances);
+    for (let i = 0; i < count; i++) variances[c * count + i] = table ? table[column[i]] : value(column[i]);
+  }
+  const read = quatReader(quats, header);
+  const quat = new Float64Array(4);
+  for (let i = 0, at = 6 * first; i < count; i++, at += 6) {
+    read(i, quat);
+    const w = quat[0],
+      x = quat[1],
+      y = quat[2],
+      z = quat[3];
+    const a = variances[i],
+      b = variances[count + i],
+      c = variances[2 * count + i];
+    const xx = 1 - 2 * (y * y + z * z),
+      xy = 2 * (x * y - w * z),
+      xz = 2 * (x * z + w * y),
+      yx = 2 * (x * y + w * z),
+      yy = 1 - 2 * (x * x + z * z),
+      yz = 2 * (y * z - w * x),
+      zx = 2 * (x * z - w * y),
+      zy = 2 * (y * z + w * x),
+      zz = 1 - 2 * (x * x + y * y);
+    out[at] = a * xx * xx + b * xy * xy + c * xz * xz;
+    out[at + 1] = a * xx * yx + b * xy * yy + c * xz * yz;
+    out[at + 2] = a * xx * zx + b * xy * zy + c * xz * zz;
+    out[at + 3] = a * yx * yx + b * yy * yy + c * yz * yz;
+    out[at + 4] = a * yx * zx + b * yy * zy + c * yz * zz;
+    out[at + 5] = a * zx * zx + b * zy * zy + c * zz * zz;
+  }
+}
+
+/**
+ * The linear map that stands a scene upright in an engine whose +y is up: what its axes say, RDF where they are not known,
+ * and then the shortest turn to where the metadata has `up`.
+ *
+ * @param {Header} header
+ * @param {Record<string, unknown> | null} metadata
+ * @param {'RUB' | 'RUF'} engine letters of its directions +x, +y, +z
+ * @returns {number[][]} 3 × 3, by rows; of determinant −1 where either of both is left-handed
+ */
+export function uprightIn({ axes }, metadata, engine) {
+  const opposite = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D', D: 'U', F: 'B', B: 'F' });
+  const from = [...(axes || 'RDF')];
+  const map = [...engine].map((to) => from.map((one) => (one === to ? 1 : one === opposite[to] ? -1 : 0)));
+  const up = upOf(metadata);
+  if (up === null) return map;
+  const [x, y, z] = map.map((row) => row[0] * up[0] + row[1] * up[1] + row[2] * up[2]);
+  const a = y > -1 + 1e-9 ? 1 / (1 + y) : 0; // turned over about x
+  const turn = [
+    [1 - a * x * x, -x, -a * x * z],
+    [x, y, z],
+    [-a * x * z, -z, y > -1 + 1e-9 ? 1 - a * z * z : -1],
+  ];
+  return turn.map((row) => [0, 1, 2].map((c) => row[0] * map[0][c] + row[1] * map[1][c] + row[2] * map[2][c]));
+}
+
+/**
+ * The direction that the metadata has as up, of length 1; null where it has none.
+ *
+ * @param {Record<string, unknown> | null} metadata
+ * @returns {number[] | null}
+ */
+export function upOf(metadata) {
+  const up = metadata?.up;
+  if (!Array.isArray(up) || up.length !== 3 || !up.every((one) => Number.isFinite(one))) return null;
+  const length = Math.hypot(...up);
+  return length > 0 && length < Infinity ? up.map((one) => one / length) : null;
+}
+
+/**
+ * What is to be said once, and no more.
+ *
+ * @param {string} prefix the adapter's name
+ * @returns {(text: string) => void}
+ */
+export function onceSaid(prefix) {
+  const said = new Set();
+  return (text) => {
+    if (!said.has(text)) console.warn(`${prefix}: ${text}`);
+    said.add(text);
+  };
+}
+
+/**
+ * The engine's value of an element.
+ *
+ * @param {PackedColumns} packed
+ * @param {number} column
+ * @param {Change} change
+ * @returns {Change}
+ */
+function valueOf({ offsets, step }, column, change) {
+  const offset = offsets[column];
+  return step === 0
+    ? (element) => change(offset + element)
+    : (element) => change(Math.fround((offset + element) * step));
+}
+
+/**
+ * Values of all that a column may hold, where it is long enough for that to be worthwhile.
+ *
+ * @param {PackedColumns['columns']} column
+ * @param {Change} value
+ * @param {Numbers} target
+ */
+function tableOf(column, value, target) {
+  const size = 2 ** (8 * column.BYTES_PER_ELEMENT);
+  if (size > Math.min(column.length, 65536)) return null;
+  const table = alike(target, size);
+  for (let element = 0; element < size; element++) table[element] = value(element);
+  return table;
+}
+
+/** Copies between arrays of one kind change no numbers. @param {Numbers} array @param {number} length @returns {Numbers} */
+const alike = (array, length) => new /** @type {any} */ (array.constructor)(length);
+
+/**
+ * Columns of rows that stay in the processor's cache meanwhile.
+ *
+ * @param {number} n rows
+ * @param {Place[]} to
+ * @param {(from: number, end: number, place: Place, column: number) => void} put
+ */
+function inBlocks(n, to, put) {
+  for (let from = 0; from < n; from += ROWS_AT_ONCE) {
+    for (const [c, place] of to.entries()) put(from, Math.min(n, from + ROWS_AT_ONCE), place, c);
+  }
+}
+
+/**
+ * @param {Numbers} array
+ * @param {number} at
+ * @param {number} stride
+ * @param {Numbers} table
+ * @param {PackedColumns['columns']} index
+ * @param {number} from
+ * @param {number} end
+ */
+function gather(array, at, stride, table, index, from, end) {
+  for (let i = from; i < end; i++, at += stride) array[at] = table[index[i]];
+}
+
+/**
+ * @param {PackedColumns} quats
+ * @param {Header} header
+ * @returns {(splat: number, out: Float64Array) => void} that writes w x y z
+ */
+function quatReader({ columns, offsets: [x0, y0, z0] }, { attributes }) {
+  const { levels } = /** @type {AttributeRecord} */ (attributes.find(({ name }) => name === 'quats'));
+  const n = columns.length / 3;
+  const square = 2 * levels * levels;
+  const unit = 1 / (levels * Math.SQRT2);
+  return (i, out) => {
+    const x = x0 + columns[i],
+      y = y0 + columns[n + i],
+      z = z0 + columns[2 * n + i];
+    out[0] = Math.sqrt(square - x * x - y * y - z * z) * unit;
+    out[1] = x * unit;
+    out[2] = y * unit;
+    out[3] = z * unit;
+  };
+}

@@ -1,0 +1,77 @@
+// The adapters for engines hold the numbers of the form 'floats', in the engines' layouts.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatReader } from '../decoder.mjs';
+import { alphaOf, places, putBand, putColumns, putCovariances, putQuats, uprightIn } from '../engines/unpack.mjs';
+import { manifest, vector } from './helpers.mjs';
+
+const same = (value) => value;
+/** Covariances by matrices, in the plain way. */
+function covariances({ count, quats, scales }) {
+  const out = [];
+  for (let i = 0; i < count; i++) {
+    const [w, x, y, z] = quats.subarray(4 * i, 4 * i + 4);
+    const rows = [
+      [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+      [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+      [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ].map((row) => row.map((value, axis) => value * Math.exp(scales[3 * i + axis])));
+    for (const [p, q] of [[0, 0], [0, 1], [0, 2], [1, 1], [1, 2], [2, 2]]) {
+      out.push(rows[p].reduce((sum, value, axis) => sum + value * rows[q][axis], 0));
+    }
+  }
+  return out;
+}
+
+const valid = manifest.filter(({ name }) => /^(valid|render)/.test(name));
+for (const { name } of valid) {
+  test(`${name}: unpacked numbers are the decoder's`, async () => {
+    const reader = await CsplatReader.open(new Blob([vector(name)]));
+    const { header } = reader;
+    for (const { index, splatCount: count } of header.tiles) {
+      const floats = await reader.readTile(index);
+      const tile = await reader.readTile(index, { form: 'packed' });
+      // One splat further than needed and a stride of their own: nothing lies where it would by chance.
+      const put = (width, fill) => {
+        const array = new Float32Array(8 * (count + 1));
+        fill(places(array, 8, 1, width));
+        return Float32Array.from({ length: width * count }, (_, at) => array[8 * (1 + Math.floor(at / width)) + 1 + (at % width)]);
+      };
+      assert.deepEqual(put(3, (to) => putColumns(tile.means, to, 1, same)), floats.means);
+      assert.deepEqual(put(3, (to) => putColumns(tile.scales, to, 1, same)), floats.scales);
+      assert.deepEqual(put(1, (to) => putColumns(tile.opacities, to, 1, alphaOf(header))), floats.opacities);
+      assert.deepEqual(put(4, (to) => putQuats(tile.quats, header, to, 1, same)), floats.quats);
+      assert.deepEqual(put(3, (to) => putBand(tile.sh0, to, 1, same)), floats.sh0);
+      const width = floats.shN.length / count;
+      const shN = new Float32Array(width * (count + 1));
+      for (const [i, band] of tile.sh.entries()) {
+        if (band) putBand(band, places(shN, width, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)), 1, same);
+      }
+      assert.deepEqual(shN.subarray(width), floats.shN);
+      const out = new Float32Array(6 * (count + 1));
+      putCovariances(tile, header, out, 1);
+      for (const [at, expected] of covariances(floats).entries()) {
+        const [of, p] = [at - (at % 6), at % 6];
+        const length = Math.max(out[6 + of], out[9 + of], out[11 + of]); // others may be what a difference leaves
+        if (length < 1e38) assert.ok(Math.abs(out[6 + at] - expected) <= 1e-6 * length, `${p} of splat ${of / 6}`);
+      }
+    }
+  });
+}
+
+test('a scene stands upright in the axes of an engine', () => {
+  const map = (axes, engine, up) => uprightIn({ axes }, { up }, engine);
+  assert.deepEqual(map('RUB', 'RUB'), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]);
+  assert.deepEqual(map('', 'RUB'), [[1, 0, 0], [0, -1, 0], [0, 0, -1]]);
+  assert.deepEqual(map('RDF', 'RUF'), [[1, 0, 0], [0, -1, 0], [0, 0, 1]]);
+  assert.deepEqual(map('RFU', 'RUF', 'no direction'), [[1, 0, 0], [0, 0, 1], [0, 1, 0]]);
+  for (const up of [[0, -1, 0], [0, 1, 0], [0.6, -0.8, 0], [0, 0, 5], [2, 3, -1]]) {
+    const rows = map('RDF', 'RUF', up);
+    const [x, y, z] = rows.map((row) => row.reduce((sum, one, i) => sum + (one * up[i]) / Math.hypot(...up), 0));
+    assert.ok(Math.hypot(x, y - 1, z) < 1e-12, `${up} is up`);
+    const [a, b, c] = rows;
+    const cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    assert.ok(Math.hypot(...cross.map((one, i) => one + c[i])) < 1e-12, `${up}: neither mirrored nor bent`);
+  }
+});
