@@ -1,6 +1,6 @@
 // Types of the adapter for Spark.
 import type { SplatMesh } from '@sparkjsdev/spark';
-import type { ByteSource, Header, ReaderOptions } from '../decoder.d.ts';
+import type { ByteSource, ReaderOptions } from '../decoder.d.ts';
 
 export interface LoadOptions extends ReaderOptions {
   /** SH bands above this degree are not fetched. */
@@ -13,7 +13,8 @@ export interface LoadOptions extends ReaderOptions {
 }
 
 /**
- * Spark's SplatMesh of a file, turned upright by the header's axes for a world whose y is up; `userData.csplat` is the header.
+ * Spark's SplatMesh of a file, turned upright by the header's axes for a world whose y is up; `userData.csplat` has `header` and
+ * `metadata`. `dispose`, of the engine, frees arrays and textures.
  * Opacity compensation is a switch of the renderer: Spark's default is that of scenes whose header says `antialiased`, others
  * want `new SparkRenderer({ renderer, preBlurAmount: 0.3, blurAmount: 0 })`. Rejects with CsplatError.
  */

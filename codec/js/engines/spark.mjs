@@ -4,7 +4,7 @@ import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';
 
 import { CsplatReader } from '../decoder.mjs';
 import { ExtWords, PackedWords, halvesSuffice } from './spark-words.mjs';
-import { axesTo, onceSaid } from './unpack.mjs';
+import { onceSaid, uprightIn } from './unpack.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Header} Header
@@ -24,9 +24,10 @@ export async function loadCsplat(from, { layout, shDegree, ...options } = {}) {
   const degree = Math.min(shDegree ?? header.shDegree, header.shDegree);
   const { signal } = options;
   const read = (/** @type {number} */ index) => reader.readTile(index, { form: 'packed', shDegree: degree, signal });
+  const { metadata } = await reader.describe({ signal });
   const make = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed' ? packed : ext;
   const mesh = await make(header, degree, read);
-  place(mesh, header);
+  place(mesh, header, metadata);
   tell(header);
   return mesh;
 }
@@ -63,15 +64,16 @@ async function packed(header, degree, read) {
  *
  * @param {SplatMesh} mesh
  * @param {Header} header
+ * @param {Record<string, unknown> | null} metadata
  */
-function place(mesh, header) {
-  const [a, b, c] = axesTo(header, 'RUB');
+function place(mesh, header, metadata) {
+  const [a, b, c] = uprightIn(header, metadata, 'RUB');
   const left = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0]) < 0;
   if (left) say(`axes ${header.axes} are left-handed, and Spark does not mirror splats: left and right are exchanged`);
   const x = left ? -1 : 1;
   mesh.matrix.set(x * a[0], a[1], a[2], 0, x * b[0], b[1], b[2], 0, x * c[0], c[1], c[2], 0, 0, 0, 0, 1);
   mesh.quaternion.setFromRotationMatrix(mesh.matrix);
-  mesh.userData.csplat = header;
+  mesh.userData.csplat = { header, metadata };
 }
 
 /** @param {Header} header */

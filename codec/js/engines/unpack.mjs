@@ -145,16 +145,41 @@ export function putCovariances({ count, quats, scales }, header, out, first) {
 }
 
 /**
- * The linear map from a scene's axes to those of an engine, by rows; the scene as RDF where its axes are not known.
+ * The linear map that stands a scene upright in an engine whose +y is up: what its axes say, RDF where they are not known,
+ * and then the shortest turn to where the metadata has `up`.
  *
  * @param {Header} header
- * @param {string} engine letters of its directions +x, +y, +z
- * @returns {number[][]} of determinant −1 where one of both is left-handed
+ * @param {Record<string, unknown> | null} metadata
+ * @param {'RUB' | 'RUF'} engine letters of its directions +x, +y, +z
+ * @returns {number[][]} 3 × 3, by rows; of determinant −1 where either of both is left-handed
  */
-export function axesTo({ axes }, engine) {
+export function uprightIn({ axes }, metadata, engine) {
   const opposite = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D', D: 'U', F: 'B', B: 'F' });
   const from = [...(axes || 'RDF')];
-  return [...engine].map((to) => from.map((one) => Number(one === to) - Number(one === opposite[to])));
+  const map = [...engine].map((to) => from.map((one) => (one === to ? 1 : one === opposite[to] ? -1 : 0)));
+  const up = upOf(metadata);
+  if (up === null) return map;
+  const [x, y, z] = map.map((row) => row[0] * up[0] + row[1] * up[1] + row[2] * up[2]);
+  const a = y > -1 + 1e-9 ? 1 / (1 + y) : 0; // turned over about x
+  const turn = [
+    [1 - a * x * x, -x, -a * x * z],
+    [x, y, z],
+    [-a * x * z, -z, y > -1 + 1e-9 ? 1 - a * z * z : -1],
+  ];
+  return turn.map((row) => [0, 1, 2].map((c) => row[0] * map[0][c] + row[1] * map[1][c] + row[2] * map[2][c]));
+}
+
+/**
+ * The direction that the metadata has as up, of length 1; null where it has none.
+ *
+ * @param {Record<string, unknown> | null} metadata
+ * @returns {number[] | null}
+ */
+export function upOf(metadata) {
+  const up = metadata?.up;
+  if (!Array.isArray(up) || up.length !== 3 || !up.every((one) => Number.isFinite(one))) return null;
+  const length = Math.hypot(...up);
+  return length > 0 && length < Infinity ? up.map((one) => one / length) : null;
 }
 
 /**

@@ -3,7 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
-import { alphaOf, axesTo, places, putBand, putColumns, putCovariances, putQuats } from '../engines/unpack.mjs';
+import { alphaOf, places, putBand, putColumns, putCovariances, putQuats, uprightIn } from '../engines/unpack.mjs';
 import { manifest, vector } from './helpers.mjs';
 
 const same = (value) => value;
@@ -60,8 +60,18 @@ for (const { name } of valid) {
   });
 }
 
-test('a scene stands in the axes of an engine', () => {
-  assert.deepEqual(axesTo({ axes: 'RUB' }, 'RUB'), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]);
-  assert.deepEqual(axesTo({ axes: '' }, 'RUB').map(([x, y, z]) => [x, y, z + 0]), [[1, 0, 0], [0, -1, 0], [0, 0, -1]]);
-  assert.deepEqual(axesTo({ axes: 'RFU' }, 'RUF'), [[1, 0, 0], [0, 0, 1], [0, 1, 0]]);
+test('a scene stands upright in the axes of an engine', () => {
+  const map = (axes, engine, up) => uprightIn({ axes }, { up }, engine);
+  assert.deepEqual(map('RUB', 'RUB'), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]);
+  assert.deepEqual(map('', 'RUB'), [[1, 0, 0], [0, -1, 0], [0, 0, -1]]);
+  assert.deepEqual(map('RDF', 'RUF'), [[1, 0, 0], [0, -1, 0], [0, 0, 1]]);
+  assert.deepEqual(map('RFU', 'RUF', 'no direction'), [[1, 0, 0], [0, 0, 1], [0, 1, 0]]);
+  for (const up of [[0, -1, 0], [0, 1, 0], [0.6, -0.8, 0], [0, 0, 5], [2, 3, -1]]) {
+    const rows = map('RDF', 'RUF', up);
+    const [x, y, z] = rows.map((row) => row.reduce((sum, one, i) => sum + (one * up[i]) / Math.hypot(...up), 0));
+    assert.ok(Math.hypot(x, y - 1, z) < 1e-12, `${up} is up`);
+    const [a, b, c] = rows;
+    const cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    assert.ok(Math.hypot(...cross.map((one, i) => one + c[i])) < 1e-12, `${up}: neither mirrored nor bent`);
+  }
 });

@@ -1,4 +1,4 @@
-"""Look at what csplat writes in the programs that other formats are made for: three.js, PlayCanvas, Babylon.js.
+"""Look at what csplat writes in the programs that other formats are made for: three.js, PlayCanvas, Babylon.js, Spark.
 
     python -m csplat_bench.viewer.owners --out pictures
     python -m csplat_bench.viewer.owners --scenes lego60k --engines three --formats gltf,spz
@@ -6,8 +6,9 @@
 Writes a scene in every format, lets the engines' own loaders read it in Chromium, and compares pictures with those of
 csplat's rasteriser of the PLY, from where SH shows most of eight places around the scene: dB. `by its rules` is the
 same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH changes there the engine shows, 1 where
-it is all. `stands` is how the engine's world, whose y is up, holds the scene. --out keeps the pictures, and all of a
-scene on one sheet. Status 1 where one is mirrored, on its head, of wrong SH or absent. Wants Chromium, playwright, npm.
+it is all. `stands` is how the engine's world, whose y is up, holds the scene; `PLY` how near the picture is to that of
+the PLY in the same engine, dB. Where csplat is among the formats, by `codec/js/engines`, all others are written from
+what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 where one is mirrored, on its head, of wrong SH or absent. Wants Chromium, playwright, npm.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ import numpy as np
 import typer
 
 from csplat.errors import InputError
-from csplat.formats import named, write
+from csplat.formats import named, read, write
 from csplat.formats.format import Format
+from csplat.formats.own import FORMAT as CSPLAT
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.ply import read_ply
 from csplat.scene import scene_of
@@ -39,29 +41,33 @@ from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
 from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.report import table, tell_machine, write_json
-from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
+from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes
 from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
 from csplat_render import Camera
 from csplat_render.metrics import psnr
 from csplat_render.paths import orbit_cameras
 from csplat_tools.files.pictures import write_png
 
-_OURS = "csplat"  # among the formats of pictures
+_OURS = "ours"  # among the formats of pictures
 _SH_OFF = 0.3  # kernels that are cut make room for what lies behind, in other colours
 _PLACES, _WIDTH, _HEIGHT = 8, 320, 240  # SwiftShader takes its time
 _PATIENCE = 120.0  # seconds
 _PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
 _PACKAGES = {
     "three": "0.187", "playcanvas": "2.23", "@babylonjs/core": "9", "@babylonjs/loaders": "9", "@adobe/spz": "0.2",
+    "@sparkjsdev/spark": "2.2",
 }  # fmt: skip
 _IMPORTS = {
     "three": "three/build/three.webgpu.js", "three/webgpu": "three/build/three.webgpu.js",
     "three/tsl": "three/build/three.tsl.js", "three/addons/": "three/examples/jsm/",
     "playcanvas": "playcanvas/build/playcanvas.mjs",
     "@babylonjs/core/": "@babylonjs/core/", "@babylonjs/loaders/": "@babylonjs/loaders/",
+    "@sparkjsdev/spark": "@sparkjsdev/spark/dist/spark.module.js",
 }  # fmt: skip
+#: Spark is made for three's WebGLRenderer, not for the WebGPURenderer of three's own splats.
+_CLASSIC = ("/node_modules/@sparkjsdev/", "/pages/spark.mjs")
 _PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;background:#000">
-<canvas style="display:block"></canvas><script type="importmap">{"imports":%s}</script>"""
+<canvas style="display:block"></canvas><script type="importmap">{"imports":%s,"scopes":%s}</script>"""
 _SHOW = """async ([engine, url, camera, patience]) => {
   const { show, version } = await import(`/pages/${engine}.mjs`);
   const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
@@ -70,7 +76,7 @@ _SHOW = """async ([engine, url, camera, patience]) => {
 }"""
 
 
-_FORMATS = "ply,gltf,sog,compressed-ply,spz,spz4,splat"
+_FORMATS = "ply,csplat,gltf,sog,compressed-ply,spz,spz4,splat"
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,7 @@ class Shown:
         psnr: against ours, dB; against ours by the engine's rules.
         wrong: the same of the likest of that one mirrored and on its head.
         sh: how far the picture lies on the way from ours without SH to ours, by these rules; 1 where there is none.
+        ply: against that of the PLY in the same engine, dB.
     """
 
     scene: str
@@ -92,6 +99,7 @@ class Shown:
     psnr: tuple[float, float] | None = None
     wrong: float = 0.0
     sh: float = 1.0
+    ply: float | None = None
 
     @property
     def right(self) -> bool:
@@ -102,7 +110,9 @@ class Shown:
     def cells(self) -> tuple[str, ...]:
         """As the table has them."""
         found = [] if self.psnr is None else [f"{self.psnr[0]:.1f}", f"{self.psnr[1]:.1f}", f"{self.sh:.2f}"]
-        return self.scene, self.engine, self.format, "yes" if self.right else "NO", self.stands, *(found or "---")
+        found.append("-" if self.ply is None else f"{self.ply:.1f}")
+        seen = found if self.psnr else ("-",) * 4
+        return self.scene, self.engine, self.format, "yes" if self.right else "NO", self.stands, *seen
 
 
 def main(
@@ -124,20 +134,26 @@ def main(
     with _opened_page(chromium, peers) as (page, folder, address):
         for scene in find_scenes(listed(scenes), cache, extra):
             model, camera = _looked_at(scene)
-            ours = [(name, engine.drawn(model, camera, DEGREE)) for name, engine in wanted]
-            pictures = {(name, _OURS): picture for name, picture in ours}
-            for form in map(named, listed(formats)):
+            forms = [named(name) for name in listed(formats)]
+            if CSPLAT in forms:
+                write(folder / f"{scene.name}.csplat", model, CSPLAT.name)
+                model = read(folder / f"{scene.name}.csplat")
+            pictures = {(name, _OURS): engine.drawn(model, camera, DEGREE) for name, engine in wanted}
+            for form in forms:
                 path = folder / f"{scene.name}{form.suffixes[0]}"
-                write(path, model, form.name)
+                if form is not CSPLAT:
+                    write(path, model, form.name)
                 for name, engine in wanted:
                     if form.name in engine.reads:
                         shown, picture = _shown(page, name, f"{address}{path.name}", model, form)
-                        rows.append(replace(shown, scene=scene.name))
+                        twin = pictures.get((name, "ply")) if shown.psnr else None
+                        like = None if twin is None else psnr(picture, twin)
+                        rows.append(replace(shown, scene=scene.name, ply=like))
                         pictures[name, form.name] = picture
                         tell(" ".join(rows[-1].cells))
             if out is not None:
                 _keep(out, scene.name, pictures)
-    header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "SH")
+    header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "SH", "PLY")
     print(table(header, [row.cells for row in rows], markdown=markdown))
     if json is not None:
         write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})
@@ -155,8 +171,11 @@ def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
         folder = Path(name)
         (folder / "node_modules").symlink_to(packages.resolve())
         (folder / "pages").symlink_to(Path(__file__).with_name("pages"))
+        (folder / "codec").symlink_to(ROOT / "codec" / "js")
         imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
-        (folder / "page.html").write_text(_PAGE % format_json.dumps(imports))
+        imports |= {f"csplat-decoder/{name}": f"/codec/engines/{name}.mjs" for name in ENGINES}
+        scopes = dict.fromkeys(_CLASSIC, {"three": "/node_modules/three/build/three.module.js"})
+        (folder / "page.html").write_text(_PAGE % (format_json.dumps(imports), format_json.dumps(scopes)))
         with open_page(chromium, gpu=False) as page:
             yield page, folder, address
 

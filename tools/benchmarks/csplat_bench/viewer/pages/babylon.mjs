@@ -8,6 +8,7 @@ import { Engine } from '@babylonjs/core/Engines/engine.js';
 import { Scene } from '@babylonjs/core/scene.js';
 import '@babylonjs/loaders/SPLAT/index.js';
 import '@babylonjs/loaders/glTF/2.0/index.js';
+import 'csplat-decoder/babylon';
 import * as fflate from 'three/addons/libs/fflate.module.js';
 
 export const version = Engine.Version;

@@ -1,5 +1,6 @@
 // three.js: GaussianSplat and its loaders. Colours go through as they are: what is SH to us, three takes for linear light.
 import * as THREE from 'three';
+import { CSPLATLoader } from 'csplat-decoder/three';
 import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 import { GaussianSplatPLYLoader } from 'three/addons/loaders/GaussianSplatPLYLoader.js';
@@ -9,7 +10,7 @@ import { GaussianSplat } from 'three/addons/objects/GaussianSplat.js';
 
 export const version = `0.${THREE.REVISION}`;
 
-const loaders = { ply: GaussianSplatPLYLoader, spz: SPZLoader, splat: SPLATLoader };
+const loaders = { csplat: CSPLATLoader, ply: GaussianSplatPLYLoader, spz: SPZLoader, splat: SPLATLoader };
 
 export async function show(canvas, url, camera) {
   const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: true, antialias: false });
@@ -38,5 +39,8 @@ async function load(url) {
     return (await loader.loadAsync(url)).scene;
   }
   if (!loaders[ending]) throw new Error('no loader');
-  return new GaussianSplat(await new loaders[ending]().loadAsync(url));
+  const geometry = await new loaders[ending]().loadAsync(url);
+  const splats = new GaussianSplat(geometry);
+  if (geometry.userData.upright) splats.applyMatrix4(geometry.userData.upright);
+  return splats;
 }

@@ -1,0 +1,147 @@
+// As much of the engines as their adapters use, for checks without the engines' packages.
+
+declare module 'three' {
+  export class BufferAttribute {
+    constructor(array: ArrayBufferView, itemSize: number, normalized?: boolean);
+  }
+  export class BufferGeometry {
+    userData: object;
+    setAttribute(name: string, attribute: BufferAttribute): this;
+    computeBoundingBox(): void;
+    computeBoundingSphere(): void;
+  }
+  export class Matrix4 {
+    set(...rows: number[]): this;
+  }
+  export class LoadingManager {
+    abortController?: AbortController;
+    resolveURL(url: string): string;
+    itemStart(url: string): void;
+    itemEnd(url: string): void;
+    itemError(url: string): void;
+  }
+  export class Loader<T = unknown> {
+    constructor(manager?: LoadingManager);
+    manager: LoadingManager;
+    path: string;
+    withCredentials: boolean;
+    requestHeader: Record<string, string>;
+    loadAsync(url: string, onProgress?: (event: ProgressEvent) => void): Promise<T>;
+  }
+}
+
+declare module '@babylonjs/core/scene.js' {
+  export class Scene {
+    isDisposed: boolean;
+    useRightHandedSystem: boolean;
+    getEngine(): { getCaps(): { maxTextureSize: number } };
+  }
+}
+
+declare module '@babylonjs/core/assetContainer.js' {
+  export class AssetContainer {
+    constructor(scene: import('@babylonjs/core/scene.js').Scene);
+    meshes: object[];
+    removeAllFromScene(): void;
+  }
+}
+
+declare module '@babylonjs/core/Loading/sceneLoader.js' {
+  export function RegisterSceneLoaderPlugin(plugin: object): void;
+}
+
+declare module '@babylonjs/core/Maths/math.vector.js' {
+  export class Vector3 {}
+  export class Quaternion {}
+  export class Matrix {
+    static FromValues(...values: number[]): Matrix;
+    decompose(scaling: Vector3, rotation: Quaternion): boolean;
+  }
+}
+
+declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js' {
+  import type { Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
+  import type { Scene } from '@babylonjs/core/scene.js';
+  export class GaussianSplattingMesh {
+    constructor(name: string, url: string | null, scene: Scene, keepInRam?: boolean);
+    material: object | null;
+    metadata: unknown;
+    rotationQuaternion: Quaternion | null;
+    scaling: Vector3;
+    computeWorldMatrix(force: boolean): void;
+    dispose(): void;
+    updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
+  }
+}
+
+declare module '@sparkjsdev/spark' {
+  export class ExtSplats {
+    constructor(options: { extArrays: [Uint32Array, Uint32Array]; extra: Record<string, unknown>; numSplats: number });
+  }
+  export class PackedSplats {
+    constructor(options: {
+      packedArray: Uint32Array;
+      extra: Record<string, unknown>;
+      numSplats: number;
+      splatEncoding: Record<string, number>;
+    });
+  }
+  export class SplatMesh {
+    constructor(options: {
+      extSplats?: ExtSplats;
+      packedSplats?: PackedSplats;
+      splatEncoding?: Record<string, number>;
+    });
+    matrix: { set(...rows: number[]): unknown };
+    quaternion: { setFromRotationMatrix(matrix: unknown): unknown };
+    userData: Record<string, unknown>;
+  }
+}
+
+declare module 'playcanvas' {
+  export const PIXELFORMAT_RGBA8U: number;
+  export const PIXELFORMAT_RGBA16U: number;
+  export const PIXELFORMAT_RGBA32U: number;
+  export const PIXELFORMAT_RGBA32F: number;
+  export interface Asset {
+    file?: { contents?: ArrayBuffer } | null;
+    fire(name: string, ...values: unknown[]): unknown;
+  }
+  export interface AppBase {
+    graphicsDevice: { maxTextureSize: number };
+    scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean } };
+  }
+  export class Entity {
+    setLocalRotation(rotation: Quat): void;
+  }
+  export class Vec3 {
+    constructor(...values: number[]);
+  }
+  export class Mat4 {
+    data: Float32Array;
+  }
+  export class Quat {
+    setFromMat4(matrix: Mat4): this;
+  }
+  export class Texture {
+    static createDataTexture2D(
+      device: object,
+      name: string,
+      width: number,
+      height: number,
+      format: number,
+      levels: ArrayBufferView[],
+    ): Texture;
+  }
+  export class GSplatFormat {
+    constructor(device: object, streams: object[], options: { readGLSL: string; readWGSL: string });
+  }
+  export class GSplatResourceBase {
+    constructor(device: object, data: object, options: object);
+    gsplatData: any;
+    streams: { textures: Map<string, Texture>; textureDimensions: { set(x: number, y: number): unknown } };
+    parameters: Map<string, unknown>;
+    _format: GSplatFormat | null;
+    destroy(): void;
+  }
+}
