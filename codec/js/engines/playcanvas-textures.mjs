@@ -10,7 +10,7 @@ import { places, putColumns } from './unpack.mjs';
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
  * @typedef {Uint8Array | Uint16Array | Uint32Array | Float32Array} Texels four to a texel
  * @typedef {{width: number, height: number, texels: Texels}} Image
- * @typedef {{low: number, step: number, bits: number, divisor: number}} Lattice value = (low + texel) * step
+ * @typedef {{low: number, step: number, bits: number}} Lattice value = (low + texel) * step
  */
 
 /**
@@ -24,10 +24,11 @@ export function imagesOf(header, tiles, shDegree, maxSize) {
   const width = Math.max(1, Math.ceil(Math.sqrt(count)));
   const height = Math.max(1, Math.ceil(count / width));
   const image = (/** @type {number} */ bits) => ({ width, height, texels: arrayOf(bits, 4 * width * height) });
-  const of = (/** @type {'scales' | 'quats' | 'sh0'} */ name) => latticeOf(tiles.map((tile) => tile[name]));
+  const of = (/** @type {'scales' | 'sh0'} */ name) => latticeOf(tiles.map((tile) => tile[name]));
   const opacity = /** @type {AttributeRecord} */ (header.attributes.find(({ name }) => name === 'opacities'));
   const quat = /** @type {AttributeRecord} */ (header.attributes.find(({ name }) => name === 'quats'));
-  const [scales, quats, colours] = [of('scales'), of('quats'), of('sh0')];
+  const [scales, colours] = [of('scales'), of('sh0')];
+  const quats = latticeOf(tiles.map((tile) => ({ ...tile.quats, step: 1 })));
   const widest = Math.max(tiles.length, ...header.tiles.flatMap(({ extent }) => extent));
   /** @type {Record<string, Image>} */
   const images = {
@@ -41,13 +42,13 @@ export function imagesOf(header, tiles, shDegree, maxSize) {
   for (const { index, first } of header.tiles) {
     const tile = tiles[index];
     putColumns(tile.means, places(centers, 3, 0), first, (mean) => mean);
-    putElements(tile.means, images.csMeans.texels, first, { low: 0, divisor: 1 }, false);
+    putElements(tile.means, images.csMeans.texels, first);
     for (let i = first; i < first + tile.count; i++) images.csMeans.texels[4 * i + 3] = index;
     putElements(tile.scales, images.csShapes.texels, first, scales);
     for (let i = 0; i < tile.count; i++) {
       images.csShapes.texels[4 * (first + i) + 3] = tile.opacities.offsets[0] + tile.opacities.columns[i];
     }
-    putElements(tile.quats, images.csQuats.texels, first, quats);
+    putElements({ ...tile.quats, step: 1 }, images.csQuats.texels, first, quats);
     putElements(tile.sh0, images.csColours.texels, first, colours);
   }
   /** @type {ReturnType<typeof bandOf>[]} */
@@ -62,7 +63,7 @@ export function imagesOf(header, tiles, shDegree, maxSize) {
   const lattice = (/** @type {number} */ i) => bands[i]?.lattice ?? { low: 0, step: 0 };
   const parameters = {
     csShape: [scales.low, scales.step, opacity.levels, opacity.mapping === 'square' ? 1 : 0],
-    csOther: [colours.low, colours.step, quats.low, quats.divisor / (quat.levels * Math.SQRT2)],
+    csOther: [colours.low, colours.step, quats.low, 1 / (quat.levels * Math.SQRT2)],
     csLows: [lattice(0).low, lattice(1).low, lattice(2).low, header.flat ? 1 : 0],
     csSteps: [lattice(0).step, lattice(1).step, lattice(2).step, 0],
   };
@@ -110,8 +111,9 @@ function bandOf(header, tiles, layer, maxSize) {
     for (let c = 0; c < 3 * terms; c++) {
       const place = 4 * (c % terms) + Math.floor(c / terms); // the columns of R come first, then those of G and B
       const offset = packed.offsets[c];
+      const factor = packed.step / lattice.step;
       for (let i = 0; i < n; i++) {
-        image.texels[4 * terms * (used + i) + place] = Math.round((offset + packed.columns[c * n + i]) / lattice.divisor) - lattice.low;
+        image.texels[4 * terms * (used + i) + place] = Math.round((offset + packed.columns[c * n + i]) * factor) - lattice.low;
       }
     }
     used += n;
@@ -134,45 +136,48 @@ function bandOf(header, tiles, layer, maxSize) {
 }
 
 /**
- * One offset and step for columns of one attribute, and the bits of what is left.
+ * One offset and step for columns of one attribute, whose steps differ by powers of two, and the bits of what is left.
  *
  * @param {PackedColumns[]} all
  * @param {boolean} [zero] whether 0 is among the values
  * @returns {Lattice}
  */
 function latticeOf(all, zero = false) {
+  let step = Math.min(...all.map((packed) => packed.step));
+  if (step === Infinity) step = 1;
   let [low, high] = zero ? [0, 0] : [Infinity, -Infinity];
-  for (const { columns, offsets } of all) {
+  for (const { columns, offsets, step: own } of all) {
     const n = columns.length / offsets.length;
     for (let c = 0; c < offsets.length; c++) {
       for (let i = c * n; i < (c + 1) * n; i++) {
-        const integer = offsets[c] + columns[i];
+        const integer = ((offsets[c] + columns[i]) * own) / step;
         if (integer < low) low = integer;
         if (integer > high) high = integer;
       }
     }
   }
   if (low > high) low = high = 0;
-  let divisor = 1; // of integers that no texel holds
-  while ((high - low) / divisor >= 2 ** 32 - 2) divisor *= 2;
-  low = Math.floor(low / divisor);
-  return { low, step: (all[0]?.step ?? 0) * divisor, divisor, bits: bitsFor(Math.ceil(high / divisor) - low) };
+  for (; high - low >= 2 ** 32 - 2; step *= 2) {
+    low = Math.floor(low / 2); // no texel holds such integers
+    high = Math.ceil(high / 2);
+  }
+  return { low, step, bits: bitsFor(high - low) };
 }
 
 /**
- * Put three columns where texels have them.
+ * Put three columns where texels have them; without a lattice, elements as they are.
  *
  * @param {PackedColumns} packed
  * @param {Texels} texels
  * @param {number} first
- * @param {{low: number, divisor: number}} lattice
- * @param {boolean} [offset] whether the columns' own offsets count
+ * @param {Lattice} [lattice]
  */
-function putElements({ columns, offsets }, texels, first, { low, divisor }, offset = true) {
+function putElements({ columns, offsets, step }, texels, first, lattice) {
   const n = columns.length / 3;
+  const factor = lattice ? step / lattice.step : 1;
   for (let c = 0; c < 3; c++) {
-    const start = offset ? offsets[c] : 0;
-    for (let i = 0; i < n; i++) texels[4 * (first + i) + c] = Math.round((start + columns[c * n + i]) / divisor) - low;
+    const [start, low] = lattice ? [offsets[c], lattice.low] : [0, 0];
+    for (let i = 0; i < n; i++) texels[4 * (first + i) + c] = Math.round((start + columns[c * n + i]) * factor) - low;
   }
 }
 

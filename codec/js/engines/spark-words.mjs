@@ -170,30 +170,33 @@ export class PackedWords {
 /**
  * Lowest and highest value of such columns; the highest so that steps become whole numbers of `levels`, if they can.
  *
- * @param {PackedColumns[]} all of one step
+ * @param {PackedColumns[]} all
  * @param {number} levels
  */
 function span(all, levels) {
-  let [low, high] = [Infinity, -Infinity];
+  let [low, high, step] = [Infinity, -Infinity, Infinity];
   for (const columns of all) {
     const [least, most] = range(columns);
-    low = Math.min(low, least);
-    high = Math.max(high, most);
+    low = Math.min(low, least * columns.step);
+    high = Math.max(high, most * columns.step);
+    step = Math.min(step, columns.step);
   }
-  if (low > high) return [0, 1];
-  const { step } = all[0];
-  return [low * step, (high - low <= levels ? low + levels : high) * step];
+  return low > high ? [0, 1] : [low, Math.max(high, low + levels * step)];
 }
 
 /**
  * The value that the integer `limit` stands for: for as many steps, if none is larger.
  *
- * @param {PackedColumns[]} all of one step
+ * @param {PackedColumns[]} all
  * @param {number} limit
  */
 function largest(all, limit) {
-  const most = Math.max(0, ...new Set(all.map((columns) => Math.max(...range(columns).map(Math.abs)))));
-  return most === 0 ? 1 : Math.max(limit, most) * all[0].step;
+  let [most, step] = [0, Infinity];
+  for (const columns of new Set(all)) {
+    most = Math.max(most, ...range(columns).map((integer) => Math.abs(integer * columns.step)));
+    step = Math.min(step, columns.step);
+  }
+  return most === 0 ? 1 : Math.max(most, limit * step);
 }
 
 /**

@@ -8,7 +8,8 @@ csplat's rasteriser of the PLY, from where SH shows most of eight places around 
 same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH changes there the engine shows, 1 where
 it is all. `stands` is how the engine's world, whose y is up, holds the scene; `PLY` how near the picture is to that of
 the PLY in the same engine, dB. Where csplat is among the formats, by `codec/js/engines`, all others are written from
-what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 where one is mirrored, on its head, of wrong SH or absent. Wants Chromium, playwright, npm.
+what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 where one is mirrored, on its
+head, of wrong SH or absent. Wants Chromium, playwright, npm.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
         (folder / "codec").symlink_to(ROOT / "codec" / "js")
         imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
         imports |= {f"csplat-decoder/{name}": f"/codec/engines/{name}.mjs" for name in ENGINES}
-        scopes = dict.fromkeys(_CLASSIC, {"three": "/node_modules/three/build/three.module.js"})
+        scopes = {key: {"three": "/node_modules/three/build/three.module.js"} for key in _CLASSIC}
         (folder / "page.html").write_text(_PAGE % (format_json.dumps(imports), format_json.dumps(scopes)))
         with open_page(chromium, gpu=False) as page:
             yield page, folder, address
