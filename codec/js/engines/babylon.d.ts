@@ -39,7 +39,7 @@ export interface CSPLATImport {
 export class CSPLATFileLoader {
   constructor(options?: CSPLATLoadingOptions);
   readonly name: 'csplat';
-  readonly extensions: { '.csplat': { isBinary: true } };
+  readonly extensions: { '.csplat': { isBinary: true; mimeType: 'model/vnd.csplat' } };
   createPlugin(options: { csplat?: CSPLATLoadingOptions }): CSPLATFileLoader;
   importMeshAsync(names: unknown, scene: Scene, data: ArrayBuffer | Uint8Array<ArrayBuffer>): Promise<CSPLATImport>;
   loadAsync(scene: Scene, data: ArrayBuffer | Uint8Array<ArrayBuffer>): Promise<void>;

@@ -28,7 +28,7 @@ export class CSPLATFileLoader {
   /** @param {{keepInRam?: boolean}} [options] */
   constructor({ keepInRam = false } = {}) {
     this.name = NAME;
-    this.extensions = { '.csplat': { isBinary: true } };
+    this.extensions = { '.csplat': { isBinary: true, mimeType: 'model/vnd.csplat' } };
     this.keepInRam = keepInRam;
   }
 
@@ -132,7 +132,7 @@ async function meshOf(scene, header, metadata, rows, sh, keepInRam) {
     mesh.computeWorldMatrix(true);
     mesh.metadata = { csplat: { axes, antialiased, origin, unitMetres, up: upOf(metadata), metadata } };
   } catch (error) {
-    mesh.dispose();
+    mesh.dispose(false, true); // with its material
     throw error;
   }
   if (extras.length > 0) say('extra columns are left out');

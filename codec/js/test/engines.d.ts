@@ -69,7 +69,7 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
     rotationQuaternion: Quaternion | null;
     scaling: Vector3;
     computeWorldMatrix(force: boolean): void;
-    dispose(): void;
+    dispose(doNotRecurse?: boolean, disposeMaterialAndTextures?: boolean): void;
     updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
   }
 }
