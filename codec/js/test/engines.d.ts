@@ -73,3 +73,75 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
     updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
   }
 }
+
+declare module '@sparkjsdev/spark' {
+  export class ExtSplats {
+    constructor(options: { extArrays: [Uint32Array, Uint32Array]; extra: Record<string, unknown>; numSplats: number });
+  }
+  export class PackedSplats {
+    constructor(options: {
+      packedArray: Uint32Array;
+      extra: Record<string, unknown>;
+      numSplats: number;
+      splatEncoding: Record<string, number>;
+    });
+  }
+  export class SplatMesh {
+    constructor(options: {
+      extSplats?: ExtSplats;
+      packedSplats?: PackedSplats;
+      splatEncoding?: Record<string, number>;
+    });
+    matrix: { set(...rows: number[]): unknown };
+    quaternion: { setFromRotationMatrix(matrix: unknown): unknown };
+    userData: Record<string, unknown>;
+  }
+}
+
+declare module 'playcanvas' {
+  export const PIXELFORMAT_RGBA8U: number;
+  export const PIXELFORMAT_RGBA16U: number;
+  export const PIXELFORMAT_RGBA32U: number;
+  export const PIXELFORMAT_RGBA32F: number;
+  export interface Asset {
+    file?: { contents?: ArrayBuffer } | null;
+    fire(name: string, ...values: unknown[]): unknown;
+  }
+  export interface AppBase {
+    graphicsDevice: { maxTextureSize: number };
+    scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean } };
+  }
+  export class Entity {
+    setLocalRotation(rotation: Quat): void;
+  }
+  export class Vec3 {
+    constructor(...values: number[]);
+  }
+  export class Mat4 {
+    data: Float32Array;
+  }
+  export class Quat {
+    setFromMat4(matrix: Mat4): this;
+  }
+  export class Texture {
+    static createDataTexture2D(
+      device: object,
+      name: string,
+      width: number,
+      height: number,
+      format: number,
+      levels: ArrayBufferView[],
+    ): Texture;
+  }
+  export class GSplatFormat {
+    constructor(device: object, streams: object[], options: { readGLSL: string; readWGSL: string });
+  }
+  export class GSplatResourceBase {
+    constructor(device: object, data: object, options: object);
+    gsplatData: any;
+    streams: { textures: Map<string, Texture>; textureDimensions: { set(x: number, y: number): unknown } };
+    parameters: Map<string, unknown>;
+    _format: GSplatFormat | null;
+    destroy(): void;
+  }
+}

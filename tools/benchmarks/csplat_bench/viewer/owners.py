@@ -1,4 +1,4 @@
-"""Look at what csplat writes in the programs that other formats are made for: three.js, PlayCanvas, Babylon.js.
+"""Look at what csplat writes in the programs that other formats are made for: three.js, PlayCanvas, Babylon.js, Spark.
 
     python -m csplat_bench.viewer.owners --out pictures
     python -m csplat_bench.viewer.owners --scenes lego60k --engines three --formats gltf,spz
@@ -56,15 +56,19 @@ _PATIENCE = 120.0  # seconds
 _PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
 _PACKAGES = {
     "three": "0.187", "playcanvas": "2.23", "@babylonjs/core": "9", "@babylonjs/loaders": "9", "@adobe/spz": "0.2",
+    "@sparkjsdev/spark": "2.2",
 }  # fmt: skip
 _IMPORTS = {
     "three": "three/build/three.webgpu.js", "three/webgpu": "three/build/three.webgpu.js",
     "three/tsl": "three/build/three.tsl.js", "three/addons/": "three/examples/jsm/",
     "playcanvas": "playcanvas/build/playcanvas.mjs",
     "@babylonjs/core/": "@babylonjs/core/", "@babylonjs/loaders/": "@babylonjs/loaders/",
+    "@sparkjsdev/spark": "@sparkjsdev/spark/dist/spark.module.js",
 }  # fmt: skip
+#: Spark is made for three's WebGLRenderer, not for the WebGPURenderer of three's own splats.
+_CLASSIC = ("/node_modules/@sparkjsdev/", "/pages/spark.mjs")
 _PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;background:#000">
-<canvas style="display:block"></canvas><script type="importmap">{"imports":%s}</script>"""
+<canvas style="display:block"></canvas><script type="importmap">{"imports":%s,"scopes":%s}</script>"""
 _SHOW = """async ([engine, url, camera, patience]) => {
   const { show, version } = await import(`/pages/${engine}.mjs`);
   const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
@@ -171,7 +175,8 @@ def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
         (folder / "codec").symlink_to(ROOT / "codec" / "js")
         imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
         imports |= {f"csplat-decoder/{name}": f"/codec/engines/{name}.mjs" for name in ENGINES}
-        (folder / "page.html").write_text(_PAGE % format_json.dumps(imports))
+        scopes = {key: {"three": "/node_modules/three/build/three.module.js"} for key in _CLASSIC}
+        (folder / "page.html").write_text(_PAGE % (format_json.dumps(imports), format_json.dumps(scopes)))
         with open_page(chromium, gpu=False) as page:
             yield page, folder, address
 

@@ -52,10 +52,11 @@ class Engine:
 #: By the names of their pages.
 ENGINES = {
     "three": Engine("three.js", ("ply", "csplat", "gltf", "spz", "spz4", "splat"), clips=True, antialiased=True),
-    "playcanvas": Engine("PlayCanvas", ("ply", "gltf", "sog", "compressed-ply", "spz4"), thin=True),
+    "playcanvas": Engine("PlayCanvas", ("ply", "csplat", "gltf", "sog", "compressed-ply", "spz4"), thin=True),
     "babylon": Engine(
         "Babylon.js", ("ply", "csplat", "gltf", "sog", "compressed-ply", "spz", "spz4", "splat"), clips=True, thin=True
     ),
+    "spark": Engine("Spark", ("ply", "csplat")),
 }
 
 

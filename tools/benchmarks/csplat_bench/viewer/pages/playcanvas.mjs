@@ -1,5 +1,6 @@
 // PlayCanvas: a component with an asset, of SPZ by the parser that comes with its package.
 import * as pc from 'playcanvas';
+import { CsplatParser } from 'csplat-decoder/playcanvas';
 import { SpzParser } from '/node_modules/playcanvas/scripts/esm/parsers/spz-parser.mjs';
 import { ZSTDDecoder } from 'three/addons/libs/zstddec.module.js';
 
@@ -16,6 +17,7 @@ export async function show(canvas, url, camera) {
   const app = new pc.AppBase(canvas);
   app.init(options);
   addSpz(app);
+  app.loader.getHandler('gsplat').addParser(new CsplatParser(app));
   app.start();
 
   const splats = await load(app, url);
@@ -58,5 +60,6 @@ async function load(app, url) {
   if (container) return asset.resource.instantiateRenderEntity();
   const entity = new pc.Entity();
   entity.addComponent('gsplat', { asset });
+  asset.resource.stand?.(entity); // of .csplat
   return entity;
 }

@@ -1,0 +1,27 @@
+// Types of the adapter for PlayCanvas.
+import type { AppBase, Asset, Entity, GSplatResourceBase } from 'playcanvas';
+import type { Header, ReaderOptions } from '../decoder.d.ts';
+
+export interface ParserOptions extends ReaderOptions {
+  /** SH bands above this degree are not fetched. */
+  shDegree?: number;
+}
+
+/** What `asset.resource` is. The integers of the file lie in textures; `destroy`, of the engine, frees them. */
+export interface CsplatResource extends GSplatResourceBase {
+  csplat: { header: Header; metadata: Record<string, unknown> | null };
+  /** Turn an entity so that the scene stands upright, by its axes and `up` of the metadata. */
+  stand(entity: Entity): void;
+}
+
+/**
+ * Loads assets of type `gsplat` whose name ends in `.csplat`. The asset fires `progress` with bytes received and those of the
+ * file; `error` with the decoder's CsplatError, and nothing is left behind then. Opacity compensation is
+ * `app.scene.gsplat.antiAlias`.
+ */
+export class CsplatParser {
+  constructor(app: AppBase, options?: ParserOptions);
+  canParse(context: { ext: string }): boolean;
+  load(url: { load: string }, callback: (error: unknown, resource?: CsplatResource) => void, asset?: Asset): void;
+  open(url: string, data: unknown): unknown;
+}

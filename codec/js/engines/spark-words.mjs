@@ -1,0 +1,335 @@
+// The words that Spark's splats are made of, from packed tiles. Without the engine, so that they can be tested.
+
+import { alphaOf, displayColour, places, putBand, putColumns, putQuats } from './unpack.mjs';
+
+/**
+ * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('../decoder.d.ts').Packed} Packed
+ * @typedef {import('../decoder.d.ts').PackedColumns} PackedColumns
+ * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
+ * @typedef {{rgbMin: number, rgbMax: number, lnScaleMin: number, lnScaleMax: number, sh1Max: number, sh2Max: number, sh3Max: number}} SplatEncoding
+ */
+
+const ROW = 2048; // splats; what does not fill a row of a texture is lost
+const LAYER = ROW * 2048;
+const LN_SCALE_ZERO = -30;
+const SH_BITS = [7, 8, 6];
+const SH_WORDS = [2, 4, 4];
+
+/** How many splats arrays must have room for. @param {number} count */
+export const paddedCount = (count) => {
+  const unit = count > LAYER ? LAYER : ROW;
+  return Math.max(1, Math.ceil(count / unit)) * unit;
+};
+
+/**
+ * Whether float16 centres, of PackedSplats, are off by no more than a step of the file's, anywhere in the scene.
+ *
+ * @param {Header} header
+ */
+export function halvesSuffice({ tiles }) {
+  return tiles.every(({ min, max, step }) => {
+    const farthest = Math.max(...min.map(Math.abs), ...max.map(Math.abs));
+    return farthest < 65504 && 2 ** (Math.floor(Math.log2(farthest)) - 11) <= step;
+  });
+}
+
+/** Arrays of ExtSplats: float32 centres, float16 colours, alphas and logarithms of scales, 32 bits of rotation. */
+export class ExtWords {
+  /**
+   * @param {Header} header
+   * @param {number} shDegree
+   */
+  constructor(header, shDegree) {
+    this.header = header;
+    const length = 4 * paddedCount(header.splatCount);
+    const words = () => new Uint32Array(length);
+    this.extArrays = /** @type {[Uint32Array, Uint32Array]} */ ([words(), words()]);
+    /** @type {Record<string, Uint32Array>} */
+    this.extra = {};
+    if (shDegree > 0) this.extra.sh1 = words();
+    if (shDegree > 1) this.extra.sh2 = words();
+    if (shDegree > 2) Object.assign(this.extra, { sh3a: words(), sh3b: words() });
+  }
+
+  /**
+   * @param {PackedTile} tile
+   * @param {number} first splat
+   */
+  put(tile, first) {
+    const { header } = this;
+    const [a, b] = this.extArrays;
+    const halves = new Uint16Array(b.buffer);
+    putColumns(tile.means, places(new Float32Array(a.buffer), 4, 0), first, (mean) => mean);
+    const alpha = alphaOf(header);
+    putColumns(tile.opacities, places(a, 4, 3, 1), first, (q) => half(alpha(q)));
+    putColumns(tile.sh0, places(halves, 8, 0), first, (sh0) => half(displayColour(sh0)));
+    putColumns(tile.scales, places(halves, 8, 3), first, half);
+    if (header.flat) flatten(tile, (i, c) => (halves[8 * (first + i) + 3 + c] = half(LN_SCALE_ZERO)));
+    eachQuat(tile, header, (i, w, x, y, z) => (b[4 * (first + i) + 3] = octahedral(w, x, y, z, 10, 12)));
+    for (const [i, sh] of tile.sh.entries()) if (sh) this.putBand(i + 1, sh, tile.count, first);
+  }
+
+  /**
+   * @param {number} layer
+   * @param {Packed} sh
+   * @param {number} count
+   * @param {number} first splat
+   */
+  putBand(layer, sh, count, first) {
+    const { sh1, sh2, sh3a, sh3b } = this.extra;
+    const places = [
+      [[sh1, 0], [sh1, 1], [sh1, 2]],
+      [[sh1, 3], [sh2, 0], [sh2, 1], [sh2, 2], [sh2, 3]],
+      [[sh3a, 0], [sh3a, 1], [sh3a, 2], [sh3a, 3], [sh3b, 0], [sh3b, 1], [sh3b, 2]],
+    ][layer - 1]; // prettier-ignore
+    const values = bandValues(sh, layer, count);
+    for (const [m, [array, word]] of /** @type {[Uint32Array, number][]} */ (places).entries()) {
+      for (let i = 0, at = 3 * m, to = 4 * first + word; i < count; i++, at += 3 * places.length, to += 4) {
+        array[to] = sharedExponent(values[at], values[at + 1], values[at + 2]);
+      }
+    }
+  }
+}
+
+/** Arrays of PackedSplats: float16 centres, bytes of all else, which hold the file's integers where these fit. */
+export class PackedWords {
+  /**
+   * @param {Header} header
+   * @param {number} shDegree
+   * @param {PackedTile[]} tiles all of them, for their ranges
+   */
+  constructor(header, shDegree, tiles) {
+    this.header = header;
+    const room = paddedCount(header.splatCount);
+    this.packedArray = new Uint32Array(4 * room);
+    /** @type {Record<string, Uint32Array>} */
+    this.extra = {};
+    for (let layer = 1; layer <= shDegree; layer++) this.extra[`sh${layer}`] = new Uint32Array(SH_WORDS[layer - 1] * room);
+    const [rgbMin, rgbMax] = span(tiles.map(({ sh0 }) => sh0), 255).map(displayColour); // prettier-ignore
+    const [lnScaleMin, lnScaleMax] = span(tiles.map(({ scales }) => scales), 254); // prettier-ignore
+    const most = [1, 2, 3].map((layer) => {
+      const bands = tiles.flatMap(({ sh }) => sh[layer - 1] ?? []);
+      return largest(bands.flatMap((band) => [band, ...(band.lookup ? [band.lookup.table] : [])]), 2 ** (SH_BITS[layer - 1] - 1) - 1); // prettier-ignore
+    });
+    /** @type {SplatEncoding} */
+    this.splatEncoding = { rgbMin, rgbMax, lnScaleMin, lnScaleMax, sh1Max: most[0], sh2Max: most[1], sh3Max: most[2] };
+  }
+
+  /**
+   * @param {PackedTile} tile
+   * @param {number} first splat
+   */
+  put(tile, first) {
+    const { header, packedArray } = this;
+    const { rgbMin, rgbMax, lnScaleMin, lnScaleMax } = this.splatEncoding;
+    const bytes = new Uint8ClampedArray(packedArray.buffer); // these round
+    const alpha = alphaOf(header);
+    putColumns(tile.sh0, places(bytes, 16, 0), first, (sh0) => (255 * (displayColour(sh0) - rgbMin)) / (rgbMax - rgbMin));
+    putColumns(tile.opacities, places(bytes, 16, 3, 1), first, (q) => 255 * alpha(q));
+    putColumns(tile.means, places(new Uint16Array(packedArray.buffer), 8, 2), first, half);
+    const perScale = 254 / (lnScaleMax - lnScaleMin);
+    putColumns(tile.scales, places(bytes, 16, 12), first, (scale) => Math.max(1, 1 + (scale - lnScaleMin) * perScale));
+    if (header.flat) flatten(tile, (i, c) => (bytes[16 * (first + i) + 12 + c] = 0));
+    eachQuat(tile, header, (i, w, x, y, z) => {
+      const word = octahedral(w, x, y, z, 8, 8);
+      const at = 16 * (first + i);
+      bytes[at + 10] = word & 255;
+      bytes[at + 11] = (word >>> 8) & 255;
+      bytes[at + 15] = (word >>> 16) & 255;
+    });
+    for (const [i, sh] of tile.sh.entries()) if (sh) this.putBand(i + 1, sh, tile.count, first);
+  }
+
+  /**
+   * @param {number} layer
+   * @param {Packed} sh
+   * @param {number} count
+   * @param {number} first splat
+   */
+  putBand(layer, sh, count, first) {
+    const values = bandValues(sh, layer, count);
+    const width = 3 * (2 * layer + 1);
+    const bits = SH_BITS[layer - 1];
+    const limit = 2 ** (bits - 1) - 1;
+    const encoding = this.splatEncoding;
+    const scale = limit / [encoding.sh1Max, encoding.sh2Max, encoding.sh3Max][layer - 1];
+    const out = this.extra[`sh${layer}`];
+    const words = SH_WORDS[layer - 1];
+    for (let i = 0; i < count; i++) {
+      for (let c = 0, place = 0; c < width; c++, place += bits) {
+        const integer = Math.max(-limit, Math.min(limit, Math.round(values[i * width + c] * scale))) & (2 ** bits - 1);
+        const at = words * (first + i) + (place >> 5);
+        out[at] |= integer << (place & 31);
+        if ((place & 31) + bits > 32) out[at + 1] |= integer >>> (32 - (place & 31));
+      }
+    }
+  }
+}
+
+/**
+ * Lowest and highest value of such columns; the highest so that steps become whole numbers of `levels`, if they can.
+ *
+ * @param {PackedColumns[]} all
+ * @param {number} levels
+ */
+function span(all, levels) {
+  let [low, high, step] = [Infinity, -Infinity, Infinity];
+  for (const columns of all) {
+    const [least, most] = range(columns);
+    low = Math.min(low, least * columns.step);
+    high = Math.max(high, most * columns.step);
+    step = Math.min(step, columns.step);
+  }
+  return low > high ? [0, 1] : [low, Math.max(high, low + levels * step)];
+}
+
+/**
+ * The value that the integer `limit` stands for: for as many steps, if none is larger.
+ *
+ * @param {PackedColumns[]} all
+ * @param {number} limit
+ */
+function largest(all, limit) {
+  let [most, step] = [0, Infinity];
+  for (const columns of new Set(all)) {
+    most = Math.max(most, ...range(columns).map((integer) => Math.abs(integer * columns.step)));
+    step = Math.min(step, columns.step);
+  }
+  return most === 0 ? 1 : Math.max(most, limit * step);
+}
+
+/**
+ * Smallest and largest integer.
+ *
+ * @param {PackedColumns} packed
+ */
+function range({ columns, offsets }) {
+  const n = columns.length / offsets.length;
+  let [low, high] = [Infinity, -Infinity];
+  for (let c = 0; c < offsets.length; c++) {
+    for (let i = c * n; i < (c + 1) * n; i++) {
+      const integer = offsets[c] + columns[i];
+      if (integer < low) low = integer;
+      if (integer > high) high = integer;
+    }
+  }
+  return n ? [low, high] : [0, 0];
+}
+
+/**
+ * @param {Packed} sh
+ * @param {number} layer
+ * @param {number} count
+ * @returns {Float32Array} [count, 2·layer + 1, 3]
+ */
+function bandValues(sh, layer, count) {
+  const width = 3 * (2 * layer + 1);
+  const values = new Float32Array(width * count);
+  putBand(sh, places(values, width, 0, width), 0, (value) => value);
+  return values;
+}
+
+/**
+ * @param {PackedTile} tile
+ * @param {Header} header
+ * @param {(splat: number, w: number, x: number, y: number, z: number) => void} put
+ */
+function eachQuat(tile, header, put) {
+  const quats = new Float32Array(4 * tile.count);
+  putQuats(tile.quats, header, places(quats, 4, 0, 4), 0, (value) => value);
+  for (let i = 0; i < tile.count; i++) put(i, quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]);
+}
+
+/**
+ * Call with the column of each splat's smallest scale, to be read as zero.
+ *
+ * @param {PackedTile} tile
+ * @param {(splat: number, column: number) => void} put
+ */
+function flatten({ count, scales: { columns, offsets } }, put) {
+  for (let i = 0; i < count; i++) {
+    const scales = offsets.map((offset, c) => offset + columns[c * count + i]);
+    put(i, scales.indexOf(Math.min(...scales)));
+  }
+}
+
+const float = new Float32Array(1);
+const floatBits = new Uint32Array(float.buffer);
+const SHARED_SCALES = Float64Array.from({ length: 32 }, (_, exponent) => 255 * 2 ** (15 - exponent));
+
+/** Bits of the float16 nearest to a number. @param {number} value */
+export function half(value) {
+  float[0] = value;
+  const sign = (floatBits[0] >>> 16) & 0x8000;
+  const magnitude = Math.abs(float[0]);
+  if (!(magnitude < 65520)) return sign | 0x7c00;
+  // Multiples of 2^-24 where float16 has no exponent of its own any more
+  if (magnitude < 2 ** -14) return sign | roundEven(magnitude * 2 ** 24);
+  const bits = floatBits[0] & 0x7fffffff;
+  return sign | ((bits + 0xfff + ((bits >>> 13) & 1) - 0x38000000) >>> 13);
+}
+
+/** @param {number} value */
+function roundEven(value) {
+  const low = Math.floor(value);
+  const over = value - low;
+  return over > 0.5 || (over === 0.5 && low % 2 === 1) ? low + 1 : low;
+}
+
+/**
+ * Three numbers of 8 bits with signs and one exponent. Spark's own encoder takes the exponent below the largest of them,
+ * and so cuts what exceeds the power of two.
+ *
+ * @param {number} r
+ * @param {number} g
+ * @param {number} b
+ */
+export function sharedExponent(r, g, b) {
+  const x = Math.abs(r);
+  const y = Math.abs(g);
+  const z = Math.abs(b);
+  float[0] = x > y ? (x > z ? x : z) : y > z ? y : z;
+  const bits = floatBits[0];
+  const above = (bits >>> 23) - 112 + ((bits & 0x7fffff) > 0 ? 1 : 0); // the power of two not below it, plus 15
+  const exponent = above < 0 ? 0 : above > 31 ? 31 : above;
+  const scale = SHARED_SCALES[exponent];
+  const signs = (r < 0 ? 1 : 0) | (g < 0 ? 2 : 0) | (b < 0 ? 4 : 0);
+  const high = (exponent << 3) | signs;
+  return (sharedByte(x, scale) | (sharedByte(y, scale) << 8) | (sharedByte(z, scale) << 16) | (high << 24)) >>> 0;
+}
+
+/**
+ * @param {number} value
+ * @param {number} scale
+ */
+function sharedByte(value, scale) {
+  const byte = (value * scale + 0.5) | 0;
+  return byte > 255 ? 255 : byte;
+}
+
+/**
+ * A rotation as an axis on an octahedron, and an angle.
+ *
+ * @param {number} w at least 0
+ * @param {number} x
+ * @param {number} y
+ * @param {number} z
+ * @param {number} axisBits of each of two numbers
+ * @param {number} angleBits
+ */
+export function octahedral(w, x, y, z, axisBits, angleBits) {
+  const norm = Math.sqrt(x * x + y * y + z * z);
+  const sum = Math.abs(x) + Math.abs(y) + Math.abs(z);
+  let u = norm < 1e-6 ? 1 : x / sum;
+  let v = norm < 1e-6 ? 0 : y / sum;
+  if (z < 0 && norm >= 1e-6) {
+    const before = u;
+    u = (1 - Math.abs(v)) * (u >= 0 ? 1 : -1);
+    v = (1 - Math.abs(before)) * (v >= 0 ? 1 : -1);
+  }
+  const most = 2 ** axisBits - 1;
+  const angle = Math.round((2 * Math.atan2(norm, w) * (2 ** angleBits - 1)) / Math.PI);
+  const axis = (Math.round((0.5 * v + 0.5) * most) << axisBits) | Math.round((0.5 * u + 0.5) * most);
+  return ((angle << (2 * axisBits)) | axis) >>> 0;
+}

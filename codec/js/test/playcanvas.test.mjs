@@ -1,0 +1,79 @@
+// The textures of PlayCanvas' adapter hold the numbers of the form 'floats'.
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { CsplatReader } from '../decoder.mjs';
+import { imagesOf } from '../engines/playcanvas-textures.mjs';
+import { manifest, vector } from './helpers.mjs';
+
+const fit = Math.fround;
+const valid = manifest.filter(({ name }) => /^(valid|render).*(rich|combined_tiles|codebook|sparse|opacities|quats|tiles)/.test(name));
+
+/** Splats as the shaders read them. */
+function readerOf({ images, parameters }) {
+  const texel = ({ width, height, texels }, x, y = 0) => {
+    assert.ok(x < width && y < height, `texel ${x}, ${y} of ${width}, ${height}`);
+    return texels.subarray(4 * (y * width + x), 4 * (y * width + x) + 4);
+  };
+  const at = (image, i) => texel(image, i % image.width, Math.floor(i / image.width));
+  const { csShape, csOther, csLows, csSteps } = parameters;
+  return {
+    mean(i, c) {
+      const mean = at(images.csMeans, i);
+      const tile = at(images.csTiles, mean[3]);
+      return tile[c] + fit(mean[c] * tile[3]);
+    },
+    scale: (i, c) => (at(images.csShapes, i)[c] + csShape[0]) * csShape[1],
+    alpha: (i) => (at(images.csShapes, i)[3] / csShape[2]) ** (csShape[3] ? 2 : 1),
+    quat: (i, c) => (at(images.csQuats, i)[c] + csOther[2]) * csOther[3],
+    colour: (i, c) => (at(images.csColours, i)[c] + csOther[0]) * csOther[1],
+    sh(i, band, m, c) {
+      const image = images[`csBand${band}`];
+      const line = image.width / (2 * band + 1);
+      const row = at(images.csRows, i)[band - 1];
+      return (texel(image, (row % line) * (2 * band + 1) + m, Math.floor(row / line))[c] + csLows[band - 1]) * csSteps[band - 1];
+    },
+  };
+}
+
+for (const { name } of valid) {
+  test(`${name}: textures stand for its numbers`, async () => {
+    const reader = await CsplatReader.open(new Blob([vector(name)]));
+    const { header } = reader;
+    const tiles = [];
+    for (const { index } of header.tiles) tiles.push(await reader.readTile(index, { form: 'packed' }));
+    const made = imagesOf(header, tiles, header.shDegree, 64); // many rows of few entries
+    const splat = readerOf(made);
+    for (const { index, first, corner, extent, step } of header.tiles) {
+      const floats = await reader.readTile(index);
+      const near = (found, wanted, off, what) => assert.ok(Math.abs(found - wanted) <= off, `${what}: ${found}, ${wanted}`);
+      for (let i = 0; i < floats.count; i++) {
+        for (let c = 0; c < 3; c++) {
+          const mean = floats.means[3 * i + c];
+          assert.equal(made.centers[3 * (first + i) + c], mean);
+          near(splat.mean(first + i, c), mean, (Math.abs(corner[c]) + extent[c]) * step * 2 ** -22, 'mean');
+          const value = (found, wanted, what) => near(found, wanted, Math.abs(wanted) * 2 ** -22 + 2 ** -31 * 100, what);
+          value(splat.scale(first + i, c), floats.scales[3 * i + c], 'scale');
+          value(splat.quat(first + i, c), floats.quats[4 * i + 1 + c], 'quat');
+          value(splat.colour(first + i, c), floats.sh0[3 * i + c], 'colour');
+          for (let band = 1, k = 0; band <= header.shDegree; band++) {
+            for (let m = 0; m <= 2 * band; m++, k++) {
+              const terms = (header.shDegree + 1) ** 2 - 1;
+              value(splat.sh(first + i, band, m, c), floats.shN[3 * (terms * i + k) + c], 'sh');
+            }
+          }
+        }
+        near(splat.alpha(first + i), floats.opacities[i], 1e-7, 'alpha');
+      }
+    }
+  });
+}
+
+test('texels are as narrow as the scene allows, and tables lie there once', async () => {
+  const reader = await CsplatReader.open(new Blob([vector('valid/codebook_sh_1_3')]));
+  const tile = await reader.readTile(0, { form: 'packed' });
+  const { images } = imagesOf(reader.header, [tile], 3, 4096);
+  assert.ok(images.csColours.texels instanceof Uint8Array);
+  const entries = 1 + tile.sh[0].lookup.table.columns.length / 9 + tile.sh[0].rows.length;
+  assert.ok(images.csBand1.width * images.csBand1.height < 3 * entries + images.csBand1.width);
+});
