@@ -13,6 +13,7 @@ import { onceSaid, uprightIn } from './unpack.mjs';
  * @typedef {import('./playcanvas-textures.mjs').Image} Image
  */
 
+const WORKERS = 2;
 const say = onceSaid('csplat in PlayCanvas');
 
 const BANDS = [1, 2, 3];
@@ -228,7 +229,9 @@ export class CsplatParser {
     const { signal } = options;
     const degree = Math.min(shDegree ?? header.shDegree, header.shDegree);
     const tiles = [];
-    for (const { index } of header.tiles) tiles.push(await reader.readTile(index, { form: 'packed', shDegree: degree, signal }));
+    for await (const tile of reader.readTiles({ form: 'packed', shDegree: degree, workers: WORKERS, signal })) {
+      tiles[tile.index] = tile;
+    }
     const { metadata } = await reader.describe({ signal });
     const { graphicsDevice: device, scene } = this.app;
     const made = imagesOf(header, tiles, degree, device.maxTextureSize);
