@@ -86,9 +86,9 @@ EDITS: Final = (
         "chunks unused",
         "chunks of the directory are opened where they are read",
         "CHK-2",
-        "decoder.mjs",
-        "for (const place of places) {",
-        "for (const place of places.filter(({ type }) => type in spec.CHUNK_NAMES)) {",
+        "reader.mjs",
+        "for (const [place, chunk] of chunks) if (!",
+        "for (const [place, chunk] of chunks) if (place.type in spec.CHUNK_NAMES && !",
     ),
     Edit(
         "tails of payloads", "a payload may go on", "TLE-3", "payload.mjs", "if (this.left) throw", "if (false) throw"
