@@ -39,14 +39,15 @@ export class FloatArrays {
   constructor(count, shDegree, spare = {}) {
     const room = (/** @type {string} */ name, /** @type {number} */ length) => {
       const buffer = spare[name]?.buffer;
-      return buffer && buffer.byteLength >= 4 * length ? new Float32Array(buffer, 0, length) : new Float32Array(length);
+      if (buffer === undefined || buffer.byteLength < 4 * length) return new Float32Array(length);
+      return new Float32Array(buffer, 0, length).fill(0);
     };
     this.means = room('means', 3 * count);
     this.quats = room('quats', 4 * count);
     this.scales = room('scales', 3 * count);
     this.opacities = room('opacities', count);
     this.sh0 = room('sh0', 3 * count);
-    this.shN = room('shN', 3 * count * shRows(shDegree)).fill(0); // "coefficients of a band left out are +0"
+    this.shN = room('shN', 3 * count * shRows(shDegree)); // "coefficients of a band left out are +0"
     this.shDegree = shDegree;
   }
 

@@ -91,6 +91,7 @@ export class CompiledDecoder {
     this.exports = /** @type {Exports} */ (/** @type {unknown} */ (exports));
     /** @type {Set<number>} */
     this.seen = new Set();
+    this.isBroken = false;
     /** @type {Map<string, PackedColumns>} entries of codebooks by id and band */
     this.codebooks = new Map();
   }
@@ -102,19 +103,28 @@ export class CompiledDecoder {
    * @param {Parts} parts what may be read
    * @param {Set<number>} checked gets the offsets of those that were read, unless something was refused
    * @param {(decoder: CompiledDecoder) => T} decode
-   * @returns {T}
+   * @returns {T | null} null where it broke down
    */
   reading(parts, checked, decode) {
+    if (this.isBroken) return null;
     this.parts = parts;
-    const made = decode(this);
-    if (made) for (const offset of this.seen) checked.add(offset);
-    this.parts = new Map();
-    this.seen.clear();
-    return made;
+    try {
+      const made = decode(this);
+      if (made) for (const offset of this.seen) checked.add(offset);
+      return made;
+    } catch (error) {
+      if (!(error instanceof WebAssembly.RuntimeError)) throw error;
+      this.isBroken = true; // a trap: its memory may hold anything
+      return null;
+    } finally {
+      this.parts = new Map();
+      this.seen.clear();
+    }
   }
 
   /** Forget the file. Nothing may be called after it. */
   close() {
+    if (this.isBroken) return;
     this.exports.close();
     this.codebooks.clear();
     spare = new WeakRef(this);

@@ -74,3 +74,15 @@ test('a page that forbids WebAssembly has no such decoder', async () => {
     }
   }
 });
+
+test('a decoder that breaks down is not used again', async () => {
+  const file = vector('valid/rich');
+  const reader = await CsplatReader.open(file.buffer);
+  const { compiled } = reader;
+  compiled.exports = { ...compiled.exports, read_tile: () => { throw new WebAssembly.RuntimeError('unreachable'); } };
+  const tile = await reader.readTile(0);
+  assert.ok(compiled.isBroken);
+  compiled.close();
+  assert.notEqual((await CsplatReader.open(file.buffer)).compiled, compiled);
+  assert.deepEqual(tile, await (await CsplatReader.open(file.buffer)).readTile(0));
+});
