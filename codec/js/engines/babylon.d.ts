@@ -1,31 +1,22 @@
 // Types of the plugin for Babylon.js. To import the module registers it.
 
 import type { AssetContainer } from '@babylonjs/core/assetContainer.js';
+import type { IFileRequest } from '@babylonjs/core/Misc/fileRequest.js';
 import type { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js';
 import type { Scene } from '@babylonjs/core/scene.js';
-
-/** What stands in `metadata.csplat` of a mesh. */
-export interface SplatMetadata {
-  /** Letters of the directions of +x, +y, +z, or empty where they are not known. */
-  axes: string;
-  antialiased: boolean;
-  /** What the positions are relative to. */
-  origin: number[];
-  /** Metres per unit, 0 where unknown. */
-  unitMetres: number;
-  /** The direction that is up, where the metadata has it. */
-  up: number[] | null;
-  metadata: Record<string, unknown> | null;
-}
+import type { LoadOptions, SceneFacts } from './options.d.ts';
 
 /** `pluginOptions: { csplat: … }` of the scene loader. */
-export interface CSPLATLoadingOptions {
+export interface CSPLATLoadingOptions extends LoadOptions {
   /** As GaussianSplattingMesh has it. */
   keepInRam?: boolean;
 }
 
+/** `dispose(false, true)` frees it with its material. */
+export type CSPLATMesh = GaussianSplattingMesh & { metadata: { csplat: SceneFacts } };
+
 export interface CSPLATImport {
-  meshes: GaussianSplattingMesh[];
+  meshes: CSPLATMesh[];
   particleSystems: never[];
   skeletons: never[];
   animationGroups: never[];
@@ -35,13 +26,25 @@ export interface CSPLATImport {
   spriteManagers: never[];
 }
 
-/** The plugin. A file's `CsplatError` is the `innerError` of what the scene loader rejects with. */
+/**
+ * The plugin. Disposal of scene or mesh and `signal` end a load. A file's `CsplatError` is the `innerError` of what the scene
+ * loader rejects with.
+ */
 export class CSPLATFileLoader {
   constructor(options?: CSPLATLoadingOptions);
   readonly name: 'csplat';
   readonly extensions: { '.csplat': { isBinary: true; mimeType: 'model/vnd.csplat' } };
   createPlugin(options: { csplat?: CSPLATLoadingOptions }): CSPLATFileLoader;
-  importMeshAsync(names: unknown, scene: Scene, data: ArrayBuffer | Uint8Array<ArrayBuffer>): Promise<CSPLATImport>;
-  loadAsync(scene: Scene, data: ArrayBuffer | Uint8Array<ArrayBuffer>): Promise<void>;
-  loadAssetContainerAsync(scene: Scene, data: ArrayBuffer | Uint8Array<ArrayBuffer>): Promise<AssetContainer>;
+  loadFile(
+    scene: Scene,
+    from: string | Blob | ArrayBufferView<ArrayBuffer>,
+    rootUrl: string,
+    onSuccess: (opened: unknown) => void,
+    onProgress?: (event: { lengthComputable: boolean; loaded: number; total: number }) => void,
+    asArrayBuffer?: boolean,
+    onError?: (request?: undefined, error?: any) => void,
+  ): IFileRequest;
+  importMeshAsync(names: unknown, scene: Scene, opened: unknown): Promise<CSPLATImport>;
+  loadAsync(scene: Scene, opened: unknown): Promise<void>;
+  loadAssetContainerAsync(scene: Scene, opened: unknown): Promise<AssetContainer>;
 }

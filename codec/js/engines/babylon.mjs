@@ -1,4 +1,4 @@
-// A plugin of Babylon.js's scene loader for .csplat; to import this module registers it.
+// A plugin of Babylon.js's scene loader for .csplat; to import this module registers it. See babylon.d.ts.
 //
 //   import 'csplat-decoder/babylon';
 //   const { meshes: [splats] } = await ImportMeshAsync('scene.csplat', scene);
@@ -7,30 +7,29 @@ import { AssetContainer } from '@babylonjs/core/assetContainer.js';
 import { RegisterSceneLoaderPlugin } from '@babylonjs/core/Loading/sceneLoader.js';
 import { Matrix, Quaternion } from '@babylonjs/core/Maths/math.vector.js';
 import { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js';
+import { Observable } from '@babylonjs/core/Misc/observable.js';
 
-import { CsplatReader } from '../decoder.mjs';
-import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putQuats, upOf, uprightIn } from './unpack.mjs';
+import { openScene } from './scene.mjs';
+import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './unpack.mjs';
 
 const NAME = 'csplat';
 const ROW_BYTES = 32; // centre and scales as float32, colour, alpha and rotation as bytes
 const SH_BYTES = 16; // of a splat in one texture
 const SH_ZERO = 128;
-const WORKERS = 2; // as many as the decoder uses at most
-
-const say = onceSaid('csplat for Babylon.js');
 
 /**
  * @typedef {import('@babylonjs/core/scene.js').Scene} Scene
- * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('./babylon.d.ts').CSPLATLoadingOptions} CSPLATLoadingOptions
+ * @typedef {import('./scene.mjs').SplatScene} SplatScene
  */
 
-/** The plugin. `keepInRam` as GaussianSplattingMesh has it. */
+/** The plugin. */
 export class CSPLATFileLoader {
-  /** @param {{keepInRam?: boolean}} [options] */
-  constructor({ keepInRam = false } = {}) {
+  /** @param {CSPLATLoadingOptions} [options] */
+  constructor(options = {}) {
     this.name = NAME;
     this.extensions = { '.csplat': { isBinary: true, mimeType: 'model/vnd.csplat' } };
-    this.keepInRam = keepInRam;
+    this.options = options;
   }
 
   /** @param {Record<string, any>} options of all plugins, by their names */
@@ -39,33 +38,66 @@ export class CSPLATFileLoader {
   }
 
   /**
+   * Open a file, which importMeshAsync reads then, piece after piece.
+   *
+   * @param {Scene} scene
+   * @param {string | Blob | ArrayBufferView<ArrayBuffer>} from
+   * @param {string} _rootUrl
+   * @param {(opened: SplatScene) => void} onSuccess
+   * @param {(event: {lengthComputable: boolean, loaded: number, total: number}) => void} [onProgress]
+   * @param {boolean} [_asArrayBuffer]
+   * @param {(request?: undefined, error?: unknown) => void} [onError]
+   */
+  loadFile(scene, from, _rootUrl, onSuccess, onProgress, _asArrayBuffer, onError) {
+    const { keepInRam, ...options } = this.options;
+    const controller = new AbortController();
+    const abort = () => controller.abort();
+    if (options.signal?.aborted) abort();
+    options.signal?.addEventListener('abort', abort, { once: true });
+    const request = { onCompleteObservable: new Observable(), abort };
+    const observer = scene.onDisposeObservable.addOnce(abort);
+    const progress = (/** @type {number} */ loaded, /** @type {number} */ total) => {
+      options.onProgress?.(loaded, total);
+      onProgress?.({ lengthComputable: total > 0, loaded, total });
+    };
+    const engine = scene.useRightHandedSystem ? /** @type {const} */ ('RUB') : 'RUF';
+    const source = typeof from === 'string' || from instanceof Blob ? from : new Blob([from]);
+    const given = { ...options, signal: controller.signal, onProgress: progress };
+    openScene(source, given, { name: 'csplat for Babylon.js', engine, mirrors: true })
+      .then(onSuccess, (error) => onError?.(undefined, error))
+      .finally(() => {
+        observer.remove();
+        request.onCompleteObservable.notifyObservers(request);
+      });
+    return request;
+  }
+
+  /**
    * @param {unknown} _names
    * @param {Scene} scene
-   * @param {ArrayBuffer | Uint8Array<ArrayBuffer>} data a file
+   * @param {SplatScene} opened
    */
-  async importMeshAsync(_names, scene, data) {
-    const reader = await CsplatReader.open(data instanceof ArrayBuffer ? data : new Blob([data]));
-    const { metadata } = await reader.describe();
-    const { rows, sh } = await arraysOf(reader, scene.getEngine().getCaps().maxTextureSize);
-    const meshes = [await meshOf(scene, reader.header, metadata, rows, sh, this.keepInRam)];
+  async importMeshAsync(_names, scene, opened) {
+    const observer = scene.onDisposeObservable.addOnce(() => opened.abort());
+    const meshes = [await meshOf(scene, opened, this.options.keepInRam).finally(() => observer.remove())];
     const none = { particleSystems: [], skeletons: [], animationGroups: [], transformNodes: [] };
     return { meshes, ...none, geometries: [], lights: [], spriteManagers: [] };
   }
 
   /**
    * @param {Scene} scene
-   * @param {ArrayBuffer | Uint8Array<ArrayBuffer>} data
+   * @param {SplatScene} opened
    */
-  async loadAsync(scene, data) {
-    await this.importMeshAsync(null, scene, data);
+  async loadAsync(scene, opened) {
+    await this.importMeshAsync(null, scene, opened);
   }
 
   /**
    * @param {Scene} scene
-   * @param {ArrayBuffer | Uint8Array<ArrayBuffer>} data
+   * @param {SplatScene} opened
    */
-  async loadAssetContainerAsync(scene, data) {
-    const { meshes } = await this.importMeshAsync(null, scene, data);
+  async loadAssetContainerAsync(scene, opened) {
+    const { meshes } = await this.importMeshAsync(null, scene, opened);
     const container = new AssetContainer(scene);
     container.meshes.push(...meshes);
     container.removeAllFromScene();
@@ -74,70 +106,105 @@ export class CSPLATFileLoader {
 }
 
 /**
- * What a mesh is filled with: a row for each splat, and the textures of SH.
- *
- * @param {CsplatReader} reader
- * @param {number} width of textures
- */
-async function arraysOf(reader, width) {
-  const { header } = reader;
-  const { splatCount: count, shDegree } = header;
-  const rows = new ArrayBuffer(ROW_BYTES * count);
-  const numbers = places(new Float32Array(rows), ROW_BYTES / 4, 0, 6);
-  const bytes = places(new Uint8ClampedArray(rows), ROW_BYTES, 24, 8);
-  const [centreAt, scalesAt] = [numbers.slice(0, 3), numbers.slice(3)];
-  const [colourAt, alphaAt, quatAt] = [bytes.slice(0, 3), bytes.slice(3, 4), bytes.slice(4)];
-  const values = 3 * ((shDegree + 1) ** 2 - 1);
-  const textureBytes = SH_BYTES * width * (Math.floor(count / width) + 1); // a splat more than there are, as the mesh has it
-  const sh = Array.from({ length: Math.ceil(values / SH_BYTES) }, () => new Uint8Array(textureBytes).fill(SH_ZERO));
-  const clamped = sh.map(({ buffer }) => new Uint8ClampedArray(buffer));
-  const shAt = Array.from({ length: values }, (_, value) => ({
-    ...{ array: clamped[Math.floor(value / SH_BYTES)], stride: SH_BYTES, start: value % SH_BYTES },
-  }));
-  const alpha = alphaOf(header);
-  const signed = (/** @type {number} */ value) => 127.5 * value + 127.5;
-  for await (const tile of reader.readTiles({ form: 'packed', workers: WORKERS })) {
-    const { first } = header.tiles[tile.index];
-    putColumns(tile.means, centreAt, first, (value) => value);
-    putColumns(tile.scales, scalesAt, first, Math.exp);
-    putBand(tile.sh0, colourAt, first, (value) => 255 * displayColour(value));
-    putColumns(tile.opacities, alphaAt, first, (q) => 255 * alpha(q));
-    putQuats(tile.quats, header, quatAt, first, signed);
-    for (const [i, band] of tile.sh.entries()) {
-      if (band) putBand(band, shAt.slice(3 * ((i + 1) ** 2 - 1), 3 * ((i + 2) ** 2 - 1)), first, signed);
-    }
-  }
-  return { rows, sh };
-}
-
-/**
  * @param {Scene} scene
- * @param {Header} header
- * @param {Record<string, unknown> | null} metadata
- * @param {ArrayBuffer} rows
- * @param {Uint8Array[]} sh
- * @param {boolean} keepInRam
+ * @param {SplatScene} opened
+ * @param {boolean} [keepInRam]
  */
-async function meshOf(scene, header, metadata, rows, sh, keepInRam) {
-  const { axes, antialiased, origin, unitMetres, shDegree, extras } = header;
+async function meshOf(scene, opened, keepInRam = false) {
+  const { header, upright: [a, b, c] } = opened; // prettier-ignore
+  const width = scene.getEngine().getCaps().maxTextureSize;
+  const degree = opened.progressive ? 0 : opened.degree;
+  const bands = new Bands(header.splatCount, degree, width);
+  const rows = await rowsOf(opened, bands);
   if (scene.isDisposed) throw new Error('the scene was disposed of before its splats had come');
   const mesh = new GaussianSplattingMesh('GaussianSplatting', null, scene, keepInRam);
+  mesh.onDisposeObservable.addOnce(() => opened.abort());
   try {
-    if (antialiased) /** @type {any} */ (mesh.material).compensation = true;
-    await mesh.updateDataAsync(rows, sh.length > 0 ? sh : undefined, undefined, shDegree);
-    const [a, b, c] = uprightIn(header, metadata, scene.useRightHandedSystem ? 'RUB' : 'RUF');
+    if (header.antialiased) /** @type {any} */ (mesh.material).compensation = true;
+    await mesh.updateDataAsync(rows, bands.textures, undefined, degree);
     // Babylon's vectors are rows: column by column.
     const upright = Matrix.FromValues(a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1);
     mesh.rotationQuaternion = new Quaternion();
     upright.decompose(mesh.scaling, mesh.rotationQuaternion);
     mesh.computeWorldMatrix(true);
-    mesh.metadata = { csplat: { axes, antialiased, origin, unitMetres, up: upOf(metadata), metadata } };
+    mesh.metadata = { csplat: opened.facts(() => addBands(mesh, rows, opened, width), undefined) };
   } catch (error) {
     mesh.dispose(false, true); // with its material
     throw error;
   }
-  if (extras.length > 0) say('extra columns are left out');
   return mesh;
 }
+
+/**
+ * @param {SplatScene} opened
+ * @param {Bands} bands
+ * @returns {Promise<ArrayBuffer>} a row for each splat
+ */
+async function rowsOf(opened, bands) {
+  const { header } = opened;
+  const rows = new ArrayBuffer(ROW_BYTES * header.splatCount);
+  const floats = new Float32Array(rows);
+  const numbers = places(floats, ROW_BYTES / 4, 0, 6);
+  const bytes = places(new Uint8ClampedArray(rows), ROW_BYTES, 24, 8);
+  const [centreAt, scalesAt] = [numbers.slice(0, 3), numbers.slice(3)];
+  const [colourAt, alphaAt, quatAt] = [bytes.slice(0, 3), bytes.slice(3, 4), bytes.slice(4)];
+  const alpha = alphaOf(header);
+  for await (const tile of opened.tiles()) {
+    const { first } = tile;
+    putColumns(tile.means, centreAt, first, (value) => value);
+    putColumns(tile.scales, scalesAt, first, Math.exp);
+    if (header.flat) eachThinnest(tile, (i, c) => (floats[(ROW_BYTES / 4) * (first + i) + 3 + c] = 0));
+    putBand(tile.sh0, colourAt, first, (value) => 255 * displayColour(value));
+    putColumns(tile.opacities, alphaAt, first, (q) => 255 * alpha(q));
+    putQuats(tile.quats, header, quatAt, first, signed);
+    for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
+  }
+  return rows;
+}
+
+/**
+ * @param {GaussianSplattingMesh} mesh
+ * @param {ArrayBuffer} rows
+ * @param {SplatScene} opened
+ * @param {number} width of textures
+ */
+async function addBands(mesh, rows, opened, width) {
+  const bands = new Bands(opened.header.splatCount, opened.degree, width);
+  for (let layer = 1; layer <= opened.degree; layer++) {
+    for await (const { sh, first } of opened.bands(layer)) bands.put(layer, sh, first);
+  }
+  await mesh.updateDataAsync(rows, bands.textures, undefined, opened.degree);
+}
+
+/** SH in bytes, as textures. */
+class Bands {
+  /**
+   * @param {number} count
+   * @param {number} degree
+   * @param {number} width of textures
+   */
+  constructor(count, degree, width) {
+    const values = 3 * ((degree + 1) ** 2 - 1);
+    const size = SH_BYTES * width * (Math.floor(count / width) + 1); // a splat more than there are, as the mesh has it
+    const textures = Array.from({ length: Math.ceil(values / SH_BYTES) }, () => new Uint8Array(size).fill(SH_ZERO));
+    this.textures = textures.length > 0 ? textures : undefined;
+    const clamped = textures.map(({ buffer }) => new Uint8ClampedArray(buffer));
+    this.places = Array.from({ length: values }, (_, value) => ({
+      ...{ array: clamped[Math.floor(value / SH_BYTES)], stride: SH_BYTES, start: value % SH_BYTES },
+    }));
+  }
+
+  /**
+   * @param {number} layer
+   * @param {import('../decoder.d.ts').Packed} band
+   * @param {number} first splat
+   */
+  put(layer, band, first) {
+    putBand(band, this.places.slice(3 * (layer ** 2 - 1), 3 * ((layer + 1) ** 2 - 1)), first, signed);
+  }
+}
+
+/** In bytes, −1 to 1. @param {number} value */
+const signed = (value) => 127.5 * value + 127.5;
 
 RegisterSceneLoaderPlugin(new CSPLATFileLoader());

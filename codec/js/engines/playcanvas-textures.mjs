@@ -14,16 +14,15 @@ import { places, putColumns } from './unpack.mjs';
  */
 
 /**
+ * Geometry and base colours.
+ *
  * @param {Header} header
  * @param {PackedTile[]} tiles all of them
- * @param {number} shDegree
  * @param {number} maxSize of a texture
  */
-export function imagesOf(header, tiles, shDegree, maxSize) {
+export function imagesOf(header, tiles, maxSize) {
   const count = header.splatCount;
-  const width = Math.max(1, Math.ceil(Math.sqrt(count)));
-  const height = Math.max(1, Math.ceil(count / width));
-  const image = (/** @type {number} */ bits) => ({ width, height, texels: arrayOf(bits, 4 * width * height) });
+  const image = (/** @type {number} */ bits) => imageOf(count, bits);
   const of = (/** @type {'scales' | 'sh0'} */ name) => latticeOf(tiles.map((tile) => tile[name]));
   const opacity = /** @type {AttributeRecord} */ (header.attributes.find(({ name }) => name === 'opacities'));
   const quat = /** @type {AttributeRecord} */ (header.attributes.find(({ name }) => name === 'quats'));
@@ -51,23 +50,49 @@ export function imagesOf(header, tiles, shDegree, maxSize) {
     putElements({ ...tile.quats, step: 1 }, images.csQuats.texels, first, quats);
     putElements(tile.sh0, images.csColours.texels, first, colours);
   }
-  /** @type {ReturnType<typeof bandOf>[]} */
-  const bands = [];
-  for (let layer = 1; layer <= shDegree; layer++) bands.push(bandOf(header, tiles, layer, maxSize));
-  for (const [i, band] of bands.entries()) images[`csBand${i + 1}`] = band.image;
-  if (bands.length) {
-    const rows = image(bitsFor(Math.max(...bands.map(({ size }) => size))));
-    for (const [band, { index }] of bands.entries()) for (let i = 0; i < count; i++) rows.texels[4 * i + band] = index[i];
-    images.csRows = rows;
-  }
-  const lattice = (/** @type {number} */ i) => bands[i]?.lattice ?? { low: 0, step: 0 };
   const parameters = {
     csShape: [scales.low, scales.step, opacity.levels, opacity.mapping === 'square' ? 1 : 0],
     csOther: [colours.low, colours.step, quats.low, 1 / (quat.levels * Math.SQRT2)],
+    csLows: [0, 0, 0, header.flat ? 1 : 0],
+    csSteps: [0, 0, 0, 0],
+  };
+  return { images, parameters, centers };
+}
+
+/**
+ * SH bands. Takes the place of some parameters.
+ *
+ * @param {Header} header
+ * @param {(Packed | null | undefined)[][]} layers a list for each band, tile after tile
+ * @param {number} maxSize of a texture
+ */
+export function bandImagesOf(header, layers, maxSize) {
+  const bands = layers.map((tiles, i) => bandOf(header, tiles, i + 1, maxSize));
+  /** @type {Record<string, Image>} */
+  const images = {};
+  for (const [i, band] of bands.entries()) images[`csBand${i + 1}`] = band.image;
+  images.csRows = imageOf(header.splatCount, bitsFor(Math.max(...bands.map(({ size }) => size))));
+  const { texels } = images.csRows;
+  for (const [band, { index }] of bands.entries()) for (let i = 0; i < index.length; i++) texels[4 * i + band] = index[i];
+  const lattice = (/** @type {number} */ i) => bands[i]?.lattice ?? { low: 0, step: 0 };
+  const parameters = {
     csLows: [lattice(0).low, lattice(1).low, lattice(2).low, header.flat ? 1 : 0],
     csSteps: [lattice(0).step, lattice(1).step, lattice(2).step, 0],
   };
-  return { images, parameters, centers };
+  return { images, parameters };
+}
+
+/**
+ * A texel for each splat.
+ *
+ * @param {number} count
+ * @param {number} bits
+ * @returns {Image}
+ */
+function imageOf(count, bits) {
+  const width = Math.max(1, Math.ceil(Math.sqrt(count)));
+  const height = Math.max(1, Math.ceil(count / width));
+  return { width, height, texels: arrayOf(bits, 4 * width * height) };
 }
 
 /**
@@ -89,13 +114,12 @@ function tileTable(tiles, maxSize) {
  * An SH band: what its splats have, once for each entry of a codebook, and a row of it for each splat.
  *
  * @param {Header} header
- * @param {PackedTile[]} tiles
+ * @param {(Packed | null | undefined)[]} bands tile after tile
  * @param {number} layer
  * @param {number} maxSize
  */
-function bandOf(header, tiles, layer, maxSize) {
+function bandOf(header, bands, layer, maxSize) {
   const terms = 2 * layer + 1;
-  const bands = tiles.map(({ sh }) => sh[layer - 1]);
   const tables = new Set(bands.flatMap((band) => (band?.lookup ? [band.lookup.table] : [])));
   const direct = bands.flatMap((band) => band ?? []);
   const lattice = latticeOf([...tables, ...direct], true);

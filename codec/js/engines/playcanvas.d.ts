@@ -1,16 +1,11 @@
 // Types of the adapter for PlayCanvas.
 import type { AppBase, Asset, Entity, GSplatResourceBase } from 'playcanvas';
-import type { Header, ReaderOptions } from '../decoder.d.ts';
+import type { LoadOptions, SceneFacts } from './options.d.ts';
 
-export interface ParserOptions extends ReaderOptions {
-  /** SH bands above this degree are not fetched. */
-  shDegree?: number;
-}
-
-/** What `asset.resource` is. The integers of the file lie in textures; `destroy`, of the engine, frees them. */
+/** What `asset.resource` is. The integers of the file lie in textures; `destroy`, of the engine, frees them and ends a load. */
 export interface CsplatResource extends GSplatResourceBase {
-  csplat: { header: Header; metadata: Record<string, unknown> | null };
-  /** Turn an entity so that the scene stands upright, by its axes and `up` of the metadata. */
+  csplat: SceneFacts;
+  /** Turn an entity so that the scene stands upright, by its axes and `up` of the metadata, and draw it again once it is complete. */
   stand(entity: Entity): void;
 }
 
@@ -20,7 +15,7 @@ export interface CsplatResource extends GSplatResourceBase {
  * `app.scene.gsplat.antiAlias`.
  */
 export class CsplatParser {
-  constructor(app: AppBase, options?: ParserOptions);
+  constructor(app: AppBase, options?: LoadOptions);
   canParse(context: { ext: string }): boolean;
   load(url: { load: string }, callback: (error: unknown, resource?: CsplatResource) => void, asset?: Asset): void;
   open(url: string, data: unknown): unknown;

@@ -3,18 +3,18 @@
 
 import * as pc from 'playcanvas';
 
-import { CsplatReader } from '../decoder.mjs';
-import { imagesOf } from './playcanvas-textures.mjs';
-import { onceSaid, uprightIn } from './unpack.mjs';
+import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
+import { openScene } from './scene.mjs';
+import { onceSaid } from './unpack.mjs';
 
 /**
- * @typedef {import('../decoder.d.ts').Header} Header
- * @typedef {import('./playcanvas.d.ts').ParserOptions} ParserOptions
+ * @typedef {import('../decoder.d.ts').Packed} Packed
+ * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
  * @typedef {import('./playcanvas-textures.mjs').Image} Image
+ * @typedef {import('./scene.mjs').SplatScene} SplatScene
  */
 
-const WORKERS = 2;
-const say = onceSaid('csplat in PlayCanvas');
+const NAME = 'csplat in PlayCanvas';
 
 const BANDS = [1, 2, 3];
 const AXES = 'xyz';
@@ -125,28 +125,65 @@ ${BANDS.map((band) => {
 class CsplatResource extends pc.GSplatResourceBase {
   /**
    * @param {object} device
-   * @param {Header} header
-   * @param {Record<string, unknown> | null} metadata
-   * @param {number} shBands
+   * @param {SplatScene} scene
    * @param {ReturnType<typeof imagesOf>} made
    * @param {object} options
    */
-  constructor(device, header, metadata, shBands, { images, parameters, centers }, options) {
-    const { tiles, splatCount: numSplats } = header;
+  constructor(device, scene, { images, parameters, centers }, options) {
+    const { tiles, splatCount: numSplats } = scene.header;
     const box = (/** @type {'min' | 'max'} */ side) =>
       new pc.Vec3(...[0, 1, 2].map((axis) => Math[side](...tiles.map((tile) => tile[side][axis]))));
-    const calcAabb = (/** @type {any} */ aabb) => tiles.length && aabb.setMinMax(box('min'), box('max'));
-    super(device, { numSplats, shBands, getCenters: () => centers, calcAabb }, options);
-    this.csplat = { header, metadata };
-    const streams = [];
+    const [low, high] = [box('min'), box('max')];
+    if (scene.mirrored) [low.x, high.x] = [-high.x, -low.x];
+    const calcAabb = (/** @type {any} */ aabb) => tiles.length && aabb.setMinMax(low, high);
+    super(device, { numSplats, shBands: 0, getCenters: () => centers, calcAabb }, options);
+    this.scene = scene;
+    /** @type {{name: string, format: number}[]} */
+    this.described = [];
+    /** @type {Set<import('playcanvas').Entity>} */
+    this.entities = new Set();
+    /** @type {import('./options.d.ts').SceneFacts | null} */
+    this.csplat = null;
+    this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
+    this.add(images, parameters, 0);
+  }
+
+  /**
+   * @param {Record<string, Image>} images
+   * @param {Record<string, number[]>} parameters
+   * @param {number} degree that is there now
+   */
+  add(images, parameters, degree) {
+    const { device } = this;
     for (const [name, { width, height, texels }] of Object.entries(images)) {
       const format = formatOf(texels);
       this.streams.textures.set(name, pc.Texture.createDataTexture2D(device, name, width, height, format, [texels]));
-      streams.push({ name, format });
+      this.described.push({ name, format });
     }
-    this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
-    this._format = new pc.GSplatFormat(device, streams, { readGLSL: GLSL, readWGSL: WGSL });
+    this.gsplatData.shBands = degree;
+    this._format = new pc.GSplatFormat(device, this.described, { readGLSL: GLSL, readWGSL: WGSL });
     for (const [name, value] of Object.entries(parameters)) this.parameters.set(name, value);
+  }
+
+  /** Of a progressive load. */
+  async addBands() {
+    const { scene } = this;
+    const layers = [];
+    for (let layer = 1; layer <= scene.degree; layer++) {
+      /** @type {(Packed | undefined)[]} */
+      const bands = [];
+      for await (const { index, sh } of scene.bands(layer)) bands[index] = sh;
+      layers.push(Array.from(scene.header.tiles, ({ index }) => bands[index]));
+    }
+    this.addImages(layers);
+    for (const { gsplat } of this.entities) if (gsplat) gsplat.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
+  }
+
+  /** @param {Parameters<typeof bandImagesOf>[1]} layers */
+  addImages(layers) {
+    if (layers.length === 0) return;
+    const { images, parameters } = bandImagesOf(this.scene.header, layers, this.device.maxTextureSize);
+    this.add(images, parameters, layers.length);
   }
 
   /** @param {Map<string, unknown>} defines */
@@ -160,14 +197,17 @@ class CsplatResource extends pc.GSplatResourceBase {
 
   /** @param {import('playcanvas').Entity} entity */
   stand(entity) {
-    const { header, metadata } = this.csplat;
-    const [a, b, c] = uprightIn(header, metadata, 'RUB');
-    const left = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0]) < 0; // prettier-ignore
-    if (left) say(`axes ${header.axes} are left-handed, and splats are not mirrored here: left and right are exchanged`);
-    const x = left ? -1 : 1;
+    const [a, b, c] = this.scene.upright;
     const matrix = new pc.Mat4();
-    matrix.data.set([x * a[0], x * b[0], x * c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1]);
+    matrix.data.set([a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1]);
     entity.setLocalRotation(new pc.Quat().setFromMat4(matrix));
+    this.entities.add(entity);
+  }
+
+  destroy() {
+    this.scene.abort();
+    this.entities.clear();
+    super.destroy();
   }
 }
 
@@ -181,7 +221,7 @@ function formatOf(texels) {
 export class CsplatParser {
   /**
    * @param {import('playcanvas').AppBase} app
-   * @param {ParserOptions} [options]
+   * @param {LoadOptions} [options]
    */
   constructor(app, options = {}) {
     this.app = app;
@@ -218,34 +258,25 @@ export class CsplatParser {
    * @param {import('playcanvas').Asset} [asset]
    */
   async read(from, asset) {
-    const { shDegree, ...options } = this.options;
+    const { graphicsDevice: device, scene: world } = this.app;
     /** @type {(received: number, size: number) => void} */
     const onProgress = (received, size) => {
-      options.onProgress?.(received, size);
+      this.options.onProgress?.(received, size);
       asset?.fire('progress', received, size);
     };
-    const reader = await CsplatReader.open(from, { ...options, onProgress });
-    const { header } = reader;
-    const { signal } = options;
-    const degree = Math.min(shDegree ?? header.shDegree, header.shDegree);
+    const scene = await openScene(from, { ...this.options, onProgress }, { name: NAME, engine: 'RUB', mirrors: false });
+    const { header } = scene;
+    /** @type {import('../decoder.d.ts').PackedTile[]} */
     const tiles = [];
-    for await (const tile of reader.readTiles({ form: 'packed', shDegree: degree, workers: WORKERS, signal })) {
-      tiles[tile.index] = tile;
+    for await (const tile of scene.tiles()) tiles[tile.index] = tile;
+    if (header.antialiased && !world?.gsplat?.antiAlias) {
+      onceSaid(NAME, 'trained with opacity compensation: set app.scene.gsplat.antiAlias = true');
     }
-    const { metadata } = await reader.describe({ signal });
-    const { graphicsDevice: device, scene } = this.app;
-    const made = imagesOf(header, tiles, degree, device.maxTextureSize);
-    tell(header, scene);
-    const prepareCenters = scene?.gsplatCentersEnabled !== false;
-    return new CsplatResource(device, header, metadata, degree, made, { prepareCenters });
+    const prepareCenters = world?.gsplatCentersEnabled !== false;
+    const resource = new CsplatResource(device, scene, imagesOf(header, tiles, device.maxTextureSize), { prepareCenters });
+    const degree = scene.progressive ? 0 : scene.degree;
+    resource.addImages(Array.from({ length: degree }, (_, i) => tiles.map(({ sh }) => sh[i])));
+    resource.csplat = scene.facts(() => resource.addBands(), undefined);
+    return resource;
   }
-}
-
-/**
- * @param {Header} header
- * @param {import('playcanvas').AppBase['scene']} scene
- */
-function tell({ antialiased, extras }, scene) {
-  if (antialiased && !scene?.gsplat?.antiAlias) say('trained with opacity compensation: set app.scene.gsplat.antiAlias = true');
-  if (extras.length) say(`extra columns are not drawn: ${extras.map(({ name }) => name).join(', ')}`);
 }

@@ -1,12 +1,13 @@
 // The words that Spark's splats are made of, from packed tiles. Without the engine, so that they can be tested.
 
-import { alphaOf, displayColour, places, putBand, putColumns, putQuats } from './unpack.mjs';
+import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './unpack.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Header} Header
  * @typedef {import('../decoder.d.ts').Packed} Packed
  * @typedef {import('../decoder.d.ts').PackedColumns} PackedColumns
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
+ * @typedef {import('./scene.mjs').Band} Band
  * @typedef {{rgbMin: number, rgbMax: number, lnScaleMin: number, lnScaleMax: number, sh1Max: number, sh2Max: number, sh3Max: number}} SplatEncoding
  */
 
@@ -36,20 +37,16 @@ export function halvesSuffice({ tiles }) {
 
 /** Arrays of ExtSplats: float32 centres, float16 colours, alphas and logarithms of scales, 32 bits of rotation. */
 export class ExtWords {
-  /**
-   * @param {Header} header
-   * @param {number} shDegree
-   */
-  constructor(header, shDegree) {
+  /** @param {Header} header */
+  constructor(header) {
     this.header = header;
-    const length = 4 * paddedCount(header.splatCount);
-    const words = () => new Uint32Array(length);
-    this.extArrays = /** @type {[Uint32Array, Uint32Array]} */ ([words(), words()]);
+    this.extArrays = /** @type {[Uint32Array, Uint32Array]} */ ([this.words(), this.words()]);
     /** @type {Record<string, Uint32Array>} */
     this.extra = {};
-    if (shDegree > 0) this.extra.sh1 = words();
-    if (shDegree > 1) this.extra.sh2 = words();
-    if (shDegree > 2) Object.assign(this.extra, { sh3a: words(), sh3b: words() });
+  }
+
+  words() {
+    return new Uint32Array(4 * paddedCount(this.header.splatCount));
   }
 
   /**
@@ -65,27 +62,35 @@ export class ExtWords {
     putColumns(tile.opacities, places(a, 4, 3, 1), first, (q) => half(alpha(q)));
     putColumns(tile.sh0, places(halves, 8, 0), first, (sh0) => half(displayColour(sh0)));
     putColumns(tile.scales, places(halves, 8, 3), first, half);
-    if (header.flat) flatten(tile, (i, c) => (halves[8 * (first + i) + 3 + c] = half(LN_SCALE_ZERO)));
+    if (header.flat) eachThinnest(tile, (i, c) => (halves[8 * (first + i) + 3 + c] = half(LN_SCALE_ZERO)));
     eachQuat(tile, header, (i, w, x, y, z) => (b[4 * (first + i) + 3] = octahedral(w, x, y, z, 10, 12)));
-    for (const [i, sh] of tile.sh.entries()) if (sh) this.putBand(i + 1, sh, tile.count, first);
+  }
+
+  /**
+   * Those of a layer one after the other, lower layers first.
+   *
+   * @param {number} layer
+   * @param {Band[]} bands
+   */
+  addBands(layer, bands) {
+    for (const name of [['sh1'], ['sh2'], ['sh3a', 'sh3b']][layer - 1]) this.extra[name] = this.words();
+    for (const band of bands) this.putBand(layer, band);
   }
 
   /**
    * @param {number} layer
-   * @param {Packed} sh
-   * @param {number} count
-   * @param {number} first splat
+   * @param {Band} band
    */
-  putBand(layer, sh, count, first) {
+  putBand(layer, { first, count, sh }) {
     const { sh1, sh2, sh3a, sh3b } = this.extra;
-    const places = [
+    const targets = [
       [[sh1, 0], [sh1, 1], [sh1, 2]],
       [[sh1, 3], [sh2, 0], [sh2, 1], [sh2, 2], [sh2, 3]],
       [[sh3a, 0], [sh3a, 1], [sh3a, 2], [sh3a, 3], [sh3b, 0], [sh3b, 1], [sh3b, 2]],
     ][layer - 1]; // prettier-ignore
     const values = bandValues(sh, layer, count);
-    for (const [m, [array, word]] of /** @type {[Uint32Array, number][]} */ (places).entries()) {
-      for (let i = 0, at = 3 * m, to = 4 * first + word; i < count; i++, at += 3 * places.length, to += 4) {
+    for (const [m, [array, word]] of /** @type {[Uint32Array, number][]} */ (targets).entries()) {
+      for (let i = 0, at = 3 * m, to = 4 * first + word; i < count; i++, at += 3 * targets.length, to += 4) {
         array[to] = sharedExponent(values[at], values[at + 1], values[at + 2]);
       }
     }
@@ -96,24 +101,17 @@ export class ExtWords {
 export class PackedWords {
   /**
    * @param {Header} header
-   * @param {number} shDegree
    * @param {PackedTile[]} tiles all of them, for their ranges
    */
-  constructor(header, shDegree, tiles) {
+  constructor(header, tiles) {
     this.header = header;
-    const room = paddedCount(header.splatCount);
-    this.packedArray = new Uint32Array(4 * room);
+    this.packedArray = new Uint32Array(4 * paddedCount(header.splatCount));
     /** @type {Record<string, Uint32Array>} */
     this.extra = {};
-    for (let layer = 1; layer <= shDegree; layer++) this.extra[`sh${layer}`] = new Uint32Array(SH_WORDS[layer - 1] * room);
     const [rgbMin, rgbMax] = span(tiles.map(({ sh0 }) => sh0), 255).map(displayColour); // prettier-ignore
     const [lnScaleMin, lnScaleMax] = span(tiles.map(({ scales }) => scales), 254); // prettier-ignore
-    const most = [1, 2, 3].map((layer) => {
-      const bands = tiles.flatMap(({ sh }) => sh[layer - 1] ?? []);
-      return largest(bands.flatMap((band) => [band, ...(band.lookup ? [band.lookup.table] : [])]), 2 ** (SH_BITS[layer - 1] - 1) - 1); // prettier-ignore
-    });
     /** @type {SplatEncoding} */
-    this.splatEncoding = { rgbMin, rgbMax, lnScaleMin, lnScaleMax, sh1Max: most[0], sh2Max: most[1], sh3Max: most[2] };
+    this.splatEncoding = { rgbMin, rgbMax, lnScaleMin, lnScaleMax, sh1Max: 1, sh2Max: 1, sh3Max: 1 };
   }
 
   /**
@@ -130,7 +128,7 @@ export class PackedWords {
     putColumns(tile.means, places(new Uint16Array(packedArray.buffer), 8, 2), first, half);
     const perScale = 254 / (lnScaleMax - lnScaleMin);
     putColumns(tile.scales, places(bytes, 16, 12), first, (scale) => Math.max(1, 1 + (scale - lnScaleMin) * perScale));
-    if (header.flat) flatten(tile, (i, c) => (bytes[16 * (first + i) + 12 + c] = 0));
+    if (header.flat) eachThinnest(tile, (i, c) => (bytes[16 * (first + i) + 12 + c] = 0));
     eachQuat(tile, header, (i, w, x, y, z) => {
       const word = octahedral(w, x, y, z, 8, 8);
       const at = 16 * (first + i);
@@ -138,22 +136,29 @@ export class PackedWords {
       bytes[at + 11] = (word >>> 8) & 255;
       bytes[at + 15] = (word >>> 16) & 255;
     });
-    for (const [i, sh] of tile.sh.entries()) if (sh) this.putBand(i + 1, sh, tile.count, first);
   }
 
   /**
-   * @param {number} layer
-   * @param {Packed} sh
-   * @param {number} count
-   * @param {number} first splat
+   * @param {1 | 2 | 3} layer
+   * @param {Band[]} bands all of them, for their range
    */
-  putBand(layer, sh, count, first) {
+  addBands(layer, bands) {
+    const columns = bands.flatMap(({ sh }) => [sh, ...(sh.lookup ? [sh.lookup.table] : [])]);
+    this.splatEncoding[`sh${layer}Max`] = largest(columns, 2 ** (SH_BITS[layer - 1] - 1) - 1);
+    this.extra[`sh${layer}`] = new Uint32Array(SH_WORDS[layer - 1] * paddedCount(this.header.splatCount));
+    for (const band of bands) this.putBand(layer, band);
+  }
+
+  /**
+   * @param {1 | 2 | 3} layer
+   * @param {Band} band
+   */
+  putBand(layer, { first, count, sh }) {
     const values = bandValues(sh, layer, count);
     const width = 3 * (2 * layer + 1);
     const bits = SH_BITS[layer - 1];
     const limit = 2 ** (bits - 1) - 1;
-    const encoding = this.splatEncoding;
-    const scale = limit / [encoding.sh1Max, encoding.sh2Max, encoding.sh3Max][layer - 1];
+    const scale = limit / this.splatEncoding[`sh${layer}Max`];
     const out = this.extra[`sh${layer}`];
     const words = SH_WORDS[layer - 1];
     for (let i = 0; i < count; i++) {
@@ -239,19 +244,6 @@ function eachQuat(tile, header, put) {
   const quats = new Float32Array(4 * tile.count);
   putQuats(tile.quats, header, places(quats, 4, 0, 4), 0, (value) => value);
   for (let i = 0; i < tile.count; i++) put(i, quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]);
-}
-
-/**
- * Call with the column of each splat's smallest scale, to be read as zero.
- *
- * @param {PackedTile} tile
- * @param {(splat: number, column: number) => void} put
- */
-function flatten({ count, scales: { columns, offsets } }, put) {
-  for (let i = 0; i < count; i++) {
-    const scales = offsets.map((offset, c) => offset + columns[c * count + i]);
-    put(i, scales.indexOf(Math.min(...scales)));
-  }
 }
 
 const float = new Float32Array(1);

@@ -2,84 +2,107 @@
 
 import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';
 
-import { CsplatReader } from '../decoder.mjs';
+import { openScene } from './scene.mjs';
 import { ExtWords, PackedWords, halvesSuffice } from './spark-words.mjs';
-import { onceSaid, uprightIn } from './unpack.mjs';
+import { onceSaid } from './unpack.mjs';
 
 /**
- * @typedef {import('../decoder.d.ts').Header} Header
- * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
- * @typedef {import('./spark.d.ts').LoadOptions} LoadOptions
+ * @typedef {import('./options.d.ts').SceneSource} SceneSource
+ * @typedef {import('./scene.mjs').Band} Band
+ * @typedef {import('./scene.mjs').SplatScene} SplatScene
+ * @typedef {import('./spark.d.ts').SparkOptions} SparkOptions
  */
 
-const say = onceSaid('csplat in Spark');
+const NAME = 'csplat in Spark';
+const LAYERS = /** @type {const} */ ([1, 2, 3]);
 
 /**
- * @param {Parameters<typeof CsplatReader.open>[0]} from
- * @param {LoadOptions} [options]
+ * @param {SceneSource} from
+ * @param {SparkOptions} [options]
  */
-export async function loadCsplat(from, { layout, shDegree, ...options } = {}) {
-  const reader = await CsplatReader.open(from, options);
-  const { header } = reader;
-  const degree = Math.min(shDegree ?? header.shDegree, header.shDegree);
-  const { signal } = options;
-  const read = (/** @type {number} */ index) => reader.readTile(index, { form: 'packed', shDegree: degree, signal });
-  const { metadata } = await reader.describe({ signal });
+export async function loadCsplat(from, { layout, ...options } = {}) {
+  const scene = await openScene(from, options, { name: NAME, engine: 'RUB', mirrors: false });
+  const { header } = scene;
   const make = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed' ? packed : ext;
-  const mesh = await make(header, degree, read);
-  place(mesh, header, metadata);
-  tell(header);
+  const { splats, words, mesh } = await make(scene);
+  turn(mesh, scene.upright);
+  mesh.userData.csplat = scene.facts(() => addBands(scene, splats, words, mesh), undefined);
+  const dispose = mesh.dispose.bind(mesh);
+  mesh.dispose = () => {
+    scene.abort();
+    dispose();
+  };
+  if (!header.antialiased) {
+    onceSaid(NAME, 'trained without opacity compensation: give SparkRenderer { preBlurAmount: 0.3, blurAmount: 0 }');
+  }
   return mesh;
 }
 
-/**
- * @param {Header} header
- * @param {number} degree
- * @param {(index: number) => Promise<PackedTile>} read
- */
-async function ext(header, degree, read) {
-  const words = new ExtWords(header, degree);
-  for (const { index, first } of header.tiles) words.put(await read(index), first);
-  const { extArrays, extra } = words;
-  return new SplatMesh({ extSplats: new ExtSplats({ extArrays, extra, numSplats: header.splatCount }) });
-}
-
-/**
- * @param {Header} header
- * @param {number} degree
- * @param {(index: number) => Promise<PackedTile>} read
- */
-async function packed(header, degree, read) {
-  const tiles = [];
-  for (const { index } of header.tiles) tiles.push(await read(index));
-  const words = new PackedWords(header, degree, tiles);
-  for (const { index, first } of header.tiles) words.put(tiles[index], first);
-  const { packedArray, extra, splatEncoding } = words;
-  const packedSplats = new PackedSplats({ packedArray, extra, numSplats: header.splatCount, splatEncoding });
-  return new SplatMesh({ packedSplats, splatEncoding }); // which it would replace by its own
-}
-
-/**
- * Stand a mesh upright.
- *
- * @param {SplatMesh} mesh
- * @param {Header} header
- * @param {Record<string, unknown> | null} metadata
- */
-function place(mesh, header, metadata) {
-  const [a, b, c] = uprightIn(header, metadata, 'RUB');
-  const left = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0]) < 0;
-  if (left) say(`axes ${header.axes} are left-handed, and Spark does not mirror splats: left and right are exchanged`);
-  const x = left ? -1 : 1;
-  mesh.matrix.set(x * a[0], a[1], a[2], 0, x * b[0], b[1], b[2], 0, x * c[0], c[1], c[2], 0, 0, 0, 0, 1);
-  mesh.quaternion.setFromRotationMatrix(mesh.matrix);
-  mesh.userData.csplat = { header, metadata };
-}
-
-/** @param {Header} header */
-function tell({ antialiased, extras }) {
-  if (!antialiased) {
-    say('trained without opacity compensation: give SparkRenderer { preBlurAmount: 0.3, blurAmount: 0 }');
+/** Float32 centres. @param {SplatScene} scene */
+async function ext(scene) {
+  const { header } = scene;
+  const words = new ExtWords(header);
+  /** @type {Band[][]} */
+  const bands = [[], [], []];
+  for await (const tile of scene.tiles()) {
+    words.put(tile, tile.first);
+    keepBands(bands, tile);
   }
-  if (extras.length) say(`extra columns are not drawn: ${extras.map(({ name }) => name).join(', ')}`);
+  if (!scene.progressive) for (const layer of LAYERS.slice(0, scene.degree)) words.addBands(layer, bands[layer - 1]);
+  const { extArrays, extra } = words;
+  const splats = new ExtSplats({ extArrays, extra, numSplats: header.splatCount });
+  return { splats, words, mesh: new SplatMesh({ extSplats: splats }) };
+}
+
+/** Float16 centres. @param {SplatScene} scene */
+async function packed(scene) {
+  const { header } = scene;
+  const tiles = [];
+  /** @type {Band[][]} */
+  const bands = [[], [], []];
+  for await (const tile of scene.tiles()) {
+    tiles.push(tile);
+    keepBands(bands, tile);
+  }
+  const words = new PackedWords(header, tiles);
+  for (const tile of tiles) words.put(tile, tile.first);
+  if (!scene.progressive) for (const layer of LAYERS.slice(0, scene.degree)) words.addBands(layer, bands[layer - 1]);
+  const { packedArray, extra, splatEncoding } = words;
+  const splats = new PackedSplats({ packedArray, extra, numSplats: header.splatCount, splatEncoding });
+  return { splats, words, mesh: new SplatMesh({ packedSplats: splats, splatEncoding }) }; // it would take its own encoding
+}
+
+/**
+ * @param {Band[][]} bands
+ * @param {import('../decoder.d.ts').PackedTile & {first: number}} tile
+ */
+function keepBands(bands, { sh, first, count }) {
+  for (const [i, band] of sh.entries()) if (band) bands[i].push({ first, count, sh: band });
+}
+
+/**
+ * Of a progressive load.
+ *
+ * @param {SplatScene} scene
+ * @param {ExtSplats | PackedSplats} splats
+ * @param {ExtWords | PackedWords} words
+ * @param {SplatMesh} mesh
+ */
+async function addBands(scene, splats, words, mesh) {
+  for (const layer of LAYERS.slice(0, scene.degree)) {
+    const bands = [];
+    for await (const band of scene.bands(layer)) bands.push(band);
+    words.addBands(layer, bands);
+  }
+  splats.extra = words.extra;
+  mesh.updateGenerator();
+}
+
+/**
+ * @param {SplatMesh} mesh
+ * @param {number[][]} upright
+ */
+function turn(mesh, [a, b, c]) {
+  mesh.matrix.set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
+  mesh.quaternion.setFromRotationMatrix(mesh.matrix);
 }

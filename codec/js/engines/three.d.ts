@@ -1,28 +1,22 @@
 // Types of the loader for three.js.
 
 import type { BufferGeometry, Loader, LoadingManager, Matrix4 } from 'three';
+import type { LoadOptions, SceneFacts } from './options.d.ts';
 
-/** What stands in `userData` of a geometry. */
-export interface SplatUserData {
-  /** Letters of the directions of +x, +y, +z, or empty where they are not known. */
-  axes: string;
-  antialiased: boolean;
-  /** What the positions are relative to. */
-  origin: number[];
-  /** Metres per unit, 0 where unknown. */
-  unitMetres: number;
-  /** The direction that is up, where the metadata has it. */
-  up: number[] | null;
-  metadata: Record<string, unknown> | null;
-  /** Stands the object upright: `splats.applyMatrix4(geometry.userData.upright)`. */
-  upright: Matrix4;
-}
+export type { LoadOptions };
 
-export type SplatGeometry = BufferGeometry & { userData: SplatUserData };
+export type SplatGeometry = BufferGeometry & {
+  userData: {
+    /** `complete` resolves to the geometry with SH: the same one, or after a progressive load another one, for a new
+     * GaussianSplat. `upright` stands the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. */
+    csplat: SceneFacts<SplatGeometry> & { upright: Matrix4 };
+  };
+};
 
 /** Loads `.csplat` as the geometry that `GaussianSplat` of three/addons takes. Errors of a file are `CsplatError`s. */
 export class CSPLATLoader extends Loader<SplatGeometry> {
   constructor(manager?: LoadingManager);
+  setOptions(options: LoadOptions): this;
   load(
     url: string,
     onLoad: (geometry: SplatGeometry) => void,

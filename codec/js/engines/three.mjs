@@ -1,19 +1,25 @@
-// A loader for three.js: what its own loaders of splats give, from a .csplat.
+// A loader for three.js: what its own loaders of splats give, from a .csplat. See three.d.ts.
 //
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');
 //   const splats = new GaussianSplat(geometry); // of three/addons/objects/GaussianSplat.js
-//   splats.applyMatrix4(geometry.userData.upright);
+//   splats.applyMatrix4(geometry.userData.csplat.upright);
 
 import { BufferAttribute, BufferGeometry, Loader, Matrix4 } from 'three';
 
-import { CsplatReader } from '../decoder.mjs';
-import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances, upOf, uprightIn } from './unpack.mjs';
+import { openScene } from './scene.mjs';
+import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './unpack.mjs';
 
+/**
+ * @typedef {import('../decoder.d.ts').ByteSource} ByteSource
+ * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
+ * @typedef {import('./options.d.ts').SceneSource} SceneSource
+ * @typedef {import('./scene.mjs').SplatScene} SplatScene
+ */
+
+const NAME = 'CSPLATLoader';
+const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true };
 const SH_WORDS = [0, 3, 4, 6]; // of a splat in a band, four coefficients each
 const SH_ZERO = 0x80808080;
-const WORKERS = 2; // as many as the decoder uses at most
-
-const say = onceSaid('CSPLATLoader');
 
 /** Loads splats as the geometry that GaussianSplat takes. */
 export class CSPLATLoader extends Loader {
@@ -21,6 +27,14 @@ export class CSPLATLoader extends Loader {
   constructor(manager) {
     super(manager);
     this.controller = new AbortController();
+    /** @type {LoadOptions} */
+    this.options = {};
+  }
+
+  /** @param {LoadOptions} options */
+  setOptions(options) {
+    this.options = options;
+    return this;
   }
 
   /**
@@ -30,18 +44,17 @@ export class CSPLATLoader extends Loader {
    * @param {(error: unknown) => void} [onError]
    */
   load(url, onLoad, onProgress, onError) {
-    const { manager } = this;
+    const { manager, options } = this;
     const address = manager.resolveURL((this.path ?? '') + url);
-    const signals = [this.controller.signal, manager.abortController?.signal].filter((one) => one !== undefined);
-    const signal = typeof AbortSignal.any === 'function' ? AbortSignal.any(signals) : signals[0];
     const { requestHeader: headers, priority, cache } = /** @type {any} */ (this);
-    const progress = (/** @type {number} */ loaded, /** @type {number} */ total) =>
+    const progress = (/** @type {number} */ loaded, /** @type {number} */ total) => {
+      options.onProgress?.(loaded, total);
       onProgress?.(new ProgressEvent('progress', { lengthComputable: total > 0, loaded, total }));
+    };
     const credentials = this.withCredentials ? 'include' : 'same-origin';
-    const request = { headers, credentials, priority, cache };
+    const request = /** @type {RequestInit} */ ({ headers, credentials, priority, cache, ...options.request });
     manager.itemStart(address);
-    CsplatReader.open(address, { request: /** @type {RequestInit} */ (request), signal, onProgress: progress })
-      .then((reader) => geometryOf(reader, signal))
+    this.read(address, { ...options, request, onProgress: progress })
       .then(onLoad)
       .catch((error) => {
         if (onError) onError(error);
@@ -59,8 +72,7 @@ export class CSPLATLoader extends Loader {
    */
   async parse(buffer, onLoad, onError) {
     try {
-      const { signal } = this.controller;
-      const geometry = await geometryOf(await CsplatReader.open(buffer, { signal }), signal);
+      const geometry = await this.read(buffer, this.options);
       onLoad?.(geometry);
       return geometry;
     } catch (error) {
@@ -75,50 +87,101 @@ export class CSPLATLoader extends Loader {
     this.controller = new AbortController();
     return this;
   }
+
+  /**
+   * @param {SceneSource} from
+   * @param {LoadOptions} options
+   */
+  async read(from, options) {
+    const signals = [this.controller.signal, this.manager.abortController?.signal, options.signal];
+    const controller = new AbortController();
+    const abort = () => controller.abort();
+    for (const signal of signals) {
+      if (signal?.aborted) abort();
+      signal?.addEventListener('abort', abort, { once: true });
+    }
+    return geometryOf(await openScene(from, { ...options, signal: controller.signal }, TARGET));
+  }
 }
 
-/**
- * @param {CsplatReader} reader
- * @param {AbortSignal} signal
- * @returns {Promise<BufferGeometry>}
- */
-async function geometryOf(reader, signal) {
-  const { header } = reader;
-  const { splatCount: count, shDegree } = header;
-  const { metadata } = await reader.describe({ signal });
+/** @param {SplatScene} scene */
+async function geometryOf(scene) {
+  const { header, upright: [a, b, c] } = scene; // prettier-ignore
+  const { splatCount: count, antialiased } = header;
   const centres = new Float32Array(3 * count);
   const covariances = new Float32Array(6 * count);
   const colours = new Uint8ClampedArray(4 * count);
-  const bands = SH_WORDS.slice(1, shDegree + 1).map((words) => new Uint32Array(words * count).fill(SH_ZERO));
+  const bands = new Bands(count, scene.progressive ? 0 : scene.degree);
   const centreAt = places(centres, 3, 0);
   const [red, green, blue, alphaAt] = places(colours, 4, 0, 4);
-  const bandAt = bands.map(({ buffer }, i) => places(new Uint8ClampedArray(buffer), 4 * SH_WORDS[i + 1], 0, 3 * (2 * i + 3)));
   const alpha = alphaOf(header);
-  const layers = Array.from({ length: shDegree + 1 }, (_, layer) => layer);
-  reader.prefetch(header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))), { signal });
-  for await (const tile of reader.readTiles({ form: 'packed', workers: WORKERS, signal })) {
-    const { first } = header.tiles[tile.index];
+  for await (const tile of scene.tiles()) {
+    const { first } = tile;
     putColumns(tile.means, centreAt, first, (value) => value);
     putCovariances(tile, header, covariances, first);
     putBand(tile.sh0, [red, green, blue], first, (value) => 255 * displayColour(value));
     putColumns(tile.opacities, [alphaAt], first, (q) => 255 * alpha(q));
-    for (const [i, band] of tile.sh.entries()) if (band) putBand(band, bandAt[i], first, (value) => 128 * value + 128);
+    for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
   }
-  signal.throwIfAborted();
+  if (!antialiased) onceSaid(NAME, 'three.js draws all splats as antialiased ones; small ones of scenes that are not come out fainter');
   const geometry = new BufferGeometry();
   geometry.setAttribute('position', new BufferAttribute(centres, 3));
   geometry.setAttribute('covariance', new BufferAttribute(covariances, 6));
   geometry.setAttribute('color', new BufferAttribute(colours, 4, true));
-  for (const [i, words] of bands.entries()) {
-    geometry.setAttribute(`sphericalHarmonics${i + 1}`, new BufferAttribute(words, SH_WORDS[i + 1]));
-  }
+  bands.addTo(geometry);
   geometry.computeBoundingBox();
   geometry.computeBoundingSphere();
-  const [a, b, c] = uprightIn(header, metadata, 'RUB');
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
-  const { axes, antialiased, origin, unitMetres } = header;
-  geometry.userData = { axes, antialiased, origin, unitMetres, up: upOf(metadata), metadata, upright };
-  if (!antialiased) say('three.js draws all splats as antialiased ones; small ones of scenes that are not come out fainter');
-  if (header.extras.length > 0) say('extra columns are left out');
+  const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
+  geometry.userData = { csplat: { ...facts, upright } };
+  geometry.addEventListener('dispose', () => scene.abort());
   return geometry;
+}
+
+/**
+ * The same splats with all bands, in a geometry of its own: GaussianSplat takes what it finds when it is made.
+ *
+ * @param {SplatScene} scene
+ * @param {BufferGeometry} base
+ */
+async function wholeOf(scene, base) {
+  const bands = new Bands(scene.header.splatCount, scene.degree);
+  for (let layer = 1; layer <= scene.degree; layer++) {
+    for await (const { sh, first } of scene.bands(layer)) bands.put(layer, sh, first);
+  }
+  const geometry = new BufferGeometry();
+  for (const [name, attribute] of Object.entries(base.attributes)) geometry.setAttribute(name, attribute);
+  bands.addTo(geometry);
+  geometry.boundingBox = base.boundingBox;
+  geometry.boundingSphere = base.boundingSphere;
+  geometry.userData = base.userData;
+  return geometry;
+}
+
+/** SH in bytes, four to a word. */
+class Bands {
+  /**
+   * @param {number} count
+   * @param {number} degree
+   */
+  constructor(count, degree) {
+    this.words = SH_WORDS.slice(1, degree + 1).map((width) => new Uint32Array(width * count).fill(SH_ZERO));
+    this.places = this.words.map(({ buffer }, i) => places(new Uint8ClampedArray(buffer), 4 * SH_WORDS[i + 1], 0, 3 * (2 * i + 3)));
+  }
+
+  /**
+   * @param {number} layer
+   * @param {import('../decoder.d.ts').Packed} band
+   * @param {number} first splat
+   */
+  put(layer, band, first) {
+    putBand(band, this.places[layer - 1], first, (value) => 128 * value + 128);
+  }
+
+  /** @param {BufferGeometry} geometry */
+  addTo(geometry) {
+    for (const [i, words] of this.words.entries()) {
+      geometry.setAttribute(`sphericalHarmonics${i + 1}`, new BufferAttribute(words, SH_WORDS[i + 1]));
+    }
+  }
 }

@@ -111,7 +111,7 @@ export function putQuats(quats, header, to, first, change) {
 /**
  * Put covariance matrices: xx, xy, xz, yy, yz, zz, beside each other.
  *
- * @param {PackedTile} tile
+ * @param {Pick<PackedTile, 'count' | 'quats' | 'scales'>} tile
  * @param {Header} header
  * @param {Float32Array} out
  * @param {number} first splat
@@ -124,6 +124,7 @@ export function putCovariances({ count, quats, scales }, header, out, first) {
     const table = tableOf(column, value, variances);
     for (let i = 0; i < count; i++) variances[c * count + i] = table ? table[column[i]] : value(column[i]);
   }
+  if (header.flat) eachThinnest({ count, scales }, (i, c) => (variances[c * count + i] = 0));
   const read = quatReader(quats, header);
   const quat = new Float64Array(4);
   for (let i = 0, at = 6 * first; i < count; i++, at += 6) {
@@ -150,6 +151,20 @@ export function putCovariances({ count, quats, scales }, header, out, first) {
     out[at + 3] = a * yx * yx + b * yy * yy + c * yz * yz;
     out[at + 4] = a * yx * zx + b * yy * zy + c * yz * zz;
     out[at + 5] = a * zx * zx + b * zy * zy + c * zz * zz;
+  }
+}
+
+/**
+ * Call with the column of each splat's smallest scale, which is to be read as zero in flat scenes.
+ *
+ * @param {Pick<PackedTile, 'count' | 'scales'>} tile
+ * @param {(splat: number, column: number) => void} put
+ */
+export function eachThinnest({ count, scales: { columns, offsets } }, put) {
+  const [a, b, c] = offsets;
+  for (let i = 0; i < count; i++) {
+    const [x, y, z] = [a + columns[i], b + columns[count + i], c + columns[2 * count + i]];
+    put(i, x <= y && x <= z ? 0 : y <= z ? 1 : 2);
   }
 }
 
@@ -184,25 +199,26 @@ export function uprightIn({ axes }, metadata, engine) {
  * @param {Record<string, unknown> | null} metadata
  * @returns {number[] | null}
  */
-export function upOf(metadata) {
+function upOf(metadata) {
   const up = metadata?.up;
   if (!Array.isArray(up) || up.length !== 3 || !up.every((one) => Number.isFinite(one))) return null;
   const length = Math.hypot(...up);
   return length > 0 && length < Infinity ? up.map((one) => one / length) : null;
 }
 
+/** @type {Set<string>} */
+const said = new Set();
+
 /**
- * What is to be said once, and no more.
+ * Say something in the console, once.
  *
- * @param {string} prefix the adapter's name
- * @returns {(text: string) => void}
+ * @param {string} name of the adapter
+ * @param {string} text
  */
-export function onceSaid(prefix) {
-  const said = new Set();
-  return (text) => {
-    if (!said.has(text)) console.warn(`${prefix}: ${text}`);
-    said.add(text);
-  };
+export function onceSaid(name, text) {
+  const line = `${name}: ${text}`;
+  if (!said.has(line)) console.warn(line);
+  said.add(line);
 }
 
 /**

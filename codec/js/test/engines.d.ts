@@ -6,6 +6,10 @@ declare module 'three' {
   }
   export class BufferGeometry {
     userData: object;
+    attributes: Record<string, BufferAttribute>;
+    boundingBox: object | null;
+    boundingSphere: object | null;
+    addEventListener(type: string, listener: () => void): void;
     setAttribute(name: string, attribute: BufferAttribute): this;
     computeBoundingBox(): void;
     computeBoundingSphere(): void;
@@ -30,9 +34,26 @@ declare module 'three' {
   }
 }
 
+declare module '@babylonjs/core/Misc/fileRequest.js' {
+  import type { Observable } from '@babylonjs/core/Misc/observable.js';
+  export interface IFileRequest {
+    onCompleteObservable: Observable<IFileRequest>;
+    abort(): void;
+  }
+}
+
+declare module '@babylonjs/core/Misc/observable.js' {
+  export class Observable<T> {
+    addOnce(listener: () => void): { remove(): void };
+    notifyObservers(value: T): void;
+  }
+}
+
 declare module '@babylonjs/core/scene.js' {
+  import type { Observable } from '@babylonjs/core/Misc/observable.js';
   export class Scene {
     isDisposed: boolean;
+    onDisposeObservable: Observable<Scene>;
     useRightHandedSystem: boolean;
     getEngine(): { getCaps(): { maxTextureSize: number } };
   }
@@ -64,6 +85,7 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
   import type { Scene } from '@babylonjs/core/scene.js';
   export class GaussianSplattingMesh {
     constructor(name: string, url: string | null, scene: Scene, keepInRam?: boolean);
+    onDisposeObservable: import('@babylonjs/core/Misc/observable.js').Observable<unknown>;
     material: object | null;
     metadata: unknown;
     rotationQuaternion: Quaternion | null;
@@ -76,9 +98,11 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
 
 declare module '@sparkjsdev/spark' {
   export class ExtSplats {
+    extra: Record<string, unknown>;
     constructor(options: { extArrays: [Uint32Array, Uint32Array]; extra: Record<string, unknown>; numSplats: number });
   }
   export class PackedSplats {
+    extra: Record<string, unknown>;
     constructor(options: {
       packedArray: Uint32Array;
       extra: Record<string, unknown>;
@@ -95,6 +119,8 @@ declare module '@sparkjsdev/spark' {
     matrix: { set(...rows: number[]): unknown };
     quaternion: { setFromRotationMatrix(matrix: unknown): unknown };
     userData: Record<string, unknown>;
+    dispose(): void;
+    updateGenerator(): void;
   }
 }
 
@@ -103,6 +129,7 @@ declare module 'playcanvas' {
   export const PIXELFORMAT_RGBA16U: number;
   export const PIXELFORMAT_RGBA32U: number;
   export const PIXELFORMAT_RGBA32F: number;
+  export const WORKBUFFER_UPDATE_ONCE: number;
   export interface Asset {
     file?: { contents?: ArrayBuffer } | null;
     fire(name: string, ...values: unknown[]): unknown;
@@ -112,10 +139,12 @@ declare module 'playcanvas' {
     scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean } };
   }
   export class Entity {
+    gsplat?: { workBufferUpdate: number };
     setLocalRotation(rotation: Quat): void;
   }
   export class Vec3 {
     constructor(...values: number[]);
+    x: number;
   }
   export class Mat4 {
     data: Float32Array;
@@ -138,6 +167,7 @@ declare module 'playcanvas' {
   }
   export class GSplatResourceBase {
     constructor(device: object, data: object, options: object);
+    device: { maxTextureSize: number };
     gsplatData: any;
     streams: { textures: Map<string, Texture>; textureDimensions: { set(x: number, y: number): unknown } };
     parameters: Map<string, unknown>;

@@ -3,6 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
+import { mirroredBand, mirroredGeometry } from '../engines/mirror.mjs';
 import { alphaOf, places, putBand, putColumns, putCovariances, putQuats, uprightIn } from '../engines/unpack.mjs';
 import { manifest, vector } from './helpers.mjs';
 
@@ -50,7 +51,7 @@ for (const { name } of valid) {
       }
       assert.deepEqual(shN.subarray(width), floats.shN);
       const out = new Float32Array(6 * (count + 1));
-      putCovariances(tile, header, out, 1);
+      putCovariances(tile, { ...header, flat: false }, out, 1);
       for (const [at, expected] of covariances(floats).entries()) {
         const [of, p] = [at - (at % 6), at % 6];
         const length = Math.max(out[6 + of], out[9 + of], out[11 + of]); // others may be what a difference leaves
@@ -59,6 +60,47 @@ for (const { name } of valid) {
     }
   });
 }
+
+for (const name of ['valid/rich', 'valid/codebook_sh_1_3', 'valid/combined_tiles']) {
+  test(`${name}: a mirror changes the signs of what is odd in x, and no more`, async () => {
+    const reader = await CsplatReader.open(new Blob([vector(name)]));
+    const { header } = reader;
+    const odd = [0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 1]; // y z x, xy yz zz xz xx, …
+    for (const { index, splatCount: count } of header.tiles) {
+      const floats = await reader.readTile(index);
+      const packed = await reader.readTile(index, { form: 'packed' });
+      const tile = mirroredGeometry(packed);
+      const [means, quats] = [new Float32Array(3 * count), new Float32Array(4 * count)];
+      putColumns(tile.means, places(means, 3, 0), 0, same);
+      putQuats(tile.quats, header, places(quats, 4, 0, 4), 0, same);
+      const signed = (values, signs) => values.map((value, i) => (signs[i % signs.length] ? -value : value) + 0);
+      assert.deepEqual(signed(means, [0]), signed(floats.means, [1, 0, 0]));
+      assert.deepEqual(signed(quats, [0]), signed(floats.quats, [0, 0, 1, 1]));
+      const terms = floats.shN.length / count / 3;
+      const shN = new Float32Array(3 * terms * count);
+      for (const [i, band] of packed.sh.entries()) {
+        if (band) putBand(mirroredBand(band, i + 1), places(shN, 3 * terms, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)), 0, same);
+      }
+      const signs = odd.slice(0, terms).flatMap((one) => [one, one, one]);
+      assert.deepEqual(signed(shN, [0]), signed(floats.shN, signs));
+      assert.deepEqual(packed.means, (await reader.readTile(index, { form: 'packed' })).means);
+    }
+  });
+}
+
+test('of flat scenes the smallest scale is zero', async () => {
+  const reader = await CsplatReader.open(new Blob([vector('valid/rich')]));
+  const tile = await reader.readTile(0, { form: 'packed' });
+  const [round, flat] = [new Float32Array(6 * tile.count), new Float32Array(6 * tile.count)];
+  putCovariances(tile, { ...reader.header, flat: false }, round, 0);
+  putCovariances(tile, { ...reader.header, flat: true }, flat, 0);
+  const { scales } = await reader.readTile(0);
+  for (let i = 0; i < tile.count; i++) {
+    const trace = (array) => array[6 * i] + array[6 * i + 3] + array[6 * i + 5];
+    const thin = Math.exp(2 * Math.min(...scales.subarray(3 * i, 3 * i + 3)));
+    assert.ok(Math.abs(trace(round) - thin - trace(flat)) <= 1e-5 * trace(round) + 1e-30, `splat ${i}`);
+  }
+});
 
 test('a scene stands upright in the axes of an engine', () => {
   const map = (axes, engine, up) => uprightIn({ axes }, { up }, engine);

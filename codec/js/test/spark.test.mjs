@@ -71,8 +71,13 @@ for (const [name, flat] of [['valid/rich', false], ['valid/codebook_sh_1_3', tru
     const header = { ...reader.header, flat };
     const tiles = [];
     for (const { index } of header.tiles) tiles.push(await reader.readTile(index, { form: 'packed' }));
-    const ext = new ExtWords(header, header.shDegree);
-    const packed = new PackedWords(header, header.shDegree, tiles);
+    const ext = new ExtWords(header);
+    const packed = new PackedWords(header, tiles);
+    for (let layer = 1; layer <= header.shDegree; layer++) {
+      const bands = header.tiles.map(({ first }, i) => ({ first, count: tiles[i].count, sh: tiles[i].sh[layer - 1] })).filter(({ sh }) => sh);
+      ext.addBands(layer, bands);
+      packed.addBands(layer, bands);
+    }
     const { rgbMin, rgbMax, lnScaleMin, lnScaleMax, ...most } = packed.splatEncoding;
     for (const { index, first } of header.tiles) {
       ext.put(tiles[index], first);

@@ -41,6 +41,6 @@ async function load(url) {
   if (!loaders[ending]) throw new Error('no loader');
   const geometry = await new loaders[ending]().loadAsync(url);
   const splats = new GaussianSplat(geometry);
-  if (geometry.userData.upright) splats.applyMatrix4(geometry.userData.upright);
+  if (geometry.userData.csplat) splats.applyMatrix4(geometry.userData.csplat.upright);
   return splats;
 }

@@ -1,0 +1,129 @@
+// A file as the adapters for engines take it: the options that they share, and its packed tiles as they come.
+
+import { CsplatReader } from '../decoder.mjs';
+import { mirroredBand, mirroredGeometry } from './mirror.mjs';
+import { onceSaid, uprightIn } from './unpack.mjs';
+
+/**
+ * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('../decoder.d.ts').Packed} Packed
+ * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
+ * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
+ * @typedef {{first: number, count: number, sh: Packed}} Band of a tile, from its first splat on
+ */
+
+const WORKERS = 2; // as many as the decoder uses at most
+const DETERMINANT_ROWS = [[1, 2], [2, 0], [0, 1]]; // prettier-ignore
+
+/**
+ * Open a file.
+ *
+ * @param {Parameters<typeof CsplatReader.open>[0]} from
+ * @param {LoadOptions} options
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean}} target the adapter's name; letters of the engine's directions
+ *   +x, +y, +z; whether it draws what a matrix mirrors
+ */
+export async function openScene(from, options, target) {
+  const { shDegree, progressive, workers, signal, ...others } = options;
+  const controller = new AbortController();
+  const abort = () => controller.abort(signal?.reason);
+  if (signal?.aborted) abort();
+  signal?.addEventListener('abort', abort, { once: true });
+  const reader = await CsplatReader.open(from, { ...others, signal: controller.signal });
+  const { metadata } = await reader.describe({ signal: controller.signal });
+  const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
+  const { extras } = reader.header;
+  if (extras.length) onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
+  return new SplatScene(reader, metadata, { degree, progressive: progressive === true && degree > 0, workers }, target, controller);
+}
+
+/** Tiles, bands and facts of a file. */
+export class SplatScene {
+  /**
+   * @param {CsplatReader} reader
+   * @param {Record<string, unknown> | null} metadata
+   * @param {{degree: number, progressive: boolean, workers?: number}} wanted
+   * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
+   * @param {AbortController} controller
+   */
+  constructor(reader, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, controller) {
+    this.reader = reader;
+    this.header = reader.header;
+    this.metadata = metadata;
+    this.degree = degree;
+    this.progressive = progressive;
+    this.workers = workers;
+    this.controller = controller;
+    const [a, b, c] = uprightIn(reader.header, metadata, engine);
+    const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
+    /** Whether splats come mirrored, −x for x, since the engine can only turn them. */
+    this.mirrored = determinant < 0 && !mirrors;
+    /** 3 × 3, by rows: stands the scene upright. */
+    this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
+  }
+
+  /** End what is under way. */
+  abort() {
+    this.controller.abort();
+  }
+
+  /**
+   * Layers from 0 on that are there when a load resolves.
+   *
+   * @returns {AsyncGenerator<PackedTile & {index: number, first: number}, void>} tiles as they are done
+   */
+  async *tiles() {
+    const { reader, header, progressive, workers } = this;
+    const { signal } = this.controller;
+    const shDegree = progressive ? 0 : this.degree;
+    this.prefetch(Array.from({ length: shDegree + 1 }, (_, layer) => layer));
+    for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
+      signal.throwIfAborted();
+      const { first } = header.tiles[tile.index];
+      if (!this.mirrored) yield { ...tile, first };
+      else {
+        const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1));
+        yield { ...mirroredGeometry(tile), sh, first };
+      }
+    }
+    signal.throwIfAborted();
+  }
+
+  /**
+   * A band of all tiles that have it, for a load that is progressive.
+   *
+   * @param {number} layer 1 to 3
+   * @returns {AsyncGenerator<Band & {index: number}, void>}
+   */
+  async *bands(layer) {
+    const { signal } = this.controller;
+    this.prefetch([layer]);
+    for (const { index, first } of this.header.tiles) {
+      const band = await this.reader.readLayer(index, layer, { form: 'packed', signal });
+      signal.throwIfAborted();
+      if (band) yield { index, first, count: band.count, sh: this.mirrored ? mirroredBand(band.sh, layer) : band.sh };
+    }
+  }
+
+  /**
+   * What stands beside the engine's object.
+   *
+   * @template T
+   * @param {(() => Promise<T>)} work puts the bands where the engine has them
+   * @param {T} done what it gives, if nothing is left to do
+   * @returns {import('./options.d.ts').SceneFacts<T>}
+   */
+  facts(work, done) {
+    const { header, metadata } = this;
+    const complete = this.progressive ? work() : Promise.resolve(done);
+    // Of those who do not wait for it nobody else would hear.
+    complete.catch((error) => this.controller.signal.aborted || console.error(error));
+    return { header, metadata, complete };
+  }
+
+  /** @param {number[]} layers */
+  prefetch(layers) {
+    const wanted = this.header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer })));
+    this.reader.prefetch(wanted, { signal: this.controller.signal });
+  }
+}
