@@ -20,6 +20,8 @@ export interface SceneFacts<T = void> {
   /** `axes`, `antialiased`, `origin` (what positions are relative to), `unitMetres`, `splatCount`, `shDegree`, … */
   header: Header;
   metadata: Record<string, unknown> | null;
+  /** A ball around most splats, as they stand upright: for a first camera. */
+  bounds: { center: number[]; radius: number };
   /** Resolves when the SH bands are there too: at once, unless the load was progressive. Disposal ends it. */
   complete: Promise<T>;
 }

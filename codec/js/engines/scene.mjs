@@ -14,6 +14,8 @@ import { onceSaid, uprightIn } from './unpack.mjs';
 
 const WORKERS = 2; // as many as the decoder uses at most
 const DETERMINANT_ROWS = [[1, 2], [2, 0], [0, 1]]; // prettier-ignore
+const SAMPLE = 1024; // splats of a tile, for the bounds
+const MOST = 0.9; // of them lie within the bounds
 
 /**
  * Open a file.
@@ -54,6 +56,8 @@ export class SplatScene {
     this.progressive = progressive;
     this.workers = workers;
     this.controller = controller;
+    /** @type {number[][]} centres of some splats */
+    this.sample = [];
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
     const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
     /** Whether splats come mirrored, −x for x, since the engine can only turn them. */
@@ -80,6 +84,7 @@ export class SplatScene {
     for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
       signal.throwIfAborted();
       const { first } = header.tiles[tile.index];
+      this.sample.push(...centresOf(tile));
       if (!this.mirrored) yield { ...tile, first };
       else {
         const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1));
@@ -114,11 +119,19 @@ export class SplatScene {
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
-    const { header, metadata } = this;
+    const { header, metadata, bounds } = this;
     const complete = this.progressive ? work() : Promise.resolve(done);
     // Of those who do not wait for it nobody else would hear.
     complete.catch((error) => this.controller.signal.aborted || console.error(error));
-    return { header, metadata, complete };
+    return { header, metadata, bounds, complete };
+  }
+
+  /** Of most splats, upright: a few far away would make it useless. */
+  get bounds() {
+    const turn = this.mirrored ? this.upright.map(([x, y, z]) => [-x, y, z]) : this.upright;
+    const centre = [0, 1, 2].map((axis) => quantile(this.sample.map((mean) => mean[axis]), 0.5)); // prettier-ignore
+    const away = this.sample.map((mean) => Math.hypot(...mean.map((value, axis) => value - centre[axis])));
+    return { center: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)), radius: quantile(away, MOST) };
   }
 
   /** @param {number[]} layers */
@@ -127,3 +140,17 @@ export class SplatScene {
     this.reader.prefetch(wanted, { signal: this.controller.signal });
   }
 }
+
+/** @param {PackedTile} tile */
+function centresOf({ count, means: { columns, offsets, step } }) {
+  const every = Math.ceil(count / SAMPLE);
+  return Array.from({ length: Math.ceil(count / every) }, (_, i) =>
+    offsets.map((offset, axis) => (offset + columns[axis * count + i * every]) * step),
+  );
+}
+
+/**
+ * @param {number[]} values
+ * @param {number} part
+ */
+const quantile = (values, part) => values.sort((a, b) => a - b)[Math.floor(part * (values.length - 1))] ?? 0;

@@ -1,0 +1,28 @@
+// babylon.mjs
+import { ArcRotateCamera } from '@babylonjs/core/Cameras/arcRotateCamera.js';
+import { Engine } from '@babylonjs/core/Engines/engine.js';
+import { ImportMeshAsync } from '@babylonjs/core/Loading/sceneLoader.js';
+import { Color4 } from '@babylonjs/core/Maths/math.color.js';
+import { Vector3 } from '@babylonjs/core/Maths/math.vector.js';
+import { Scene } from '@babylonjs/core/scene.js';
+import 'csplat-decoder/babylon'; // registers a plugin for .csplat
+
+const words = document.querySelector('#words');
+const engine = new Engine(document.querySelector('canvas'), false);
+const scene = new Scene(engine);
+scene.clearColor = new Color4(0, 0, 0, 1);
+const camera = new ArcRotateCamera('camera', 0, 0, 1, Vector3.Zero(), scene);
+camera.attachControl();
+addEventListener('resize', () => engine.resize());
+try {
+  const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
+  const onProgress = ({ loaded }) => (words.textContent = `${loaded} bytes`);
+  const { meshes: [splats] } = await ImportMeshAsync(url, scene, { onProgress });
+  const { center, radius } = splats.metadata.csplat.bounds;
+  camera.setTarget(Vector3.FromArray(center));
+  Object.assign(camera, { alpha: -Math.PI / 2, beta: 1.25, radius: 3.2 * radius, minZ: 0.01, wheelDeltaPercentage: 0.01 });
+  engine.runRenderLoop(() => scene.render());
+  words.textContent = '';
+} catch (error) {
+  words.textContent = (error.innerError ?? error).message;
+}
