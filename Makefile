@@ -12,7 +12,7 @@ FUZZED := -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-reco
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format spec sample docs bench wasm fuzz fuzz-c clean
+.PHONY: help demo examples test lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
@@ -24,6 +24,11 @@ demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
 	$(BIN)/csplat decode out/sample.csplat out/sample.ply --force
 	$(BIN)/csplat info out/sample.csplat
 	@ls -l $(SAMPLE) out/sample.csplat out/sample.ply
+
+examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in three.js, Spark, PlayCanvas, Babylon.js; needs npm
+	@mkdir -p tools/examples/public
+	$(if $(SCENE),cp "$(SCENE)",$(BIN)/csplat encode --force $(SAMPLE)) tools/examples/public/scene.csplat
+	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
 test: $(VENV)/.dev ## everything that must hold: lint, types, contracts, vectors, fuzzing, tests
 	tests/run.sh

@@ -72,7 +72,8 @@ _PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;b
 _SHOW = """async ([engine, url, camera, patience]) => {
   const { show, version } = await import(`/pages/${engine}.mjs`);
   const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
-  const shown = show(document.querySelector('canvas'), url, camera).then((world) => ({ world, version }));
+  const shown = show(document.querySelector('canvas'), url, camera)
+    .then(async ({ world, whole }) => (await whole, { world, version }));
   return Promise.race([shown, late]).catch((error) => ({ failed: String(error.message ?? error) }));
 }"""
 

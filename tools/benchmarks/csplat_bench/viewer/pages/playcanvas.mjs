@@ -4,12 +4,15 @@ import { CsplatParser } from 'csplat-decoder/playcanvas';
 import { SpzParser } from '/node_modules/playcanvas/scripts/esm/parsers/spz-parser.mjs';
 import { ZSTDDecoder } from 'three/addons/libs/zstddec.module.js';
 
-export const version = pc.version;
+export const { version } = pc;
 
-export async function show(canvas, url, camera) {
-  canvas.width = camera.width;
-  canvas.height = camera.height;
-  const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false });
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+
+export async function start(canvas, { width, height }, { webgpu = false } = {}) {
+  canvas.width = width;
+  canvas.height = height;
+  const deviceTypes = [webgpu ? 'webgpu' : 'webgl2'];
+  const device = await pc.createGraphicsDevice(canvas, { deviceTypes, antialias: false });
   const options = new pc.AppOptions();
   options.graphicsDevice = device;
   options.componentSystems = [pc.CameraComponentSystem, pc.RenderComponentSystem, pc.GSplatComponentSystem];
@@ -17,25 +20,30 @@ export async function show(canvas, url, camera) {
   const app = new pc.AppBase(canvas);
   app.init(options);
   addSpz(app);
-  app.loader.getHandler('gsplat').addParser(new CsplatParser(app));
+  const parser = new CsplatParser(app);
+  app.loader.getHandler('gsplat').addParser(parser);
   app.start();
-
-  const splats = await load(app, url);
-  app.root.addChild(splats);
-  const world = splats.findComponent('gsplat').entity.getWorldTransform().clone();
-  const flip = new pc.Mat4().setScale(1, -1, -1);
-  const view = new pc.Mat4();
-  view.data.set(camera.view);
-  const pose = flip.mul(view).mul(world.clone().invert()).invert();
   const eye = new pc.Entity();
-  eye.addComponent('camera', {
-    clearColor: new pc.Color(0, 0, 0, 1), fov: camera.fovY, nearClip: camera.near, farClip: camera.far,
-    toneMapping: pc.TONEMAP_NONE,
-  });
-  eye.setPosition(pose.getTranslation());
-  eye.setRotation(new pc.Quat().setFromMat4(pose));
+  eye.addComponent('camera', { clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE });
   app.root.addChild(eye);
-  return Array.from(world.data);
+  return {
+    show: async (url, camera, loading = {}) => {
+      parser.options = loading;
+      const asset = await loaded(app, url);
+      const splats = entityOf(asset);
+      app.root.addChild(splats);
+      const world = splats.findComponent('gsplat').entity.getWorldTransform().clone();
+      look(eye, camera, world);
+      const remove = () => {
+        splats.destroy();
+        app.assets.remove(asset);
+        asset.unload();
+      };
+      const { csplat, numSplats: count } = asset.resource;
+      return { world: Array.from(world.data), count, whole: csplat?.complete, remove };
+    },
+    close: () => app.destroy(),
+  };
 }
 
 function addSpz(app) {
@@ -48,18 +56,30 @@ function addSpz(app) {
   app.loader.getHandler('gsplat').addParser(new SpzParser(app));
 }
 
-async function load(app, url) {
-  const container = url.endsWith('.glb');
-  const asset = new pc.Asset('splats', container ? 'container' : 'gsplat', { url });
-  await new Promise((resolve, reject) => {
-    asset.once('load', resolve);
-    asset.once('error', (message) => reject(new Error(message)));
+function loaded(app, url) {
+  const asset = new pc.Asset('splats', url.endsWith('.glb') ? 'container' : 'gsplat', { url });
+  return new Promise((resolve, reject) => {
+    asset.once('load', () => resolve(asset));
+    asset.once('error', (error) => reject(error instanceof Error ? error : new Error(error)));
     app.assets.add(asset);
     app.assets.load(asset);
   });
-  if (container) return asset.resource.instantiateRenderEntity();
+}
+
+function entityOf(asset) {
+  if (asset.type === 'container') return asset.resource.instantiateRenderEntity();
   const entity = new pc.Entity();
   entity.addComponent('gsplat', { asset });
   asset.resource.stand?.(entity); // of .csplat
   return entity;
+}
+
+function look(eye, { view: columns, fovY, near, far }, world) {
+  const flip = new pc.Mat4().setScale(1, -1, -1);
+  const view = new pc.Mat4();
+  view.data.set(columns);
+  const pose = flip.mul(view).mul(world.clone().invert()).invert();
+  Object.assign(eye.camera, { fov: fovY, nearClip: near, farClip: far });
+  eye.setPosition(pose.getTranslation());
+  eye.setRotation(new pc.Quat().setFromMat4(pose));
 }

@@ -1,34 +1,54 @@
 // Spark, over three.js: its own loader, and the adapter for .csplat.
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
+import { loadCsplat } from 'csplat-decoder/spark';
 import * as THREE from 'three';
 
 export const version = '2.2';
 
-export async function show(canvas, url, camera) {
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+
+export async function start(canvas, { width, height }) {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
   renderer.setPixelRatio(1);
-  renderer.setSize(camera.width, camera.height, false);
+  renderer.setSize(width, height, false);
   renderer.setClearColor(0x000000, 1);
   const scene = new THREE.Scene();
   // Without opacity compensation, as these scenes want it, and with colours that are not cut to bytes on their way.
-  scene.add(new SparkRenderer({ renderer, preBlurAmount: 0.3, blurAmount: 0, accumExtSplats: true }));
-  const splats = await load(url);
-  scene.add(splats);
-  scene.updateMatrixWorld(true);
-  const world = splats.matrixWorld;
-  const eye = new THREE.PerspectiveCamera(camera.fovY, camera.width / camera.height, camera.near, camera.far);
-  const pose = new THREE.Matrix4().fromArray(camera.view).multiply(world.clone().invert());
-  new THREE.Matrix4().makeScale(1, -1, -1).multiply(pose).invert().decompose(eye.position, eye.quaternion, eye.scale);
+  const spark = new SparkRenderer({ renderer, preBlurAmount: 0.3, blurAmount: 0, accumExtSplats: true });
+  scene.add(spark);
+  const eye = new THREE.PerspectiveCamera(50, width / height);
   renderer.setAnimationLoop(() => renderer.render(scene, eye));
-  return world.toArray();
+  return {
+    show: async (url, camera, options = {}) => {
+      const splats = await load(url, options);
+      scene.add(splats);
+      scene.updateMatrixWorld(true);
+      look(eye, camera, splats.matrixWorld);
+      const remove = () => {
+        scene.remove(splats);
+        splats.dispose();
+      };
+      const { matrixWorld, numSplats: count, userData } = splats;
+      return { world: matrixWorld.toArray(), count, whole: userData.csplat?.complete, remove };
+    },
+    close: () => {
+      renderer.setAnimationLoop(null);
+      spark.dispose?.();
+      renderer.dispose();
+    },
+  };
 }
 
-async function load(url) {
-  if (url.endsWith('.csplat')) {
-    const { loadCsplat } = await import('csplat-decoder/spark');
-    return loadCsplat(url);
-  }
+async function load(url, options) {
+  if (url.endsWith('.csplat')) return loadCsplat(url, options);
   const mesh = new SplatMesh({ url, extSplats: true });
   await mesh.initialized;
   return mesh;
+}
+
+function look(eye, { view, fovY, near, far }, world) {
+  Object.assign(eye, { fov: fovY, near, far });
+  eye.updateProjectionMatrix();
+  const pose = new THREE.Matrix4().fromArray(view).multiply(world.clone().invert());
+  new THREE.Matrix4().makeScale(1, -1, -1).multiply(pose).invert().decompose(eye.position, eye.quaternion, eye.scale);
 }

@@ -12,35 +12,72 @@ export const version = `0.${THREE.REVISION}`;
 
 const loaders = { csplat: CSPLATLoader, ply: GaussianSplatPLYLoader, spz: SPZLoader, splat: SPLATLoader };
 
-export async function show(canvas, url, camera) {
-  const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: true, antialias: false });
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+
+export async function start(canvas, { width, height }, { webgpu = false } = {}) {
+  const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: !webgpu, antialias: false });
   renderer.setPixelRatio(1);
-  renderer.setSize(camera.width, camera.height, false);
+  renderer.setSize(width, height, false);
   renderer.setClearColor(0x000000, 1);
   renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
   await renderer.init();
-  const splats = await load(url);
   const scene = new THREE.Scene();
-  scene.add(splats);
-  scene.updateMatrixWorld(true);
-  let world;
-  splats.traverse((one) => { world = one.isGaussianSplat ? one.matrixWorld : world; });
-  const eye = new THREE.PerspectiveCamera(camera.fovY, camera.width / camera.height, camera.near, camera.far);
-  const pose = new THREE.Matrix4().fromArray(camera.view).multiply(world.clone().invert());
-  new THREE.Matrix4().makeScale(1, -1, -1).multiply(pose).invert().decompose(eye.position, eye.quaternion, eye.scale);
+  const eye = new THREE.PerspectiveCamera(50, width / height);
   renderer.setAnimationLoop(() => renderer.render(scene, eye));
-  return world.toArray();
+  return {
+    show: async (url, camera, options = {}) => {
+      let splats = await load(url, options);
+      scene.add(splats);
+      scene.updateMatrixWorld(true);
+      let inner;
+      splats.traverse((one) => { inner = one.isGaussianSplat ? one : inner; });
+      const { matrixWorld, splatGeometry } = inner;
+      look(eye, camera, matrixWorld);
+      const whole = splatGeometry.userData.csplat?.complete.then((geometry) => {
+        if (geometry === splatGeometry) return;
+        take(scene, splats);
+        scene.add((splats = standing(geometry)));
+      });
+      const remove = () => take(scene, splats);
+      return { world: matrixWorld.toArray(), count: splatGeometry.getAttribute('position').count, whole, remove };
+    },
+    close: () => {
+      renderer.setAnimationLoop(null);
+      renderer.dispose();
+    },
+  };
 }
 
-async function load(url) {
+async function load(url, options) {
   const ending = url.split('.').pop();
   if (ending === 'glb') {
     const loader = new GLTFLoader().register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
     return (await loader.loadAsync(url)).scene;
   }
   if (!loaders[ending]) throw new Error('no loader');
-  const geometry = await new loaders[ending]().loadAsync(url);
+  const loader = new loaders[ending]();
+  loader.setOptions?.(options);
+  return standing(await loader.loadAsync(url));
+}
+
+function standing(geometry) {
   const splats = new GaussianSplat(geometry);
   if (geometry.userData.csplat) splats.applyMatrix4(geometry.userData.csplat.upright);
   return splats;
+}
+
+function take(scene, splats) {
+  scene.remove(splats);
+  splats.traverse((one) => {
+    one.splatGeometry?.dispose();
+    one.geometry?.dispose();
+    one.material?.dispose();
+  });
+}
+
+function look(eye, { view, fovY, near, far }, world) {
+  Object.assign(eye, { fov: fovY, near, far });
+  eye.updateProjectionMatrix();
+  const pose = new THREE.Matrix4().fromArray(view).multiply(world.clone().invert());
+  new THREE.Matrix4().makeScale(1, -1, -1).multiply(pose).invert().decompose(eye.position, eye.quaternion, eye.scale);
 }
