@@ -52,18 +52,16 @@ export class CSPLATFileLoader {
     const { keepInRam, ...options } = this.options;
     const controller = new AbortController();
     const abort = () => controller.abort();
-    if (options.signal?.aborted) abort();
-    options.signal?.addEventListener('abort', abort, { once: true });
     const request = { onCompleteObservable: new Observable(), abort };
     const observer = scene.onDisposeObservable.addOnce(abort);
     const progress = (/** @type {number} */ loaded, /** @type {number} */ total) => {
       options.onProgress?.(loaded, total);
       onProgress?.({ lengthComputable: total > 0, loaded, total });
     };
-    const engine = scene.useRightHandedSystem ? /** @type {const} */ ('RUB') : 'RUF';
+    const engine = /** @type {'RUB' | 'RUF'} */ (scene.useRightHandedSystem ? 'RUB' : 'RUF');
     const source = typeof from === 'string' || from instanceof Blob ? from : new Blob([from]);
-    const given = { ...options, signal: controller.signal, onProgress: progress };
-    openScene(source, given, { name: 'csplat for Babylon.js', engine, mirrors: true })
+    const target = { name: 'csplat for Babylon.js', engine, mirrors: true };
+    openScene(source, { ...options, onProgress: progress }, target, [controller.signal])
       .then(onSuccess, (error) => onError?.(undefined, error))
       .finally(() => {
         observer.remove();

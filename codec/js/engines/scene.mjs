@@ -24,19 +24,41 @@ const MOST = 0.9; // of them lie within the bounds
  * @param {LoadOptions} options
  * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean}} target the adapter's name; letters of the engine's directions
  *   +x, +y, +z; whether it draws what a matrix mirrors
+ * @param {(AbortSignal | undefined)[]} [signals] that end it, beside the option
  */
-export async function openScene(from, options, target) {
-  const { shDegree, progressive, workers, signal, ...others } = options;
-  const controller = new AbortController();
-  const abort = () => controller.abort(signal?.reason);
-  if (signal?.aborted) abort();
-  signal?.addEventListener('abort', abort, { once: true });
-  const reader = await CsplatReader.open(from, { ...others, signal: controller.signal });
-  const { metadata } = await reader.describe({ signal: controller.signal });
-  const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
-  const { extras } = reader.header;
-  if (extras.length) onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
-  return new SplatScene(reader, metadata, { degree, progressive: progressive === true && degree > 0, workers }, target, controller);
+export async function openScene(from, options, target, signals = []) {
+  const { shDegree, progressive, workers, signal: given, ...others } = options;
+  const life = new Life([given, ...signals]);
+  try {
+    const { signal } = life;
+    const reader = await CsplatReader.open(from, { ...others, signal });
+    const { metadata } = await reader.describe({ signal });
+    const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
+    const { extras } = reader.header;
+    if (extras.length) onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
+    return new SplatScene(reader, metadata, { degree, progressive: progressive === true && degree > 0, workers }, target, life);
+  } catch (error) {
+    life.end();
+    throw error;
+  }
+}
+
+/** Of a load: ends when others say so, and lets go of them when it is over; they may live longer. */
+class Life {
+  /** @param {(AbortSignal | undefined)[]} signals */
+  constructor(signals) {
+    this.controller = new AbortController();
+    this.signal = this.controller.signal;
+    this.over = new AbortController();
+    for (const signal of signals) {
+      if (signal?.aborted) this.controller.abort(signal.reason);
+      signal?.addEventListener('abort', () => this.controller.abort(signal.reason), { signal: this.over.signal });
+    }
+  }
+
+  end() {
+    this.over.abort();
+  }
 }
 
 /** Tiles, bands and facts of a file. */
@@ -46,16 +68,17 @@ export class SplatScene {
    * @param {Record<string, unknown> | null} metadata
    * @param {{degree: number, progressive: boolean, workers?: number}} wanted
    * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
-   * @param {AbortController} controller
+   * @param {Life} life
    */
-  constructor(reader, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, controller) {
+  constructor(reader, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
+    /** @type {CsplatReader | null} null once all is read: it holds bytes of the file, and a decoder */
     this.reader = reader;
     this.header = reader.header;
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;
     this.workers = workers;
-    this.controller = controller;
+    this.life = life;
     /** @type {number[][]} centres of some splats */
     this.sample = [];
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
@@ -68,7 +91,14 @@ export class SplatScene {
 
   /** End what is under way. */
   abort() {
-    this.controller.abort();
+    this.life.controller.abort();
+  }
+
+  /** Once nothing reads any more. */
+  release() {
+    this.life.end();
+    this.reader?.compiled?.close();
+    this.reader = null;
   }
 
   /**
@@ -77,21 +107,26 @@ export class SplatScene {
    * @returns {AsyncGenerator<PackedTile & {index: number, first: number}, void>} tiles as they are done
    */
   async *tiles() {
-    const { reader, header, progressive, workers } = this;
-    const { signal } = this.controller;
+    const { header, progressive, workers } = this;
+    const { signal } = this.life;
     const shDegree = progressive ? 0 : this.degree;
-    this.prefetch(Array.from({ length: shDegree + 1 }, (_, layer) => layer));
-    for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
-      signal.throwIfAborted();
-      const { first } = header.tiles[tile.index];
-      this.sample.push(...centresOf(tile));
-      if (!this.mirrored) yield { ...tile, first };
-      else {
-        const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1));
-        yield { ...mirroredGeometry(tile), sh, first };
+    try {
+      const reader = this.reading(Array.from({ length: shDegree + 1 }, (_, layer) => layer));
+      for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
+        signal.throwIfAborted();
+        const { first } = header.tiles[tile.index];
+        this.sample.push(...centresOf(tile));
+        if (!this.mirrored) yield { ...tile, first };
+        else {
+          const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1));
+          yield { ...mirroredGeometry(tile), sh, first };
+        }
       }
+      signal.throwIfAborted();
+    } catch (error) {
+      this.release();
+      throw error;
     }
-    signal.throwIfAborted();
   }
 
   /**
@@ -101,10 +136,10 @@ export class SplatScene {
    * @returns {AsyncGenerator<Band & {index: number}, void>}
    */
   async *bands(layer) {
-    const { signal } = this.controller;
-    this.prefetch([layer]);
+    const { signal } = this.life;
+    const reader = this.reading([layer]);
     for (const { index, first } of this.header.tiles) {
-      const band = await this.reader.readLayer(index, layer, { form: 'packed', signal });
+      const band = await reader.readLayer(index, layer, { form: 'packed', signal });
       signal.throwIfAborted();
       if (band) yield { index, first, count: band.count, sh: this.mirrored ? mirroredBand(band.sh, layer) : band.sh };
     }
@@ -122,7 +157,7 @@ export class SplatScene {
     const { header, metadata, bounds } = this;
     const complete = this.progressive ? work() : Promise.resolve(done);
     // Of those who do not wait for it nobody else would hear.
-    complete.catch((error) => this.controller.signal.aborted || console.error(error));
+    complete.catch((error) => this.life.signal.aborted || console.error(error)).finally(() => this.release());
     return { header, metadata, bounds, complete };
   }
 
@@ -134,10 +169,18 @@ export class SplatScene {
     return { center: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)), radius: quantile(away, MOST) };
   }
 
-  /** @param {number[]} layers */
-  prefetch(layers) {
-    const wanted = this.header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer })));
-    this.reader.prefetch(wanted, { signal: this.controller.signal });
+  /**
+   * The reader, while it fetches layers.
+   *
+   * @param {number[]} layers
+   */
+  reading(layers) {
+    const { header, reader } = this;
+    const { signal } = this.life;
+    signal.throwIfAborted();
+    if (reader === null) throw new Error('all of it was read already');
+    reader.prefetch(header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))), { signal });
+    return reader;
   }
 }
 

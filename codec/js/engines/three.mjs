@@ -93,14 +93,8 @@ export class CSPLATLoader extends Loader {
    * @param {LoadOptions} options
    */
   async read(from, options) {
-    const signals = [this.controller.signal, this.manager.abortController?.signal, options.signal];
-    const controller = new AbortController();
-    const abort = () => controller.abort();
-    for (const signal of signals) {
-      if (signal?.aborted) abort();
-      signal?.addEventListener('abort', abort, { once: true });
-    }
-    return geometryOf(await openScene(from, { ...options, signal: controller.signal }, TARGET));
+    const signals = [this.controller.signal, this.manager.abortController?.signal];
+    return geometryOf(await openScene(from, options, TARGET, signals));
   }
 }
 
