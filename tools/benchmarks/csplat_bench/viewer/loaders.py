@@ -17,9 +17,7 @@ from __future__ import annotations
 import shutil
 import statistics
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -36,7 +34,8 @@ from csplat_render.metrics import psnr
 
 _LOADS = 20
 _HEADER = (
-    "scene", "engine", "splats", "same", "first ms", "whole ms", "heap B/splat", "GPU B/splat", "abort", "damaged", "20 loads",
+    "scene", "engine", "splats", "same", "first ms", "whole ms", "heap B/splat", "GPU B/splat", "abort", "damaged",
+    "20 loads",
 )  # fmt: skip
 
 
@@ -130,9 +129,9 @@ class Trial:
         self.version = self.page.evaluate(words, [self.engine, self.camera, options])
         return self
 
-    def show(self, file: str, **options: object) -> dict[str, Any]:
-        """Show a file of the folder; what pages/trial.mjs says of it."""
-        words = [f"{self.address}{file}", self.camera, options]
+    def show(self, file: str, *, moved: bool = True, **options: object) -> dict[str, Any]:
+        """Show a file of the folder, with the camera where it was unless moved; what pages/trial.mjs says of it."""
+        words = [f"{self.address}{file}", self.camera if moved else None, options]
         said: dict[str, Any] = self.page.evaluate("(words) => trial.show(...words)", words)
         return said
 

@@ -156,23 +156,23 @@ def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> t
     way = right - bare
     sh = float(((picture - bare) * way).sum() / (way * way).sum()) if way.any() else 1.0
     found = psnr(picture, drawn(model, ours, sh_degree=form.degree)), psnr(picture, right)
-    return replace(shown, stands=_stands(placed, said["world"]), psnr=found, wrong=wrong, sh=sh), picture
+    return replace(shown, stands=stands(placed, said["world"]), psnr=found, wrong=wrong, sh=sh), picture
 
 
-def still(page: Any) -> Picture:
+def still(page: Any, pause: float = _PAUSE) -> Picture:
     """The picture that an engine comes to rest at: loaders return before splats are sorted and shaders compiled."""
     from PIL import Image
 
     end, last, same = time.monotonic() + _PATIENCE, np.zeros((1, 1, 3), np.uint8), 0
     while same < _STILL and time.monotonic() < end:
-        time.sleep(_PAUSE)
+        time.sleep(pause)
         picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
         same = same + 1 if picture.any() and np.array_equal(picture, last) else 0
         last = picture
     return last.astype(np.float32) / 255.0
 
 
-def _stands(placed: SplatModel, world: Sequence[float]) -> str:
+def stands(placed: SplatModel, world: Sequence[float]) -> str:
     """How what is up by the axes of a file lies in a world whose y is up."""
     axes = placed.coordinate_system
     up = up_of_axes(USUAL if axes == UNSPECIFIED else axes)

@@ -26,7 +26,7 @@ from csplat_render import Camera
 from csplat_render.metrics import psnr
 from csplat_render.paths import orbit_cameras
 
-__all__ = ["HEIGHT", "WIDTH", "looked_at", "opened_page", "pinhole", "placed_in"]
+__all__ = ["HEIGHT", "WIDTH", "looked_at", "opened_page", "pinhole", "placed_in", "served"]
 
 WIDTH, HEIGHT = 320, 240  # SwiftShader takes its time
 
@@ -56,7 +56,7 @@ def opened_page(
     more: Mapping[str, str] | None = None,
     serving: Callable[[Path], AbstractContextManager[str]] = serve,
 ) -> Iterator[tuple[Any, Path, str]]:
-    """A browser, and a served folder where `page.html` finds the engines and the modules that load files into them.
+    """A browser, and what `served` gives.
 
     Args:
         chromium: the program.
@@ -73,9 +73,26 @@ def opened_page(
     failed = npm_pinned(peers, {**_PACKAGES, **(more or {})})
     if failed:
         raise InputError(failed)
+    with served(peers / "node_modules", serving) as (folder, address), open_page(chromium, gpu=False) as page:
+        yield page, folder, address
+
+
+@contextmanager
+def served(
+    packages: Path, serving: Callable[[Path], AbstractContextManager[str]] = serve
+) -> Iterator[tuple[Path, str]]:
+    """A served folder where `page.html` finds the engines and the modules that load files into them.
+
+    Args:
+        packages: the folder `node_modules`.
+        serving: serves a folder, gives its address.
+
+    Yields:
+        the folder, its address.
+    """
     with tempfile.TemporaryDirectory(prefix="csplat-stage-") as name, serving(Path(name)) as address:
         folder = Path(name)
-        (folder / "node_modules").symlink_to((peers / "node_modules").resolve())
+        (folder / "node_modules").symlink_to(packages.resolve())
         (folder / "pages").symlink_to(Path(__file__).with_name("pages"))
         for place in ("codec/js", "tools/viewer"):  # as the viewer's modules find the decoder's
             (folder / place).parent.mkdir()
@@ -84,8 +101,7 @@ def opened_page(
         imports |= {f"csplat-decoder/{name}": f"/codec/js/engines/{name}.mjs" for name in ENGINES}
         scopes = {key: {"three": "/node_modules/three/build/three.module.js"} for key in _CLASSIC}
         (folder / "page.html").write_text(_PAGE % (json.dumps(imports), json.dumps(scopes)))
-        with open_page(chromium, gpu=False) as page:
-            yield page, folder, address
+        yield folder, address
 
 
 def looked_at(scene: Scene) -> tuple[SplatModel, Camera]:

@@ -30,7 +30,7 @@ export async function start(canvas, { width, height }) {
       const { meshes } = await ImportMeshAsync(url, scene, { pluginOptions });
       const splats = meshes.find((mesh) => mesh.getClassName().startsWith('GaussianSplatting'));
       const world = splats.computeWorldMatrix(true);
-      look(eye, camera, world);
+      if (camera) look(eye, camera, world);
       const remove = () => splats.dispose(false, true);
       const whole = splats.metadata?.csplat?.complete;
       return { world: Array.from(world.asArray()), count: splats.splatCount, whole, remove };

@@ -33,7 +33,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
       const splats = entityOf(asset);
       app.root.addChild(splats);
       const world = splats.findComponent('gsplat').entity.getWorldTransform().clone();
-      look(eye, camera, world);
+      if (camera) look(eye, camera, world);
       const remove = () => {
         splats.destroy();
         app.assets.remove(asset);

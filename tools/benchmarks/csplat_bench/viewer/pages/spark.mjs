@@ -23,7 +23,7 @@ export async function start(canvas, { width, height }) {
       const splats = await load(url, options);
       scene.add(splats);
       scene.updateMatrixWorld(true);
-      look(eye, camera, splats.matrixWorld);
+      if (camera) look(eye, camera, splats.matrixWorld);
       const remove = () => {
         scene.remove(splats);
         splats.dispose();

@@ -32,7 +32,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
       let inner;
       splats.traverse((one) => { inner = one.isGaussianSplat ? one : inner; });
       const { matrixWorld, splatGeometry } = inner;
-      look(eye, camera, matrixWorld);
+      if (camera) look(eye, camera, matrixWorld);
       const whole = splatGeometry.userData.csplat?.complete.then((geometry) => {
         if (geometry === splatGeometry) return;
         take(scene, splats);

@@ -1,0 +1,158 @@
+"""The loaders for three.js, Spark, PlayCanvas and Babylon.js in Chromium, with the versions that tools/examples pins."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("numba", reason="our own pictures want the extra [render]")
+pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+
+from chromium import absent
+
+from csplat import EncodeOptions, decode, encode, read_ply
+from csplat.formats import write
+from csplat.scene import scene_of
+from csplat.turning import in_axes
+from csplat_bench.common.browser import serve
+from csplat_bench.viewer.loaders import Trial
+from csplat_bench.viewer.owners import stands, still
+from csplat_bench.viewer.rules import ENGINES
+from csplat_bench.viewer.stage import pinhole, served
+from csplat_render.metrics import psnr
+from csplat_render.paths import orbit_cameras
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "tools" / "examples"
+FAST = EncodeOptions(preset="fast")
+#: What a loader of the engine's own makes of the PLY: Spark's cuts SH that exceeds a power of two.
+LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.0}
+
+
+@pytest.fixture(scope="module")
+def packages():
+    """The engines, as the examples have them."""
+    if shutil.which("npm") is None:
+        absent("the engines come from npm, which is not installed")
+    lock = EXAMPLES / "package-lock.json"
+    installed = EXAMPLES / "node_modules" / ".package-lock.json"
+    if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
+        words = ["npm", "ci", "--silent", "--ignore-scripts", "--no-audit", "--no-fund"]
+        subprocess.run(words, cwd=EXAMPLES, check=True, capture_output=True)
+    return EXAMPLES / "node_modules"
+
+
+@pytest.fixture(scope="module")
+def files(packages, sample_path):
+    """A served folder with a scene in all the states that are looked at, the scene, and a camera."""
+    source = read_ply(sample_path)
+    source = source.select(slice(0, 4001))  # no multiple of anything
+    data = encode(source, replace(FAST, tile_splats=3000))
+    model = decode(data)
+    camera = orbit_cameras(model, 8, 120, 90)[1]
+    with served(packages) as (folder, address):
+        (folder / "scene.csplat").write_bytes(data)
+        (folder / "flipped.csplat").write_bytes(data[:-9] + bytes([data[-9] ^ 4]) + data[-8:])
+        (folder / "cut.csplat").write_bytes(data[: len(data) // 2])
+        (folder / "text.csplat").write_text("no scene")
+        write(folder / "scene.ply", model, "ply")
+        (folder / "left.csplat").write_bytes(encode(in_axes(scene_of(model), "LUF").model(), FAST))
+        yield folder, address, model, camera
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def trial(request, browser, files):
+    """An engine on a page."""
+    _, address, model, camera = files
+    page = browser.new_page(device_scale_factor=1)
+    page.set_default_timeout(60_000)
+    yield Trial(page, address, request.param, pinhole(camera, model)).start()
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def picture(trial):
+    """What the engine shows of the scene, and what it says."""
+    said = trial.show("scene.csplat")
+    assert "failed" not in said, said
+    shown = settled(trial)
+    trial.remove()
+    return shown, said
+
+
+def settled(trial):
+    """What the engine shows in the end; it draws all the time, which is what these tests take."""
+    return still(trial.page, 0.2)
+
+
+def test_a_scene_stands_upright_and_is_ours(trial, picture, files):
+    shown, said = picture
+    _, _, model, camera = files
+    assert said["count"] - len(model) in range(16)  # Babylon.js fills up
+    assert "upright" == stands(model, said["world"])
+    ours = ENGINES[trial.engine].drawn(model, camera, 3)
+    assert psnr(shown, ours) > max(30.0, psnr(shown, ours[:, ::-1]) + 3.0)
+
+
+def test_a_left_handed_scene_in_two_steps_ends_in_the_same_picture(trial, picture):
+    said = trial.show("left.csplat", moved=False, progressive=True)  # seen from where the last one was
+    again = settled(trial)
+    trial.remove()
+    assert said["firstMs"] < said["wholeMs"]
+    assert psnr(picture[0], again) > 35.0
+
+
+def test_the_picture_is_that_of_the_ply(trial, picture):
+    trial.show("scene.ply")
+    twin = settled(trial)
+    trial.remove()
+    assert psnr(picture[0], twin) > LIKE_THE_PLY[trial.engine]
+
+
+@pytest.mark.parametrize(
+    ("file", "code"), [("flipped", "E_CRC"), ("cut", "E_TRUNCATED"), ("text", "E_MAGIC"), ("none", "E_INPUT")]
+)
+def test_what_is_wrong_with_a_file_is_told(trial, file, code):
+    failed = trial.show(f"{file}.csplat")["failed"]
+    assert code == failed["code"]
+    assert len(failed["message"]) > 20
+
+
+def test_a_load_can_be_ended(trial):
+    assert "AbortError" == trial.show("scene.csplat", abortAt=1)["failed"]["name"]
+
+
+def test_disposal_leaves_nothing_on_the_gpu(trial):
+    if trial.engine == "three":
+        pytest.skip("GaussianSplat of three 0.187 keeps its textures until the renderer is disposed of, of a PLY, too")
+    trial.repeat("scene.csplat", 1)
+    before = trial.taken()[1]
+    trial.repeat("scene.csplat", 2)
+    assert trial.taken()[1] <= before + 100_000
+
+
+def test_the_guide_shows_the_examples_as_they_are():
+    guide = (EXAMPLES.parent.parent / "codec" / "EMBEDDING.md").read_text("utf-8")
+    for name in ENGINES:
+        assert f"```js\n{(EXAMPLES / name).with_suffix('.mjs').read_text('utf-8')}```\n" in guide
+
+
+@pytest.mark.benchmark
+def test_the_examples_show_the_sample(packages, browser, sample_path):
+    (EXAMPLES / "public").mkdir(exist_ok=True)
+    data = encode(read_ply(sample_path), FAST)
+    (EXAMPLES / "public" / "scene.csplat").write_bytes(data)
+    (EXAMPLES / "public" / "cut.csplat").write_bytes(data[:5000])
+    subprocess.run(["npm", "run", "build"], cwd=EXAMPLES, check=True, capture_output=True)
+    page = browser.new_page(viewport={"width": 320, "height": 240})
+    with serve(EXAMPLES / "dist") as address:
+        for name in ENGINES:
+            page.goto(f"{address}{name}.html")
+            shown = still(page)
+            assert "" == page.inner_text("#words"), name
+            assert 0.1 < (shown.max(axis=2) > 0.15).mean() < 0.9, name
+            page.goto(f"{address}{name}.html?scene=cut.csplat")
+            page.wait_for_function("document.querySelector('#words').textContent.length > 20")
+            assert "E_" in page.inner_text("#words"), name
+    page.close()
