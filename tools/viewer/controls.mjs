@@ -11,6 +11,10 @@ import { between } from './rig.mjs';
  * @property {(x: number, y: number) => Pose | null} pivotAt the pose that turns around what lies at a point of the
  *   canvas, CSS pixels; null where nothing does
  * @property {() => boolean} calm whether a person wants no animations
+ *
+ * @typedef {object} Reach
+ * @property {EventTarget} keys where keys count: the whole page, or the canvas alone
+ * @property {() => boolean} wheel whether the wheel is the scene's, not the page's
  */
 
 const ORBIT = Math.PI; // radians per shorter side of the canvas
@@ -55,11 +59,14 @@ export class Controls {
    * @param {HTMLElement} canvas
    * @param {Rig} rig
    * @param {Hooks} hooks
+   * @param {Reach} [reach] everything, by default
    */
-  constructor(canvas, rig, hooks) {
+  constructor(canvas, rig, hooks, reach = { keys: window, wheel: () => true }) {
     this.canvas = canvas;
     this.rig = rig;
     this.hooks = hooks;
+    this.reach = reach;
+    this.listeners = new AbortController();
     /** Whether a person has moved the camera since it was placed. */
     this.touched = false;
     /** @type {Map<number, {x: number, y: number}>} */
@@ -95,22 +102,30 @@ export class Controls {
     this.#wake();
   }
 
+  /** Let go of the canvas and the page. */
+  close() {
+    this.listeners.abort();
+    cancelAnimationFrame(this.frame);
+  }
+
   #listen() {
-    const { canvas } = this;
-    canvas.addEventListener('pointerdown', (event) => this.#down(event));
-    canvas.addEventListener('pointermove', (event) => this.#move(event));
+    const { canvas, reach } = this;
+    const { signal } = this.listeners;
+    canvas.addEventListener('pointerdown', (event) => this.#down(event), { signal });
+    canvas.addEventListener('pointermove', (event) => this.#move(event), { signal });
     for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) {
-      canvas.addEventListener(end, (event) => this.#up(/** @type {PointerEvent} */ (event)));
+      canvas.addEventListener(end, (event) => this.#up(/** @type {PointerEvent} */ (event)), { signal });
     }
-    canvas.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
-    canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY));
-    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
-    addEventListener('keydown', (event) => this.#key(event));
-    addEventListener('keyup', ({ code, shiftKey }) => {
+    canvas.addEventListener('wheel', (event) => this.#wheel(event), { signal, passive: false });
+    canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY), { signal });
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault(), { signal });
+    reach.keys.addEventListener('keydown', (event) => this.#key(/** @type {KeyboardEvent} */ (event)), { signal });
+    reach.keys.addEventListener('blur', () => this.keys.clear(), { signal });
+    const released = (/** @type {KeyboardEvent} */ { code, shiftKey }) => {
       this.shift = shiftKey;
       this.keys.delete(code);
-    });
-    addEventListener('blur', () => this.keys.clear());
+    };
+    addEventListener('keyup', released, { signal });
   }
 
   /** @param {PointerEvent} event */
@@ -160,6 +175,7 @@ export class Controls {
 
   /** @param {WheelEvent} event */
   #wheel(event) {
+    if (!this.reach.wheel()) return;
     event.preventDefault();
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const pixels = event.deltaY * (event.deltaMode === 1 ? LINE : event.deltaMode === 2 ? height : 1);
