@@ -79,6 +79,7 @@ export class Controls {
     this.gliding = null;
     this.tap = { time: -Infinity, x: 0, y: 0 };
     this.press = { x: 0, y: 0, still: false, pans: false };
+    this.before = { pose: rig.pose, touched: false }; // the fingers that are down
     this.frame = 0;
     this.last = 0;
     this.#listen();
@@ -133,6 +134,7 @@ export class Controls {
     const { offsetX: x, offsetY: y, button, shiftKey, ctrlKey, metaKey } = event;
     this.canvas.focus({ preventScroll: true });
     this.canvas.setPointerCapture(event.pointerId);
+    if (this.pointers.size === 0) this.before = { pose: this.rig.pose, touched: this.touched };
     this.pointers.set(event.pointerId, { x, y });
     this.press = { x, y, still: this.pointers.size === 1, pans: button !== 0 || shiftKey || ctrlKey || metaKey };
     this.gliding = null;
@@ -166,11 +168,20 @@ export class Controls {
   /** @param {PointerEvent} event */
   #up(event) {
     if (!this.pointers.delete(event.pointerId)) return;
+    if (event.type === 'pointercancel') this.#takeBack();
     if (event.type !== 'pointerup' || event.pointerType === 'mouse' || !this.press.still) return;
     const { offsetX: x, offsetY: y, timeStamp } = event; // browsers differ in whether two taps are a double click
     const near = Math.hypot(x - this.tap.x, y - this.tap.y) < TAP_PIXELS;
     if (near && timeStamp - this.tap.time < TAP_MS) this.#choosePivot(x, y);
     this.tap = { time: timeStamp, x, y };
+  }
+
+  /** What began as a drag was the page's: it scrolls. */
+  #takeBack() {
+    this.pending = { right: 0, down: 0 };
+    this.rig.pose = this.before.pose;
+    this.touched = this.before.touched;
+    this.hooks.moved();
   }
 
   /** @param {WheelEvent} event */

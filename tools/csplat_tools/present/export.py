@@ -1,4 +1,5 @@
 """One HTML file with a scene, the viewer and the decoder inside: it opens from a disk, without a network.
+Beside it one script with the viewer alone, for pages of others.
 
 A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
 all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
@@ -19,9 +20,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from csplat_tools.present.webroot import PAGE, WORKER, web_files
+from csplat_tools.present.webroot import ELEMENT, PAGE, WORKER, web_files
 
-__all__ = ["Exported", "export_page", "link_modules"]
+__all__ = ["Exported", "export_element", "export_page", "link_modules"]
 
 # Statements that import: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
@@ -126,6 +127,15 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     assert found == 1, "the page has one policy"
     data = page.encode("ascii", "xmlcharrefreplace")
     return Exported(data, len(data) - len(coded), len(coded))
+
+
+def export_element() -> bytes:
+    """Make one script of all that shows scenes: pages that run it know the element `<csplat-view>`.
+
+    Raises:
+        InputError: the installation is not complete.
+    """
+    return _program(_texts(), ELEMENT).encode()
 
 
 def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]:
