@@ -11,6 +11,10 @@ import { between } from './rig.mjs';
  * @property {(x: number, y: number) => Pose | null} pivotAt the pose that turns around what lies at a point of the
  *   canvas, CSS pixels; null where nothing does
  * @property {() => boolean} calm whether a person wants no animations
+ *
+ * @typedef {object} Reach
+ * @property {EventTarget} keys where keys count: the whole page, or the canvas alone
+ * @property {() => boolean} wheel whether the wheel is the scene's, not the page's
  */
 
 const ORBIT = Math.PI; // radians per shorter side of the canvas
@@ -55,11 +59,14 @@ export class Controls {
    * @param {HTMLElement} canvas
    * @param {Rig} rig
    * @param {Hooks} hooks
+   * @param {Reach} [reach] everything, by default
    */
-  constructor(canvas, rig, hooks) {
+  constructor(canvas, rig, hooks, reach = { keys: window, wheel: () => true }) {
     this.canvas = canvas;
     this.rig = rig;
     this.hooks = hooks;
+    this.reach = reach;
+    this.listeners = new AbortController();
     /** Whether a person has moved the camera since it was placed. */
     this.touched = false;
     /** @type {Map<number, {x: number, y: number}>} */
@@ -72,6 +79,7 @@ export class Controls {
     this.gliding = null;
     this.tap = { time: -Infinity, x: 0, y: 0 };
     this.press = { x: 0, y: 0, still: false, pans: false };
+    this.before = { pose: rig.pose, touched: false }; // the fingers that are down
     this.frame = 0;
     this.last = 0;
     this.#listen();
@@ -95,22 +103,30 @@ export class Controls {
     this.#wake();
   }
 
+  /** Let go of the canvas and the page. */
+  close() {
+    this.listeners.abort();
+    cancelAnimationFrame(this.frame);
+  }
+
   #listen() {
-    const { canvas } = this;
-    canvas.addEventListener('pointerdown', (event) => this.#down(event));
-    canvas.addEventListener('pointermove', (event) => this.#move(event));
+    const { canvas, reach } = this;
+    const { signal } = this.listeners;
+    canvas.addEventListener('pointerdown', (event) => this.#down(event), { signal });
+    canvas.addEventListener('pointermove', (event) => this.#move(event), { signal });
     for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) {
-      canvas.addEventListener(end, (event) => this.#up(/** @type {PointerEvent} */ (event)));
+      canvas.addEventListener(end, (event) => this.#up(/** @type {PointerEvent} */ (event)), { signal });
     }
-    canvas.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
-    canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY));
-    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
-    addEventListener('keydown', (event) => this.#key(event));
-    addEventListener('keyup', ({ code, shiftKey }) => {
+    canvas.addEventListener('wheel', (event) => this.#wheel(event), { signal, passive: false });
+    canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY), { signal });
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault(), { signal });
+    reach.keys.addEventListener('keydown', (event) => this.#key(/** @type {KeyboardEvent} */ (event)), { signal });
+    reach.keys.addEventListener('blur', () => this.keys.clear(), { signal });
+    const released = (/** @type {KeyboardEvent} */ { code, shiftKey }) => {
       this.shift = shiftKey;
       this.keys.delete(code);
-    });
-    addEventListener('blur', () => this.keys.clear());
+    };
+    addEventListener('keyup', released, { signal });
   }
 
   /** @param {PointerEvent} event */
@@ -118,6 +134,7 @@ export class Controls {
     const { offsetX: x, offsetY: y, button, shiftKey, ctrlKey, metaKey } = event;
     this.canvas.focus({ preventScroll: true });
     this.canvas.setPointerCapture(event.pointerId);
+    if (this.pointers.size === 0) this.before = { pose: this.rig.pose, touched: this.touched };
     this.pointers.set(event.pointerId, { x, y });
     this.press = { x, y, still: this.pointers.size === 1, pans: button !== 0 || shiftKey || ctrlKey || metaKey };
     this.gliding = null;
@@ -151,6 +168,7 @@ export class Controls {
   /** @param {PointerEvent} event */
   #up(event) {
     if (!this.pointers.delete(event.pointerId)) return;
+    if (event.type === 'pointercancel') this.#takeBack();
     if (event.type !== 'pointerup' || event.pointerType === 'mouse' || !this.press.still) return;
     const { offsetX: x, offsetY: y, timeStamp } = event; // browsers differ in whether two taps are a double click
     const near = Math.hypot(x - this.tap.x, y - this.tap.y) < TAP_PIXELS;
@@ -158,8 +176,17 @@ export class Controls {
     this.tap = { time: timeStamp, x, y };
   }
 
+  /** What began as a drag was the page's: it scrolls. */
+  #takeBack() {
+    this.pending = { right: 0, down: 0 };
+    this.rig.pose = this.before.pose;
+    this.touched = this.before.touched;
+    this.hooks.moved();
+  }
+
   /** @param {WheelEvent} event */
   #wheel(event) {
+    if (!this.reach.wheel()) return;
     event.preventDefault();
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const pixels = event.deltaY * (event.deltaMode === 1 ? LINE : event.deltaMode === 2 ? height : 1);

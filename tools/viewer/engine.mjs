@@ -29,14 +29,34 @@ export { EngineError };
  *
  * @param {HTMLCanvasElement} canvas
  * @param {EngineOptions} [options]
- * @returns {Promise<Engine>} rejects with an EngineError E_WEBGL2 where the browser has no WebGL 2
+ * @returns {Promise<Engine>} rejects with an EngineError: E_WEBGL2 where the browser has no WebGL 2, E_WORKER where the page may
+ *   start no worker
  */
 export async function createEngine(canvas, options = {}) {
   const renderer = createRenderer(canvas, options.pictureFormat);
   if (renderer === null) {
     throw new EngineError({ code: E_WEBGL2, message: 'this browser has no WebGL 2, or it is switched off' });
   }
-  return new SplatEngine(canvas, renderer, options);
+  try {
+    return new SplatEngine(canvas, renderer, options);
+  } catch (error) {
+    renderer.dispose();
+    throw error;
+  }
+}
+
+const NO_WORKER = 'it did not start; a Content-Security-Policy of the page may forbid it (worker-src)';
+
+/**
+ * @param {EngineOptions} options
+ * @throws {EngineError} E_WORKER where the page may have none
+ */
+function startWorker({ workerFactory }) {
+  try {
+    return workerFactory?.() ?? new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' });
+  } catch (error) {
+    throw new EngineError({ code: E_WORKER, message: `the viewer's worker failed: ${NO_WORKER}: ${error}` });
+  }
 }
 
 /** @implements {Engine} */
@@ -66,12 +86,10 @@ class SplatEngine {
       () => this.drawFrame(),
       (frameMs, fps) => this.frameDrawn(frameMs, fps),
     );
-    this.worker =
-      options.workerFactory?.() ?? new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' });
+    this.worker = startWorker(options);
     this.worker.onmessage = ({ data }) => this.take(data);
     this.worker.onerror = ({ message }) => {
-      const what = message ?? 'it did not start';
-      this.fail(new EngineError({ code: E_WORKER, message: `the viewer's worker failed: ${what}` }));
+      this.fail(new EngineError({ code: E_WORKER, message: `the viewer's worker failed: ${message ?? NO_WORKER}` }));
     };
     this.listeners = new AbortController();
     const { signal } = this.listeners;

@@ -18,7 +18,6 @@ import { unitDirection } from './vectors.mjs';
  * @typedef {object} Embedded
  * @property {string} name
  * @property {() => ArrayBuffer} scene
- * @property {() => Worker} workerFactory
  * @property {Record<string, string>} wishes parameters, as an address would have them
  */
 
@@ -48,7 +47,7 @@ export function readWishes(query) {
     return found;
   };
   const size = match('size', /^([1-9]\d{0,3})x([1-9]\d{0,3})$/, 'width and height as 800x600');
-  const colour = match('background', /^([\da-f]{2})([\da-f]{2})([\da-f]{2})$/i, 'a colour as ff8800');
+  const colour = match('background', /^#?([\da-f]{2})([\da-f]{2})([\da-f]{2})$/i, 'a colour as ff8800');
   /** @param {string} name */
   const direction = (name) => {
     const numbers = match(name, UP, THREE);

@@ -27,11 +27,11 @@ export class Stage {
     this.moving = false;
     this.quality = 1; // while moving
     this.rest = 0;
+    this.observer = new ResizeObserver(() => this.fit());
     if (fixed) {
-      document.documentElement.classList.add('fixed');
       canvas.style.width = `${fixed.width}px`;
       canvas.style.height = `${fixed.height}px`;
-    } else new ResizeObserver(() => this.fit()).observe(canvas);
+    } else this.observer.observe(canvas);
   }
 
   /** @param {Sized} engine */
@@ -80,5 +80,11 @@ export class Stage {
     if (quality === this.quality) return;
     this.quality = quality;
     this.fit();
+  }
+
+  close() {
+    this.engine = null;
+    this.observer.disconnect();
+    clearTimeout(this.rest);
   }
 }

@@ -34,6 +34,7 @@ _MODULES = {
     "finetune": "finetune",
     "view": "view",
     "export-html": "view",
+    "export-element": "view",
     "conformance": "conformance",
 }
 

@@ -1,7 +1,8 @@
-"""`csplat view` and `csplat export-html`."""
+"""`csplat view`, `csplat export-html` and `csplat export-element`."""
 
 from __future__ import annotations
 
+import gzip
 import sys
 import webbrowser
 from contextlib import ExitStack
@@ -17,11 +18,11 @@ from csplat_tools.cli.options import Scene, command
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, note
 from csplat_tools.files.streams import check_name, write_bytes
-from csplat_tools.present.export import export_page
+from csplat_tools.present import export
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import ViewScene, open_scene, seeming_wishes, view_wishes
 
-__all__ = ["export_html", "view"]
+__all__ = ["export_element", "export_html", "view"]
 
 _Cameras = Annotated[
     str | None, typer.Option(metavar="FILE.json", help="Look from these cameras: a list of {K, viewmat, W, H, near}.")
@@ -86,7 +87,8 @@ def export_html(
 
     It opens from a disk, without a network, in any browser with WebGL 2,
     and can be sent to anybody. A PLY is encoded first; a .csplat file is
-    checked to the last byte.
+    checked to the last byte. `csplat export-element` is for scenes in a
+    page of your own.
 
     Examples:
       csplat export-html scene.csplat scene.html
@@ -100,7 +102,7 @@ def export_html(
         data = scene.read()
         decode_scene(data)
         wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
-        exported = export_page(data, scene.name, wishes)
+        exported = export.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.findings([one for one in scene.findings if one.kind == "repair"])
         out.remark(*_encoded(scene, preset))
@@ -110,6 +112,33 @@ def export_html(
     )
     sizes = {"scene_bytes": exported.scene_bytes, "code_bytes": exported.code_bytes}
     out.publish({"splats": scene.header.splat_count, "size_bytes": len(exported.page), **sizes})
+
+
+@command()
+def export_element(
+    output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")], out: Output
+) -> None:
+    """Write the viewer as one script, for scenes in pages of your own.
+
+    A page that loads it has the element <csplat-view>, which is to a
+    .csplat file what <img> is to a picture:
+
+      <script src="csplat-view.js" defer></script>
+      <csplat-view src="scene.csplat" alt="A garden"></csplat-view>
+
+    The script needs nothing beside it. "Only show it" in the guide to
+    embedding lists attributes and events, and what a policy of the page
+    (Content-Security-Policy) has to allow.
+
+    Examples:
+      csplat export-element csplat-view.js
+    """
+    out.check(output)
+    check_name(output, ".js", "export-element")
+    script = export.export_element()
+    write_bytes(output, script)
+    out.remark(f"{output}: {format_bytes(len(script))}, {format_bytes(len(gzip.compress(script)))} as servers send it")
+    out.publish({"size_bytes": len(script)})
 
 
 def _encoded(scene: ViewScene, preset: str) -> list[str]:

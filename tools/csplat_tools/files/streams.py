@@ -142,9 +142,7 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
         return
     what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
     line = writer if writer.startswith("-") else f"csplat {writer}"
-    meant = (
-        f"{line} {target.with_suffix(wanted)}" if line == writer else f"{line} {source} {target.with_suffix(wanted)}"
-    )
+    meant = " ".join(filter(None, [line, source * (line != writer), str(target.with_suffix(wanted))]))
     if maker and source:
         meant = f"csplat {maker} {source} {path}"
     raise InputError(f"{path}: {what} `{line}` writes a {wanted} file: did you mean `{meant}`?")

@@ -1,10 +1,12 @@
 """One HTML file with a scene, the viewer and the decoder inside: it opens from a disk, without a network.
+Beside it one script with the viewer alone, for pages of others.
 
 A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
 all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
 `import`, and Chromium to a worker that is a module. So the modules become functions of one classic script. The page
-runs it, and so does the worker, made from a blob of the same text. A policy in the page forbids it the network. All of
-it is ASCII: a server that names another charset would change what the policy has digests of.
+runs it, and so does the worker, made from a blob of the same text, which a function knows of itself. A policy in the
+page forbids it the network. All of it is ASCII: a server that names another charset would change what the policy has
+digests of.
 """
 
 from __future__ import annotations
@@ -18,9 +20,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from csplat_tools.present.webroot import PAGE, WORKER, web_files
+from csplat_tools.present.webroot import ELEMENT, PAGE, WORKER, web_files
 
-__all__ = ["Exported", "export_page", "link_modules"]
+__all__ = ["Exported", "export_element", "export_page", "link_modules"]
 
 # Statements that import: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
@@ -31,17 +33,32 @@ _IMPORT = re.compile(
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
+# Lines that are nothing but comments. What stands so in templates is GLSL, which may lose them, too.
+_COMMENT = re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE)
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'
 _POLICY = re.compile(r'(<meta http-equiv="Content-Security-Policy" content=")[^"]*(">)')
-# Runs in the page and in its worker, behind the functions of the modules.
-_BOOT = """\
+_START_WORKER = "new Worker(new URL('./worker.mjs', import.meta.url), { type: 'module' })"
+# Runs in the page and, as the same text, in its worker.
+_PROGRAM = """\
+(function csplat() {
+'use strict';
+const modules = [
+MODULES];
 const made = [];
 const link = (number) => (made[number] ??= modules[number](link));
-if (typeof document === 'undefined') {
-  link(WORKER);
-} else {
-  const { textContent } = document.currentScript;
+let text = '';
+link.startWorker = () => {
+  text ||= URL.createObjectURL(new Blob([`(${csplat})();`], { type: 'text/javascript' }));
+  return new Worker(text);
+};
+if (typeof document === 'undefined') link(WORKER);
+else {
+BEFORE  link(ENTRY);
+}
+})();
+"""
+_SCENE = """\
   globalThis.csplatEmbedded = {
     ...JSON.parse(document.getElementById('csplat-page').textContent),
     scene: () => {
@@ -58,10 +75,7 @@ if (typeof document === 'undefined') {
       }
       return bytes.buffer.slice(0, filled);
     },
-    workerFactory: () => new Worker(URL.createObjectURL(new Blob([textContent], { type: 'text/javascript' }))),
   };
-  link(MAIN);
-}
 """
 
 
@@ -91,17 +105,11 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     Raises:
         InputError: the installation is not complete.
     """
-    texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
+    texts = _texts()
     folder = posixpath.dirname(PAGE)
-    main = f"{folder}/main.mjs"
-    modules = link_modules(texts, [main, WORKER])
-    order = list(modules)
-    boot = _BOOT.replace("WORKER", str(order.index(WORKER))).replace("MAIN", str(order.index(main)))
-    script = f"'use strict';\n{{\nconst modules = [\n{''.join(modules.values())}];\n{boot}}}\n"
-    script = script.encode("ascii", "backslashreplace").decode()  # \x… and \u… mean the same in JavaScript
+    script = f"\n{_program(texts, f'{folder}/main.mjs', _SCENE)}"
     style = f"\n{texts[f'{folder}/viewer.css']}"
     assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script can stand in an element"
-    assert "\\U000" not in script, "JavaScript spells characters beyond U+FFFF otherwise"
     assert style.isascii(), "characters of a style have no other spelling that a page may use"
     coded = base64.b64encode(scene).decode()
     described = _json({"name": name, "wishes": dict(wishes or {})})
@@ -119,6 +127,15 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     assert found == 1, "the page has one policy"
     data = page.encode("ascii", "xmlcharrefreplace")
     return Exported(data, len(data) - len(coded), len(coded))
+
+
+def export_element() -> bytes:
+    """Make one script of all that shows scenes: pages that run it know the element `<csplat-view>`.
+
+    Raises:
+        InputError: the installation is not complete.
+    """
+    return _program(_texts(), ELEMENT).encode()
 
 
 def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]:
@@ -158,6 +175,34 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
     return found
 
 
+def _texts() -> dict[str, str]:
+    """Text files of the viewer and the decoder by their paths; modules without comments, a fifth of what is sent."""
+    texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
+    return {path: _COMMENT.sub("", text) if path.endswith(".mjs") else text for path, text in texts.items()}
+
+
+def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
+    """A classic script that runs a module, and its worker, with all that they import; ASCII.
+
+    Args:
+        texts: source texts by their paths.
+        entry: path of the module.
+        before: statements to run before it in the page.
+    """
+    modules = link_modules(texts, [entry, WORKER])
+    order = list(modules)
+    parts = {
+        "MODULES": "".join(modules.values()),
+        "WORKER": str(order.index(WORKER)),
+        "BEFORE": before,
+        "ENTRY": str(order.index(entry)),
+    }
+    script = re.sub("MODULES|WORKER|BEFORE|ENTRY", lambda match: parts[match[0]], _PROGRAM)
+    script = script.encode("ascii", "backslashreplace").decode()  # \x… and \u… mean the same in JavaScript
+    assert "\\U000" not in script, "JavaScript spells characters beyond U+FFFF otherwise"
+    return script
+
+
 def _as_function(path: str, text: str) -> str:
     """A module without imports, as a function that returns what it exports."""
     names = [match["name"] for match in _DECLARED.finditer(text)]
@@ -165,6 +210,7 @@ def _as_function(path: str, text: str) -> str:
     text = _LISTED.sub("", _DECLARED.sub("", text))
     left = _STATEMENT.search(text)
     assert left is None, f"{path} has a statement that cannot be linked: {left[0] if left else ''}"
+    text = text.replace(_START_WORKER, "link.startWorker()")
     text = text.replace("import.meta.url", "document.baseURI")  # the module lies in the page
     return f"// {path}\n(link) => {{\n{text}return {{ {', '.join(names)} }};\n}},\n"
 

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from csplat.errors import InputError
 
-__all__ = ["PAGE", "WORKER", "web_files"]
+__all__ = ["ELEMENT", "PAGE", "WORKER", "web_files"]
 
-#: The page, and the module that it starts as a worker, below the root.
+#: The page, the element for other pages, and the module that both start as a worker, below the root.
 PAGE = "tools/viewer/index.html"
+ELEMENT = "tools/viewer/element.mjs"
 WORKER = "tools/viewer/worker.mjs"
 
 _FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",)}

@@ -25,7 +25,7 @@ test('an empty address wishes nothing', () => {
 
 test('every parameter is read', () => {
   const { wishes, complaints } = readWishes(
-    new URLSearchParams('scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=ff8000&ui=0'),
+    new URLSearchParams('scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=%23ff8000&ui=0'),
   );
   assert.deepEqual(complaints, []);
   assert.deepEqual(wishes.size, { width: 512, height: 384 });

@@ -1,0 +1,200 @@
+// Scenes on a canvas: an engine, a camera, a person's hands on it, a picture of the canvas's size. The page (main.mjs)
+// and the element (element.mjs) put their own things around it.
+
+import { Controls } from './controls.mjs';
+import { createEngine } from './engine.mjs';
+import { E_REPLACED } from './engine_error.mjs';
+import { fetchCameras } from './page.mjs';
+import { Rig } from './rig.mjs';
+import { SceneView, emptyPose } from './sceneview.mjs';
+import { Stage } from './stage.mjs';
+
+/**
+ * @typedef {import('./types.d.ts').Engine} Engine
+ * @typedef {import('./types.d.ts').ErrorReport} ErrorReport
+ * @typedef {import('./types.d.ts').Progress} Progress
+ * @typedef {import('./types.d.ts').Stats} Stats
+ *
+ * @typedef {object} Hooks
+ * @property {() => boolean} calm whether a person wants no animations
+ * @property {() => void} [header] what the file says of its scene is in `view.facts`
+ * @property {() => void} [placed] the camera may have found its place
+ * @property {(progress: Progress) => void} progress
+ * @property {(stats: Stats) => void} frame a frame has been drawn
+ * @property {(stats: Stats) => void} shown the scene is drawn for good
+ * @property {(report: ErrorReport) => void} failed each error once
+ */
+
+const BLACK = /** @type {[number, number, number]} */ ([0, 0, 0]);
+
+export class Showing {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {import('./page.mjs').Wishes} wishes
+   * @param {Hooks} hooks
+   * @param {import('./controls.mjs').Reach} [reach] of the controls
+   */
+  constructor(canvas, wishes, hooks, reach) {
+    this.canvas = canvas;
+    this.wishes = wishes;
+    this.hooks = hooks;
+    /** @type {Engine | null} */
+    this.engine = null;
+    this.turn = 0; // counts scenes, so that what is late for one is not shown for the next
+    this.isOpening = false;
+    this.isClosed = false;
+    this.rig = new Rig(emptyPose(), 1);
+    this.stage = new Stage(canvas, wishes.size, () => this.draw());
+    /** @type {Controls} */
+    this.controls = new Controls(
+      canvas,
+      this.rig,
+      {
+        moved: () => {
+          this.stage.moved();
+          this.draw();
+        },
+        pivotAt: (x, y) => this.view.pivotAt(x, y, canvas.clientWidth, canvas.clientHeight),
+        calm: hooks.calm,
+      },
+      reach,
+    );
+    /** @type {SceneView} */
+    this.view = new SceneView(this.rig, this.controls, wishes);
+  }
+
+  /** What stands behind the scene: first what is wished, else what it was trained in front of, else black. */
+  get background() {
+    return this.wishes.background ?? this.view.facts.background ?? BLACK;
+  }
+
+  /** @param {[number, number, number] | null} wanted null for the scene's own */
+  setBackground(wanted) {
+    this.wishes = { ...this.wishes, background: wanted };
+    this.engine?.setBackground(this.background);
+  }
+
+  /**
+   * Make the engine.
+   *
+   * @returns {Promise<Engine | null>} null where it could not be made, as `failed` was told
+   */
+  async start() {
+    const { hooks } = this;
+    try {
+      const engine = await createEngine(this.canvas, {
+        background: this.background,
+        onHeader: (header, description) => {
+          this.view.read(header, description);
+          engine.setBackground(this.background);
+          hooks.header?.();
+          this.#place();
+        },
+        onProgress: (progress) => {
+          hooks.progress(progress);
+          if (this.view.waits) this.#place();
+        },
+        onFrame: (stats) => {
+          this.stage.drawn(stats.frameMs);
+          hooks.frame(stats);
+        },
+        // what `open` rejects with is told by `show`
+        onError: (report) => (report.fatal && this.isOpening) || hooks.failed(report),
+      });
+      if (this.isClosed) {
+        engine.close();
+        return null;
+      }
+      this.engine = engine;
+      this.stage.attach(engine);
+    } catch (error) {
+      if (!this.isClosed) hooks.failed(asReport(error));
+    }
+    return this.engine;
+  }
+
+  /**
+   * Take the cameras that are wished; a wrong one does not cost the scene.
+   *
+   * @returns {Promise<string>} why they cannot be used, or nothing
+   */
+  async readCameras() {
+    const { camera, view } = this.wishes;
+    if (camera === null) return '';
+    try {
+      this.view.useCameras(await fetchCameras(camera), view);
+      return '';
+    } catch (error) {
+      return `The camera cannot be used: ${error instanceof Error ? error.message : error}`;
+    }
+  }
+
+  /**
+   * Show a scene in the place of the present one.
+   *
+   * @param {string | Blob | ArrayBuffer} source
+   */
+  async show(source) {
+    const { engine, hooks } = this;
+    if (!engine) return;
+    const mine = ++this.turn;
+    this.view.begin();
+    this.isOpening = true;
+    try {
+      await engine.open(source);
+      if (mine !== this.turn) return;
+      this.#place();
+      await engine.settled();
+      if (mine === this.turn) hooks.shown(engine.stats);
+    } catch (error) {
+      const report = asReport(error);
+      if (mine === this.turn && report.code !== E_REPLACED) hooks.failed(report);
+    } finally {
+      if (mine === this.turn) this.isOpening = false;
+    }
+  }
+
+  draw() {
+    const { engine, stage } = this;
+    if (!engine) return;
+    engine.setCamera(this.rig.camera(stage.width, stage.height));
+    engine.requestFrame();
+  }
+
+  /** Put the camera where it should be by what is known of the scene so far. */
+  #place() {
+    const { engine } = this;
+    if (!engine?.bounds || !engine.header) return;
+    const { splatCount, splatsDrawn } = engine.stats;
+    if (this.view.place(engine.bounds, splatCount, splatsDrawn === 0)) this.draw();
+    this.hooks.placed?.();
+  }
+
+  /** Free everything, the canvas's context too; nothing else may be called afterwards. */
+  close() {
+    this.isClosed = true;
+    this.turn++;
+    this.controls.close();
+    this.stage.close();
+    if (!this.engine) return;
+    this.engine.close();
+    this.engine = null;
+    // browsers have few contexts, and take one back when they please
+    this.canvas.getContext('webgl2')?.getExtension('WEBGL_lose_context')?.loseContext();
+  }
+}
+
+/**
+ * @param {unknown} error
+ * @returns {ErrorReport}
+ */
+function asReport(error) {
+  const { code = 'E_UNKNOWN', message = String(error), offset, clause } = /** @type {any} */ (error);
+  return {
+    code,
+    message,
+    ...(offset !== undefined && { offset }),
+    ...(clause !== undefined && { clause }),
+    fatal: true,
+  };
+}
