@@ -25,9 +25,10 @@ demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
 	$(BIN)/csplat info out/sample.csplat
 	@ls -l $(SAMPLE) out/sample.csplat out/sample.ply
 
-examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in three.js, Spark, PlayCanvas, Babylon.js; needs npm
+examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engine; needs npm
 	@mkdir -p tools/examples/public
 	$(if $(SCENE),cp "$(SCENE)",$(BIN)/csplat encode --force $(SAMPLE)) tools/examples/public/scene.csplat
+	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
 test: $(VENV)/.dev ## everything that must hold: lint, types, contracts, vectors, fuzzing, tests

@@ -1,4 +1,4 @@
-"""The loaders for three.js, Spark, PlayCanvas and Babylon.js in Chromium, with the versions that tools/examples pins."""
+"""The loaders for three.js, Spark, PlayCanvas and Babylon.js in Chromium, with the versions that the examples pin."""
 
 import shutil
 import subprocess
@@ -33,12 +33,13 @@ LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.
 @pytest.fixture(scope="module")
 def packages():
     """The engines, as the examples have them."""
-    if shutil.which("npm") is None:
+    npm = shutil.which("npm")
+    if npm is None:
         absent("the engines come from npm, which is not installed")
     lock = EXAMPLES / "package-lock.json"
     installed = EXAMPLES / "node_modules" / ".package-lock.json"
     if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
-        words = ["npm", "ci", "--silent", "--ignore-scripts", "--no-audit", "--no-fund"]
+        words = [npm, "ci", "--silent", "--ignore-scripts", "--no-audit", "--no-fund"]
         subprocess.run(words, cwd=EXAMPLES, check=True, capture_output=True)
     return EXAMPLES / "node_modules"
 
@@ -139,12 +140,13 @@ def test_the_guide_shows_the_examples_as_they_are():
 
 
 @pytest.mark.benchmark
-def test_the_examples_show_the_sample(packages, browser, sample_path):
+@pytest.mark.usefixtures("packages")
+def test_the_examples_show_the_sample(browser, sample_path):
     (EXAMPLES / "public").mkdir(exist_ok=True)
     data = encode(read_ply(sample_path), FAST)
     (EXAMPLES / "public" / "scene.csplat").write_bytes(data)
     (EXAMPLES / "public" / "cut.csplat").write_bytes(data[:5000])
-    subprocess.run(["npm", "run", "build"], cwd=EXAMPLES, check=True, capture_output=True)
+    subprocess.run([shutil.which("npm"), "run", "build"], cwd=EXAMPLES, check=True, capture_output=True)
     page = browser.new_page(viewport={"width": 320, "height": 240})
     with serve(EXAMPLES / "dist") as address:
         for name in ENGINES:

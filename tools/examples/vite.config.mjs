@@ -2,7 +2,7 @@
 import { defineConfig } from 'vite';
 import manifest from './package.json' with { type: 'json' };
 
-const pages = ['index', 'three', 'spark', 'playcanvas', 'babylon'];
+const pages = ['index', 'three', 'spark', 'playcanvas', 'babylon', 'view'];
 
 export default defineConfig({
   base: './',
