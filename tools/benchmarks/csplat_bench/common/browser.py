@@ -17,12 +17,22 @@ __all__ = ["open_page", "serve"]
 _PATIENCE = 600_000  # milliseconds
 
 _SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+#: What the first line asks for, through Vulkan: so that WebGPU has a device that can draw on a page, too.
+_WEBGPU = [
+    "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader", "--use-angle=swiftshader",
+]  # fmt: skip
 _HARDWARE = ["--ignore-gpu-blocklist", "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface"]
 
 
 @contextmanager
-def open_page(chromium: str, *, gpu: bool) -> Iterator[Any]:
+def open_page(chromium: str, *, gpu: bool, webgpu: bool = False) -> Iterator[Any]:
     """Start a browser; yields playwright's page.
+
+    Args:
+        chromium: the program.
+        gpu: let it use the machine's GPU; SwiftShader draws otherwise.
+        webgpu: with SwiftShader's WebGPU, which it has not by itself.
 
     Raises:
         InputError: playwright is not installed.
@@ -32,7 +42,11 @@ def open_page(chromium: str, *, gpu: bool) -> Iterator[Any]:
     except ModuleNotFoundError:
         raise InputError("playwright is not installed: pip install playwright") from None
     with sync_playwright() as playwright:
-        arguments = ["--no-sandbox", "--disable-dev-shm-usage", *(_HARDWARE if gpu else _SOFTWARE)]
+        arguments = [
+            "--no-sandbox",
+            "--disable-dev-shm-usage",
+            *(_HARDWARE if gpu else _WEBGPU if webgpu else _SOFTWARE),
+        ]
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         page = browser.new_page()
         page.set_default_timeout(_PATIENCE)

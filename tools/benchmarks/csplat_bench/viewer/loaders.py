@@ -4,12 +4,13 @@
     python -m csplat_bench.viewer.loaders --scenes lego60k --engines three,spark
 
 Encodes scenes (balanced), lets the engines open them in Chromium at 320x240 from a server on the same machine, and
-does what a page does. `first` and `whole`: ms until the picture without and with SH of a progressive load; SwiftShader
-draws, a GL on the CPU, so a GPU is faster. Bytes per splat on the JavaScript heap, arrays included, and of WebGL's
-textures and buffers, once all is there and garbage is collected. `abort`: what comes of a load that is ended, and within
-how many ms. `damaged`: codes of the errors for a file with a flipped bit and for half a file. `20 loads`: how many MB of
-heap and of GPU are taken after the last of twenty loads and disposals that were not after the second. `same`: the picture
-against that of the PLY decoded from the file in the same engine, dB. Medians of --runs. Wants Chromium, playwright, npm.
+does what a page does. `first` and `whole`: ms until the picture without and with SH of a progressive load;
+SwiftShader draws, a GL on the CPU, so a GPU is faster. Bytes per splat on the JavaScript heap, arrays included, and
+of WebGL's textures and buffers, once all is there and garbage is collected. `abort`: what comes of a load that is
+ended, and within how many ms. `damaged`: codes of the errors for a file with a flipped bit and for half a file. `20
+loads`: how many MB of heap and of GPU are taken after the last of twenty loads and disposals that were not after the
+second. `same`: the picture against that of the PLY decoded from the file in the same engine, dB. Medians of --runs.
+Wants Chromium, playwright, npm.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
     python -m csplat_bench.viewer.owners --out pictures
     python -m csplat_bench.viewer.owners --scenes lego60k --engines three --formats gltf,spz
+    python -m csplat_bench.viewer.owners --engines three,playcanvas,babylon --formats ply,csplat --webgpu
 
 Writes a scene in every format, lets the engines' own loaders read it in Chromium, and compares pictures with those of
 csplat's rasteriser of the PLY, from where SH shows most of eight places around the scene: dB. `by its rules` is the
@@ -45,10 +46,10 @@ _OURS = "ours"  # among the formats of pictures
 _SH_OFF = 0.3  # kernels that are cut make room for what lies behind, in other colours
 _PATIENCE = 120.0  # seconds
 _PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
-_SHOW = """async ([engine, url, camera, patience]) => {
+_SHOW = """async ([engine, url, camera, options, patience]) => {
   const { show, version } = await import(`/pages/${engine}.mjs`);
   const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
-  const shown = show(document.querySelector('canvas'), url, camera)
+  const shown = show(document.querySelector('canvas'), url, camera, options)
     .then(async ({ world, whole }) => (await whole, { world, version }));
   return Promise.race([shown, late]).catch((error) => ({ failed: String(error.message ?? error) }));
 }"""
@@ -98,6 +99,7 @@ def main(
     scenes: SCENES = "sample,plane3",
     engines: Annotated[str, typer.Option(help="which")] = ",".join(ENGINES),
     formats: Annotated[str, typer.Option(help="which")] = _FORMATS,
+    webgpu: Annotated[bool, typer.Option("--webgpu", help="let engines draw by WebGPU; Spark cannot")] = False,
     extra: EXTRA = [],
     markdown: MARKDOWN = False,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="keep the pictures")] = None,
@@ -109,7 +111,7 @@ def main(
     """Look at what the command line names, and print a table."""
     machine, rows = tell_machine(), list[Shown]()
     wanted = [(name, ENGINES[name]) for name in listed(engines)]
-    with opened_page(chromium, peers) as (page, folder, address):
+    with opened_page(chromium, peers, webgpu=webgpu) as (page, folder, address):
         for scene in find_scenes(listed(scenes), cache, extra):
             model, camera = looked_at(scene)
             forms = [named(name) for name in listed(formats)]
@@ -123,7 +125,7 @@ def main(
                     write(path, model, form.name)
                 for name, engine in wanted:
                     if form.name in engine.reads:
-                        shown, picture = _shown(page, name, f"{address}{path.name}", model, form)
+                        shown, picture = _shown(page, name, f"{address}{path.name}", model, form, webgpu=webgpu)
                         twin = pictures.get((name, "ply")) if shown.psnr else None
                         like = None if twin is None else psnr(picture, twin)
                         rows.append(replace(shown, scene=scene.name, ply=like))
@@ -138,14 +140,14 @@ def main(
     return 0 if all(row.right for row in rows) else 1
 
 
-def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> tuple[Shown, Picture]:
+def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format, *, webgpu: bool) -> tuple[Shown, Picture]:
     """Let an engine draw a file, and compare what comes."""
     engine = ENGINES[name]
     placed, camera = placed_in(form, model)
     ours = Camera.from_json((model.cameras or [])[0])
     page.set_viewport_size({"width": camera.W, "height": camera.H})
     page.goto(url.rpartition("/")[0] + "/page.html")
-    said = page.evaluate(_SHOW, [name, url, pinhole(camera, model), 1000 * _PATIENCE])
+    said = page.evaluate(_SHOW, [name, url, pinhole(camera, model), {"webgpu": webgpu}, 1000 * _PATIENCE])
     shown = Shown("", f"{engine.title} {said.get('version', '')}".strip(), form.name, said.get("failed", ""))
     if shown.stands:
         return shown, np.zeros((camera.H, camera.W, 3), np.float32)

@@ -55,6 +55,8 @@ def opened_page(
     peers: Path,
     more: Mapping[str, str] | None = None,
     serving: Callable[[Path], AbstractContextManager[str]] = serve,
+    *,
+    webgpu: bool = False,
 ) -> Iterator[tuple[Any, Path, str]]:
     """A browser, and what `served` gives.
 
@@ -63,6 +65,7 @@ def opened_page(
         peers: folder of npm packages.
         more: packages beside those of the engines, and how their versions begin.
         serving: serves a folder, gives its address.
+        webgpu: whether the browser has it.
 
     Yields:
         playwright's page, the folder, its address.
@@ -73,7 +76,10 @@ def opened_page(
     failed = npm_pinned(peers, {**_PACKAGES, **(more or {})})
     if failed:
         raise InputError(failed)
-    with served(peers / "node_modules", serving) as (folder, address), open_page(chromium, gpu=False) as page:
+    with (
+        served(peers / "node_modules", serving) as (folder, address),
+        open_page(chromium, gpu=False, webgpu=webgpu) as page,
+    ):
         yield page, folder, address
 
 

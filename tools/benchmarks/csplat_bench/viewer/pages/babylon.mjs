@@ -5,6 +5,7 @@ import { ImportMeshAsync } from '@babylonjs/core/Loading/sceneLoader.js';
 import { Color4 } from '@babylonjs/core/Maths/math.color.js';
 import { Matrix, Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
 import { Engine } from '@babylonjs/core/Engines/engine.js';
+import { WebGPUEngine } from '@babylonjs/core/Engines/webgpuEngine.js';
 import { Scene } from '@babylonjs/core/scene.js';
 import '@babylonjs/loaders/SPLAT/index.js';
 import '@babylonjs/loaders/glTF/2.0/index.js';
@@ -13,12 +14,13 @@ import * as fflate from 'three/addons/libs/fflate.module.js';
 
 export const version = Engine.Version;
 
-export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera, options)).show(url, camera, options);
 
-export async function start(canvas, { width, height }) {
+export async function start(canvas, { width, height }, { webgpu = false } = {}) {
   canvas.width = width;
   canvas.height = height;
-  const engine = new Engine(canvas, false, { preserveDrawingBuffer: true });
+  const engine = webgpu ? new WebGPUEngine(canvas) : new Engine(canvas, false, { preserveDrawingBuffer: true });
+  await engine.initAsync?.();
   const scene = new Scene(engine);
   scene.clearColor = new Color4(0, 0, 0, 1);
   const eye = new FreeCamera('eye', Vector3.Zero(), scene);

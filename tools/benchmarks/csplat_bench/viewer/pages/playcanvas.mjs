@@ -6,7 +6,7 @@ import { ZSTDDecoder } from 'three/addons/libs/zstddec.module.js';
 
 export const { version } = pc;
 
-export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera, options)).show(url, camera, options);
 
 export async function start(canvas, { width, height }, { webgpu = false } = {}) {
   canvas.width = width;

@@ -5,7 +5,7 @@ import * as THREE from 'three';
 
 export const version = '2.2';
 
-export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera, options)).show(url, camera, options);
 
 export async function start(canvas, { width, height }) {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });

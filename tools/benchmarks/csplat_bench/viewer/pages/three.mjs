@@ -12,7 +12,7 @@ export const version = `0.${THREE.REVISION}`;
 
 const loaders = { csplat: CSPLATLoader, ply: GaussianSplatPLYLoader, spz: SPZLoader, splat: SPLATLoader };
 
-export const show = async (canvas, url, camera, options) => (await start(canvas, camera)).show(url, camera, options);
+export const show = async (canvas, url, camera, options) => (await start(canvas, camera, options)).show(url, camera, options);
 
 export async function start(canvas, { width, height }, { webgpu = false } = {}) {
   const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: !webgpu, antialias: false });
