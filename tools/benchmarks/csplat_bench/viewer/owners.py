@@ -15,13 +15,10 @@ head, of wrong SH or absent. Wants Chromium, playwright, npm.
 from __future__ import annotations
 
 import io
-import json as format_json
 import shutil
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,50 +26,30 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from csplat.errors import InputError
 from csplat.formats import named, read, write
 from csplat.formats.format import Format
 from csplat.formats.own import FORMAT as CSPLAT
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.ply import read_ply
-from csplat.scene import scene_of
-from csplat.turning import USUAL, in_axes
+from csplat.turning import USUAL
 from csplat.upright import up_of_axes
-from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
-from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.report import table, tell_machine, write_json
-from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes
+from csplat_bench.common.scenes import MADE, NPM, find_scenes
 from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
+from csplat_bench.viewer.stage import HEIGHT, WIDTH, looked_at, opened_page, pinhole, placed_in
 from csplat_render import Camera
 from csplat_render.metrics import psnr
-from csplat_render.paths import orbit_cameras
 from csplat_tools.files.pictures import write_png
 
 _OURS = "ours"  # among the formats of pictures
 _SH_OFF = 0.3  # kernels that are cut make room for what lies behind, in other colours
-_PLACES, _WIDTH, _HEIGHT = 8, 320, 240  # SwiftShader takes its time
 _PATIENCE = 120.0  # seconds
 _PAUSE, _STILL = 0.4, 3  # seconds between pictures, and how many in a row are the same once all is drawn
-_PACKAGES = {
-    "three": "0.187", "playcanvas": "2.23", "@babylonjs/core": "9", "@babylonjs/loaders": "9", "@adobe/spz": "0.2",
-    "@sparkjsdev/spark": "2.2",
-}  # fmt: skip
-_IMPORTS = {
-    "three": "three/build/three.webgpu.js", "three/webgpu": "three/build/three.webgpu.js",
-    "three/tsl": "three/build/three.tsl.js", "three/addons/": "three/examples/jsm/",
-    "playcanvas": "playcanvas/build/playcanvas.mjs",
-    "@babylonjs/core/": "@babylonjs/core/", "@babylonjs/loaders/": "@babylonjs/loaders/",
-    "@sparkjsdev/spark": "@sparkjsdev/spark/dist/spark.module.js",
-}  # fmt: skip
-#: Spark is made for three's WebGLRenderer, not for the WebGPURenderer of three's own splats.
-_CLASSIC = ("/node_modules/@sparkjsdev/", "/pages/spark.mjs")
-_PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;background:#000">
-<canvas style="display:block"></canvas><script type="importmap">{"imports":%s,"scopes":%s}</script>"""
 _SHOW = """async ([engine, url, camera, patience]) => {
   const { show, version } = await import(`/pages/${engine}.mjs`);
   const late = new Promise((_, reject) => setTimeout(() => reject(new Error('it never came')), patience));
-  const shown = show(document.querySelector('canvas'), url, camera).then((world) => ({ world, version }));
+  const shown = show(document.querySelector('canvas'), url, camera)
+    .then(async ({ world, whole }) => (await whole, { world, version }));
   return Promise.race([shown, late]).catch((error) => ({ failed: String(error.message ?? error) }));
 }"""
 
@@ -132,9 +109,9 @@ def main(
     """Look at what the command line names, and print a table."""
     machine, rows = tell_machine(), list[Shown]()
     wanted = [(name, ENGINES[name]) for name in listed(engines)]
-    with _opened_page(chromium, peers) as (page, folder, address):
+    with opened_page(chromium, peers) as (page, folder, address):
         for scene in find_scenes(listed(scenes), cache, extra):
-            model, camera = _looked_at(scene)
+            model, camera = looked_at(scene)
             forms = [named(name) for name in listed(formats)]
             if CSPLAT in forms:
                 write(folder / f"{scene.name}.csplat", model, CSPLAT.name)
@@ -161,43 +138,14 @@ def main(
     return 0 if all(row.right for row in rows) else 1
 
 
-@contextmanager
-def _opened_page(chromium: str, peers: Path) -> Iterator[tuple[Any, Path, str]]:
-    """A browser, and a served folder where it finds the engines and the modules that load files into them."""
-    packages = peers / "node_modules"
-    failed = npm_pinned(peers, _PACKAGES)
-    if failed:
-        raise InputError(failed)
-    with tempfile.TemporaryDirectory(prefix="csplat-owners-") as name, serve(name) as address:
-        folder = Path(name)
-        (folder / "node_modules").symlink_to(packages.resolve())
-        (folder / "pages").symlink_to(Path(__file__).with_name("pages"))
-        (folder / "codec").symlink_to(ROOT / "codec" / "js")
-        imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
-        imports |= {f"csplat-decoder/{name}": f"/codec/engines/{name}.mjs" for name in ENGINES}
-        scopes = {key: {"three": "/node_modules/three/build/three.module.js"} for key in _CLASSIC}
-        (folder / "page.html").write_text(_PAGE % (format_json.dumps(imports), format_json.dumps(scopes)))
-        with open_page(chromium, gpu=False) as page:
-            yield page, folder, address
-
-
-def _looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
-    """A scene with the one camera that it is looked at from."""
-    model = read_ply(scene.path)
-    cameras = orbit_cameras(model, _PLACES, _WIDTH, _HEIGHT)
-    chosen = min(cameras, key=lambda camera: psnr(drawn(model, camera), drawn(model, camera, sh_degree=0)))
-    return replace(model, cameras=[chosen.to_json()]), chosen
-
-
 def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> tuple[Shown, Picture]:
     """Let an engine draw a file, and compare what comes."""
     engine = ENGINES[name]
-    placed = in_axes(scene_of(model), form.axes).facts if form.axes else model
-    placed_cameras = [Camera.from_json(camera) for camera in placed.cameras or ()]
-    camera, ours = placed_cameras[0], Camera.from_json((model.cameras or [])[0])
+    placed, camera = placed_in(form, model)
+    ours = Camera.from_json((model.cameras or [])[0])
     page.set_viewport_size({"width": camera.W, "height": camera.H})
     page.goto(url.rpartition("/")[0] + "/page.html")
-    said = page.evaluate(_SHOW, [name, url, _pinhole(camera, model), 1000 * _PATIENCE])
+    said = page.evaluate(_SHOW, [name, url, pinhole(camera, model), 1000 * _PATIENCE])
     shown = Shown("", f"{engine.title} {said.get('version', '')}".strip(), form.name, said.get("failed", ""))
     if shown.stands:
         return shown, np.zeros((camera.H, camera.W, 3), np.float32)
@@ -209,16 +157,6 @@ def _shown(page: Any, name: str, url: str, model: SplatModel, form: Format) -> t
     sh = float(((picture - bare) * way).sum() / (way * way).sum()) if way.any() else 1.0
     found = psnr(picture, drawn(model, ours, sh_degree=form.degree)), psnr(picture, right)
     return replace(shown, stands=_stands(placed, said["world"]), psnr=found, wrong=wrong, sh=sh), picture
-
-
-def _pinhole(camera: Camera, model: SplatModel) -> dict[str, Any]:
-    """A camera as the pages want it: `view` of column vectors, column by column, y down, z forward; degrees."""
-    depths = model.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    return {
-        "view": camera.viewmat.T.ravel().tolist(),
-        "fovY": float(np.degrees(2.0 * np.arctan(camera.H / 2.0 / camera.K[1, 1]))),
-        "width": camera.W, "height": camera.H, "near": camera.near, "far": 2.0 * float(np.abs(depths).max()),
-    }  # fmt: skip
 
 
 def _still(page: Any) -> Picture:
@@ -250,7 +188,7 @@ def _keep(out: Path, scene: str, pictures: dict[tuple[str, str], Picture]) -> No
 
     out.mkdir(parents=True, exist_ok=True)
     engines, forms = (list(dict.fromkeys(names)) for names in zip(*pictures, strict=True))
-    sheet = Image.new("RGB", (_WIDTH * len(forms), _HEIGHT * len(engines)))
+    sheet = Image.new("RGB", (WIDTH * len(forms), HEIGHT * len(engines)))
     for (engine, form), picture in pictures.items():
         pixels = np.rint(255.0 * picture).astype(np.uint8)
         write_png(out / f"{scene}-{engine}-{form}.png", pixels)
@@ -258,7 +196,7 @@ def _keep(out: Path, scene: str, pictures: dict[tuple[str, str], Picture]) -> No
         ImageDraw.Draw(image).text(
             (4, 4), f"{engine} {form}", fill=(255, 255, 0), stroke_width=1, stroke_fill=(0, 0, 0)
         )
-        sheet.paste(image, (_WIDTH * forms.index(form), _HEIGHT * engines.index(engine)))
+        sheet.paste(image, (WIDTH * forms.index(form), HEIGHT * engines.index(engine)))
     sheet.save(out / f"{scene}.png")
 
 

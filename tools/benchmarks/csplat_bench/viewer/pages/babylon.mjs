@@ -13,7 +13,7 @@ import * as fflate from 'three/addons/libs/fflate.module.js';
 
 export const version = Engine.Version;
 
-export async function show(canvas, url, camera) {
+export async function show(canvas, url, camera, { progressive = false } = {}) {
   canvas.width = camera.width;
   canvas.height = camera.height;
   const engine = new Engine(canvas, false, { preserveDrawingBuffer: true });
@@ -21,7 +21,7 @@ export async function show(canvas, url, camera) {
   scene.clearColor = new Color4(0, 0, 0, 1);
   const eye = new FreeCamera('eye', Vector3.Zero(), scene);
   const spzLibraryUrl = new URL('/node_modules/@adobe/spz/dist/spz.js', location.href).href;
-  await AppendSceneAsync(url, scene, { pluginOptions: { splat: { fflate, spzLibraryUrl } } });
+  await AppendSceneAsync(url, scene, { pluginOptions: { splat: { fflate, spzLibraryUrl }, csplat: { progressive } } });
   const splats = scene.meshes.find((mesh) => mesh.getClassName().startsWith('GaussianSplatting'));
   const world = splats.computeWorldMatrix(true);
   // Matrices of row vectors lie in memory as ours of columns do; products are the other way round.
@@ -34,5 +34,5 @@ export async function show(canvas, url, camera) {
   eye.minZ = camera.near;
   eye.maxZ = camera.far;
   engine.runRenderLoop(() => scene.render());
-  return Array.from(world.asArray());
+  return { world: Array.from(world.asArray()), whole: splats.metadata?.csplat?.complete };
 }

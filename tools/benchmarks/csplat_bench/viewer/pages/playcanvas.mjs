@@ -6,7 +6,7 @@ import { ZSTDDecoder } from 'three/addons/libs/zstddec.module.js';
 
 export const version = pc.version;
 
-export async function show(canvas, url, camera) {
+export async function show(canvas, url, camera, { progressive = false } = {}) {
   canvas.width = camera.width;
   canvas.height = camera.height;
   const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false });
@@ -17,10 +17,10 @@ export async function show(canvas, url, camera) {
   const app = new pc.AppBase(canvas);
   app.init(options);
   addSpz(app);
-  app.loader.getHandler('gsplat').addParser(new CsplatParser(app));
+  app.loader.getHandler('gsplat').addParser(new CsplatParser(app, { progressive }));
   app.start();
 
-  const splats = await load(app, url);
+  const { splats, whole } = await load(app, url);
   app.root.addChild(splats);
   const world = splats.findComponent('gsplat').entity.getWorldTransform().clone();
   const flip = new pc.Mat4().setScale(1, -1, -1);
@@ -35,7 +35,7 @@ export async function show(canvas, url, camera) {
   eye.setPosition(pose.getTranslation());
   eye.setRotation(new pc.Quat().setFromMat4(pose));
   app.root.addChild(eye);
-  return Array.from(world.data);
+  return { world: Array.from(world.data), whole };
 }
 
 function addSpz(app) {
@@ -57,9 +57,9 @@ async function load(app, url) {
     app.assets.add(asset);
     app.assets.load(asset);
   });
-  if (container) return asset.resource.instantiateRenderEntity();
+  if (container) return { splats: asset.resource.instantiateRenderEntity() };
   const entity = new pc.Entity();
   entity.addComponent('gsplat', { asset });
   asset.resource.stand?.(entity); // of .csplat
-  return entity;
+  return { splats: entity, whole: asset.resource.csplat?.complete };
 }
