@@ -3,7 +3,7 @@
 codec             throughput, memory and size beside other programs; quality, decoders
 rendering         time of a picture and of its gradients; removal
 training          a step of training, stage by stage; lego
-viewer            culling, sorting, drawing; engines, owners
+viewer            culling, sorting, drawing; arrival, engines, owners
 compression       a whole compression of trained scenes, step by step, on held-out photographs
 distortion        rate against distortion beside SPZ and SOG; grades, operating
 targets           what targets give, beside presets and another build

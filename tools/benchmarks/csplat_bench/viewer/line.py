@@ -1,0 +1,133 @@
+"""A slow line from a server to a browser: so many bits a second over all connections, a while before each answer."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from csplat_tools.present.server import byte_range
+
+__all__ = ["SLOW", "Line"]
+
+#: What lies in this folder of a served one comes over the line, everything else as fast as it goes.
+SLOW = "/scenes/"
+
+_BLOCK_BYTES = 4096  # 3 ms at 10 Mbit/s: connections take turns after so many
+
+
+class Line:
+    """Serves folders, and knows when what was sent.
+
+    Attributes:
+        sent: seconds since the epoch, and bytes of bodies that were handed to the system then.
+        begun: seconds since the epoch when the first request came; `None` before.
+    """
+
+    def __init__(self, bits_per_second: float, latency_seconds: float) -> None:
+        self.sent: list[tuple[float, int]] = []
+        self.begun: float | None = None
+        self._bytes_per_second = bits_per_second / 8.0
+        self._latency = latency_seconds
+        self._lock = threading.Lock()
+        self._free = 0.0  # when what has been asked for will have passed
+        self._open = 0
+        self._ended = 0.0
+
+    def forget(self) -> None:
+        """Begin anew."""
+        with self._lock:
+            self.sent, self.begun = [], None
+
+    @property
+    def quiet_seconds(self) -> float:
+        """How long nobody has asked for anything; 0 while something is on its way."""
+        with self._lock:
+            return 0.0 if self._open else time.time() - self._ended
+
+    @contextmanager
+    def serve(self, folder: Path) -> Iterator[str]:
+        """Serve the files of a folder, with HTTP Range; yields its address."""
+        handler = functools.partial(type("Slow", (_Handler,), {"line": self}), directory=str(folder))
+        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+            server.daemon_threads = True
+            server.block_on_close = False
+            threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+            yield f"http://127.0.0.1:{server.server_address[1]}/"
+            server.shutdown()
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """For the time of a request."""
+        with self._lock:
+            self.begun = self.begun or time.time()
+            self._open += 1
+        try:
+            time.sleep(self._latency)
+            yield
+        finally:
+            with self._lock:
+                self._open -= 1
+                self._ended = time.time()
+
+    def passed(self, size: int) -> None:
+        """Wait until so many bytes have passed, behind those of others."""
+        with self._lock:
+            self._free = max(self._free, time.monotonic()) + size / self._bytes_per_second
+            wait = self._free - time.monotonic()
+        time.sleep(max(0.0, wait))
+
+    def note(self, size: int) -> None:
+        """Note that so many bytes have been sent."""
+        with self._lock:
+            self.sent.append((time.time(), size))
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # a block would wait for the last one's acknowledgement
+    line: Line
+
+    def do_GET(self) -> None:
+        if not self.path.startswith(SLOW):
+            super().do_GET()
+            return
+        with self.line.asked(), contextlib.suppress(ConnectionError):  # the page has gone elsewhere
+            self._answer()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Stay quiet."""
+
+    def _answer(self) -> None:
+        path = Path(self.translate_path(self.path))
+        if not path.is_file():
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        body = path.read_bytes()
+        headers = {"Accept-Ranges": "bytes", "Cache-Control": "no-store", "Content-Type": self.guess_type(path)}
+        status, part = HTTPStatus.OK, body
+        try:
+            found = byte_range(self.headers.get("Range"), len(body))
+        except ValueError:
+            status, part = HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b""
+            headers["Content-Range"] = f"bytes */{len(body)}"
+        else:
+            if found:
+                first, length = found
+                status, part = HTTPStatus.PARTIAL_CONTENT, body[first : first + length]
+                headers["Content-Range"] = f"bytes {first}-{first + length - 1}/{len(body)}"
+        self.send_response(status)
+        for name, value in {**headers, "Content-Length": str(len(part))}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        for start in range(0, len(part), _BLOCK_BYTES):
+            block = part[start : start + _BLOCK_BYTES]
+            self.line.passed(len(block))
+            self.wfile.write(block)
+            self.line.note(len(block))
