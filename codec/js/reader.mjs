@@ -192,11 +192,11 @@ export class Reader {
    * @returns {Promise<Map<number, Bytes>>}
    */
   async partsOf(wanted, record) {
-    const places = record
-      ? wantedLayers(record, wanted)
-      : [...this.codebookChunks.values()].filter(({ layer }) => layer <= wanted.shDegree);
     const parts = record ? [] : [...this.opening];
-    for (const place of places) parts.push([place.offset, await this.fetch(place)]);
+    for (const place of record ? wantedLayers(record, wanted) : []) parts.push([place.offset, await this.fetch(place)]);
+    for (const [key, { layer, offset }] of record ? [] : this.codebookChunks) {
+      if (layer <= wanted.shDegree) parts.push([offset, await this.codebookChunk(key)]); // every worker wants them
+    }
     return new Map(parts.map(([offset, bytes]) => [offset, bytes.slice()])); // alone in their buffers, which are sent
   }
 

@@ -31,7 +31,12 @@ export async function openScene(from, options, target, signals = []) {
   const life = new Life([given, ...signals]);
   try {
     const { signal } = life;
-    const reader = await CsplatReader.open(from, { ...others, signal });
+    const onProgress = (/** @type {number} */ received, /** @type {number} */ size) => {
+      options.onProgress?.(received, size);
+      life.received = received;
+      life.onBytes();
+    };
+    const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
     const { metadata } = await reader.describe({ signal });
     const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
     const { extras } = reader.header;
@@ -50,6 +55,8 @@ class Life {
     this.controller = new AbortController();
     this.signal = this.controller.signal;
     this.over = new AbortController();
+    this.received = 0; // bytes
+    this.onBytes = () => {};
     for (const signal of signals) {
       if (signal?.aborted) this.controller.abort(signal.reason);
       signal?.addEventListener('abort', () => this.controller.abort(signal.reason), { signal: this.over.signal });
@@ -112,6 +119,7 @@ export class SplatScene {
     const shDegree = progressive ? 0 : this.degree;
     try {
       const reader = this.reading(Array.from({ length: shDegree + 1 }, (_, layer) => layer));
+      if (progressive) this.fetchBandsNext();
       for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
         signal.throwIfAborted();
         const { first } = header.tiles[tile.index];
@@ -127,6 +135,18 @@ export class SplatScene {
       this.release();
       throw error;
     }
+  }
+
+  /** As soon as layer 0 has come, so that nothing competes with it, and the line does not rest meanwhile. */
+  fetchBandsNext() {
+    const { life, header, degree } = this;
+    const base = Math.max(...header.tiles.map(({ layers: [{ offset, size }] }) => offset + size)); // it lies first
+    life.onBytes = () => {
+      if (life.received < base || life.signal.aborted) return;
+      life.onBytes = () => {};
+      this.reading(Array.from({ length: degree }, (_, i) => i + 1));
+    };
+    life.onBytes();
   }
 
   /**

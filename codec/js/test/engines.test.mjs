@@ -3,6 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
+import { openScene } from '../engines/scene.mjs';
 import { mirroredBand, mirroredGeometry } from '../engines/mirror.mjs';
 import { alphaOf, places, putBand, putColumns, putCovariances, putQuats, uprightIn } from '../engines/unpack.mjs';
 import { manifest, vector } from './helpers.mjs';
@@ -117,3 +118,29 @@ test('a scene stands upright in the axes of an engine', () => {
     assert.ok(Math.hypot(...cross.map((one, i) => one + c[i])) < 1e-12, `${up}: neither mirrored nor bent`);
   }
 });
+
+for (const options of [{}, { progressive: true }, { workers: 0 }]) {
+  test(`a load asks for every byte once: ${JSON.stringify(options)}`, async () => {
+    const bytes = vector('valid/codebook_sh_1_3');
+    const asked = [];
+    const fetch = async (_url, { headers }) => {
+      const [first, last] = headers.Range.slice(6).split('-').map(Number);
+      const body = bytes.slice(first, last + 1);
+      asked.push([first, first + body.length]);
+      const known = { 'Content-Range': `bytes ${first}-${first + body.length - 1}/${bytes.length}`, 'Content-Length': body.length };
+      return new Response(body, { status: 206, headers: known });
+    };
+    const target = { name: 'test', engine: 'RUB', mirrors: true };
+    const scene = await openScene('http://example.org/a.csplat', { ...options, fetch, firstBytes: 64 }, target);
+    let count = 0;
+    for await (const tile of scene.tiles()) count += tile.count;
+    const complete = scene.facts(async () => {
+      for (let layer = 1; layer <= scene.degree; layer++) for await (const band of scene.bands(layer)) assert.ok(band.count > 0);
+    });
+    await complete.complete;
+    assert.equal(count, scene.header.splatCount);
+    assert.equal(scene.reader, null);
+    asked.sort(([a], [b]) => a - b);
+    for (const [i, [first]] of asked.entries()) if (i > 0) assert.ok(first >= asked[i - 1][1], `${asked.join(' ')}`);
+  });
+}
