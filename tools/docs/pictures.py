@@ -3,10 +3,11 @@
 What the plot shows stands in `measured.json`: bytes, PSNR over the eight views of `csplat compare`, seconds, and the
 versions of all programs. `--measure` takes those figures anew, on an idle machine; it wants npm, for splat-transform,
 and some minutes. `--tutorial` takes a scene and a page that the commands of `guide/tutorial.md` left behind, and wants
-Chromium.
+Chromium. `--engines` takes what `python -m csplat_bench.viewer.owners --scenes sample --formats csplat --out FOLDER`
+left behind.
 
 Usage:
-    python tools/docs/pictures.py [--measure] [--peers FOLDER] [--tutorial FOLDER]
+    python tools/docs/pictures.py [--measure] [--peers FOLDER] [--tutorial FOLDER] [--engines FOLDER]
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ _FEWER = (30, 34, 38)  # dB wanted, splats removed and the others fitted
 _RUNS = 5
 _WIDTH, _HEIGHT = 640, 480
 _QUALITY = 86
+_ENGINES = ("three", "spark", "playcanvas", "babylon")
 # Okabe and Ito's colours, told apart by all eyes.
 _OURS, _FITTED, _SPZ, _SOG = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
 
@@ -62,6 +64,7 @@ def main() -> None:
     parser.add_argument("--measure", action="store_true", help="take all figures anew")
     parser.add_argument("--peers", type=Path, default=Path("out/npm"), metavar="FOLDER", help="for npm packages")
     parser.add_argument("--tutorial", type=Path, metavar="FOLDER", help="where its commands were run")
+    parser.add_argument("--engines", type=Path, metavar="FOLDER", help="pictures of the sample in engines")
     arguments = parser.parse_args()
     if arguments.measure:
         write_json(str(MEASURED), measure(arguments.peers))
@@ -69,6 +72,8 @@ def main() -> None:
     draw_curves(json.loads(MEASURED.read_text("utf-8")))
     if arguments.tutorial is not None:
         draw_tutorial(arguments.tutorial)
+    if arguments.engines is not None:
+        _save(_row([arguments.engines / f"sample-{name}-csplat.png" for name in _ENGINES]), "engines.webp")
     for path in sorted(PICTURES.iterdir()):
         print(f"{path.name}: {path.stat().st_size:,} bytes")
 
@@ -162,12 +167,7 @@ def draw_tutorial(folder: Path) -> None:
         folder: with `photographs`, `garden.csplat` and `garden.html`.
     """
     names = [folder / "photographs" / "train" / f"{number:03d}.png" for number in (4, 9, 13, 18, 22, 27)]
-    photographs = [Image.open(name).convert("RGBA") for name in names]
-    width, height = photographs[0].size
-    sheet = Image.new("RGBA", (width * len(photographs), height))
-    for place, one in enumerate(photographs):
-        sheet.paste(one, (place * width, 0))
-    _save(sheet, "tutorial-photographs.webp")
+    _save(_row(names), "tutorial-photographs.webp")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -182,6 +182,16 @@ def draw_tutorial(folder: Path) -> None:
         shot = Image.open(io.BytesIO(page.screenshot()))
         browser.close()
     _save(shot.convert("RGB"), "tutorial-page.webp")
+
+
+def _row(names: Sequence[Path]) -> Image.Image:
+    """Pictures of one size beside each other."""
+    pictures = [Image.open(name).convert("RGBA") for name in names]
+    width, height = pictures[0].size
+    row = Image.new("RGBA", (width * len(pictures), height))
+    for place, one in enumerate(pictures):
+        row.paste(one, (place * width, 0))
+    return row
 
 
 def _target(judge: Judge, folder: Path, psnr: int, *more: str) -> dict[str, Any]:

@@ -37,7 +37,7 @@ export class CSPLATFileLoader {
   createPlugin(options: { csplat?: CSPLATLoadingOptions }): CSPLATFileLoader;
   loadFile(
     scene: Scene,
-    from: string | Blob | ArrayBufferView<ArrayBuffer>,
+    from: string | Blob | ArrayBufferView,
     rootUrl: string,
     onSuccess: (opened: unknown) => void,
     onProgress?: (event: { lengthComputable: boolean; loaded: number; total: number }) => void,

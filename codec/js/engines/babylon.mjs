@@ -41,7 +41,7 @@ export class CSPLATFileLoader {
    * Open a file, which importMeshAsync reads then, piece after piece.
    *
    * @param {Scene} scene
-   * @param {string | Blob | ArrayBufferView<ArrayBuffer>} from
+   * @param {string | Blob | ArrayBufferView} from
    * @param {string} _rootUrl
    * @param {(opened: SplatScene) => void} onSuccess
    * @param {(event: {lengthComputable: boolean, loaded: number, total: number}) => void} [onProgress]
@@ -59,7 +59,7 @@ export class CSPLATFileLoader {
       onProgress?.({ lengthComputable: total > 0, loaded, total });
     };
     const engine = /** @type {'RUB' | 'RUF'} */ (scene.useRightHandedSystem ? 'RUB' : 'RUF');
-    const source = typeof from === 'string' || from instanceof Blob ? from : new Blob([from]);
+    const source = typeof from === 'string' || from instanceof Blob ? from : new Blob([/** @type {ArrayBufferView<ArrayBuffer>} */ (from)]);
     const target = { name: 'csplat for Babylon.js', engine, mirrors: true };
     openScene(source, { ...options, onProgress: progress }, target, [controller.signal])
       .then(onSuccess, (error) => onError?.(undefined, error))

@@ -234,12 +234,12 @@ export class CsplatParser {
   }
 
   /**
-   * @param {{load: string}} url
+   * @param {string | {load: string}} url
    * @param {(error: unknown, resource?: CsplatResource) => void} callback
    * @param {import('playcanvas').Asset} [asset]
    */
   load(url, callback, asset) {
-    this.read(asset?.file?.contents ?? url.load, asset).then(
+    this.read(asset?.file?.contents ?? (typeof url === 'string' ? url : url.load), asset).then(
       (resource) => callback(null, resource),
       (error) => callback(error),
     );
