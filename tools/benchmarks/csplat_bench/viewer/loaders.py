@@ -4,19 +4,17 @@
     python -m csplat_bench.viewer.loaders --scenes lego60k --engines three,spark
 
 Encodes scenes (balanced), lets the engines open them in Chromium at 320x240 from a server on the same machine, and
-does what a page does. `first` and `whole`: ms until the picture without and with SH of a progressive load;
-SwiftShader draws, a GL on the CPU, so a GPU is faster. Bytes per splat on the JavaScript heap, arrays included, and
-of WebGL's textures and buffers, once all is there and garbage is collected. `abort`: what comes of a load that is
-ended, and within how many ms. `damaged`: codes of the errors for a file with a flipped bit and for half a file. `20
-loads`: how many MB of heap and of GPU are taken after the last of twenty loads and disposals that were not after the
-second. `same`: the picture against that of the PLY decoded from the file in the same engine, dB. Medians of --runs.
+does what a page does; how soon something is to be seen says `viewer.arrival`. Bytes per splat on the JavaScript heap,
+arrays included, and of WebGL's textures and buffers, once all is there and garbage is collected. `abort`: what comes
+of a load that is ended, and within how many ms. `damaged`: codes of the errors for a file with a flipped bit and for
+half a file. `20 loads`: how many MB of heap and of GPU are taken after the last of twenty loads and disposals that
+were not after the second. `same`: the picture against that of the PLY decoded from the file in the same engine, dB.
 Wants Chromium, playwright, npm.
 """
 
 from __future__ import annotations
 
 import shutil
-import statistics
 import sys
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
@@ -35,7 +33,7 @@ from csplat_render.metrics import psnr
 
 _LOADS = 20
 _HEADER = (
-    "scene", "engine", "splats", "same", "first ms", "whole ms", "heap B/splat", "GPU B/splat", "abort", "damaged",
+    "scene", "engine", "splats", "same", "heap B/splat", "GPU B/splat", "abort", "damaged",
     "20 loads",
 )  # fmt: skip
 
@@ -47,7 +45,6 @@ class Loaded:
     Attributes:
         splats: that the engine holds.
         same: picture against the PLY's in the same engine, dB.
-        first_ms, whole_ms: until pictures without and with SH.
         heap, gpu: bytes per splat.
         abort: what an ended load rejects with, and after how many ms.
         damaged: codes of the errors for a flipped bit and a file cut short.
@@ -58,8 +55,6 @@ class Loaded:
     engine: str
     splats: int
     same: float
-    first_ms: float
-    whole_ms: float
     heap: float
     gpu: float
     abort: str
@@ -71,7 +66,7 @@ class Loaded:
     def cells(self) -> tuple[str, ...]:
         """As the table has them."""
         left = f"{self.heap_left / 1e6:+.1f}, {self.gpu_left / 1e6:+.1f}"
-        numbers = (f"{one:.0f}" for one in (self.first_ms, self.whole_ms, self.heap, self.gpu))
+        numbers = (f"{one:.0f}" for one in (self.heap, self.gpu))
         same = f"{self.same:.1f}"
         return self.scene, self.engine, f"{self.splats:,}", same, *numbers, self.abort, self.damaged, left
 
@@ -80,7 +75,6 @@ def main(
     *,
     scenes: SCENES = "sample,fox120k,lego60k,donut",
     engines: Annotated[str, typer.Option(help="which")] = ",".join(ENGINES),
-    runs: Annotated[int, typer.Option(help="of each measurement of time")] = 3,
     extra: EXTRA = [],
     markdown: MARKDOWN = False,
     json: JSON = None,
@@ -101,7 +95,7 @@ def main(
             write(folder / f"{scene.name}.ply", decoded, "ply")
             for name in listed(engines):
                 trial = Trial(page, address, name, pinhole(camera, decoded))
-                rows.append(trial.loaded(scene.name, runs))
+                rows.append(trial.loaded(scene.name))
                 tell(" ".join(rows[-1].cells))
     print(table(_HEADER, [row.cells for row in rows], markdown=markdown))
     if json is not None:
@@ -153,10 +147,10 @@ class Trial:
         session.detach()
         return heap["usedSize"] + heap.get("backingStorageSize", 0.0), self.page.evaluate("trial.gpuBytes()")
 
-    def loaded(self, scene: str, runs: int) -> Loaded:
+    def loaded(self, scene: str) -> Loaded:
         """Do all of it."""
         file = f"{scene}.csplat"
-        times = [self.start().show(file, progressive=True) for _ in range(runs)]
+        self.start().show(file, progressive=True)
         picture = still(self.page)
         self.start().show(f"{scene}.ply")
         twin = still(self.page)
@@ -173,7 +167,6 @@ class Trial:
         heap_left, gpu_left = (after - was for after, was in zip(self.taken(), early, strict=True))
         return Loaded(
             scene, f"{ENGINES[self.engine].title} {self.version}", splats, psnr(picture, twin),
-            statistics.median(one["firstMs"] for one in times), statistics.median(one["wholeMs"] for one in times),
             heap, gpu, f"{ended['name']}, {ended['ms']:.0f} ms", ", ".join(failed), heap_left, gpu_left,
         )  # fmt: skip
 

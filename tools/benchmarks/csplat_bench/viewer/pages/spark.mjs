@@ -28,8 +28,8 @@ export async function start(canvas, { width, height }) {
         scene.remove(splats);
         splats.dispose();
       };
-      const { matrixWorld, numSplats: count, userData } = splats;
-      return { world: matrixWorld.toArray(), count, whole: userData.csplat?.complete, remove };
+      const { matrixWorld, userData } = splats;
+      return { world: matrixWorld.toArray(), count: splats.splats.getNumSplats(), whole: userData.csplat?.complete, remove };
     },
     close: () => {
       renderer.setAnimationLoop(null);

@@ -61,7 +61,7 @@ const frames = async (count) => {
   for (let i = 0; i < count; i++) await new Promise((resolve) => requestAnimationFrame(resolve));
 };
 
-/** Shows a scene; milliseconds until its first and its whole picture, or what is wrong with it. `abortAt`: bytes received. */
+/** Shows a scene until it is whole; what is wrong with it, if anything. `abortAt`: bytes received. */
 export async function show(url, camera, { abortAt, ...options } = {}) {
   const begun = performance.now();
   const controller = new AbortController();
@@ -71,11 +71,10 @@ export async function show(url, camera, { abortAt, ...options } = {}) {
   }
   try {
     shown = await stage.show(url, camera, options);
-    await frames(2);
-    const firstMs = performance.now() - begun;
+    await frames(1);
     await shown.whole;
     await frames(2);
-    return { world: shown.world, count: shown.count, firstMs, wholeMs: performance.now() - begun };
+    return { world: shown.world, count: shown.count };
   } catch (error) {
     const { name, code = '', message } = cause(error);
     return { failed: { name, code, message, ms: performance.now() - begun } };
