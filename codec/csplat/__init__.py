@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     )
     from csplat.formats import read, write
     from csplat.model import SplatModel
+    from csplat.parts import extract
     from csplat.ply import lint_ply, read_ply, write_ply
     from csplat.upright import with_up
 
@@ -54,6 +55,7 @@ __all__ = [
     "decode_scene",
     "encode",
     "encode_with_report",
+    "extract",
     "from_gsplat",
     "lint_ply",
     "read",
@@ -107,6 +109,7 @@ _MODULE_OF = {
     "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
     "encode_with_report": "csplat.encoder",
+    "extract": "csplat.parts",
     "from_gsplat": "csplat.bridges",
     "lint_ply": "csplat.ply",
     "read_header": "csplat.decoder",

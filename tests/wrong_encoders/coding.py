@@ -16,12 +16,10 @@ OF_CODEBOOK = {"sh_coding": "codebook", "codebook_size": 160}
 # Blocks and streams ---------------------------------------------------------------------------------
 
 
-def swapped_blocks(encode_tile):
-    def run(*args):
-        encoded = encode_tile(*args)
-        layer = encoded.tile.layers[0]
-        layer[1], layer[2] = layer[2], layer[1]
-        return encoded
+def swapped_blocks(tile_payload):
+    def run(layer, parts):
+        order = [0, 2, 1, *range(3, len(parts))] if layer == 0 else range(len(parts))
+        return tile_payload(layer, [parts[place] for place in order])
 
     return run
 
@@ -98,7 +96,7 @@ MISTAKES = {
         "rotations come before scales",
         BROKEN,
         ("L1", "TLE-2"),
-        stage=replaced(coded, "encode_tile", swapped_blocks),
+        stage=replaced(tile, "tile_payload", swapped_blocks),
     ),
     "zlib_for_deflate": Mistake(
         "DEFLATE is what zlib.compress gives",

@@ -13,7 +13,7 @@ import numpy as np
 from csplat import _spec
 from csplat.encoder.streams import Coding, unsigned_stream
 
-__all__ = ["CodebookTable", "FileChunk", "FileTile", "SceneFields", "json_payload", "write"]
+__all__ = ["CodebookTable", "FileChunk", "FileTile", "SceneFields", "json_payload", "tile_payload", "write"]
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class FileChunk:
 
 @dataclass(frozen=True)
 class FileTile:
-    """A tile as the index describes it, and the payloads of its layers (without their heads)."""
+    """A tile as the index describes it, and the payloads of its layers."""
 
     splat_count: int
     exponent: int
     corner: tuple[int, int, int]
     extent: tuple[int, int, int]
     max_scale: float
-    layers: Mapping[int, Sequence[bytes]]
+    layers: Mapping[int, bytes]
     tables: tuple[int, ...] = ()
 
 
@@ -70,6 +70,11 @@ def json_payload(value: Any, coding: Coding) -> bytes:
     return unsigned_stream(np.frombuffer(text.encode(), np.uint8), coding)
 
 
+def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
+    """Return the payload of a TILE chunk (spec 5.2): a head, and blocks in the order of their ids."""
+    return _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0)) + b"".join(blocks)
+
+
 def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
     """Lay out header, index and chunks in the order the spec recommends (4.3.6)."""
     index_size = _index_size(scene, tiles)
@@ -101,9 +106,7 @@ def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[t
                 yield None, chunk
         for number, tile in enumerate(tiles):
             if layer in tile.layers:
-                blocks = tile.layers[layer]
-                head = _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0))
-                yield (number, layer), FileChunk(_spec.CHUNK_TILE, head + b"".join(blocks), layer=layer)
+                yield (number, layer), FileChunk(_spec.CHUNK_TILE, tile.layers[layer], layer=layer)
 
 
 def _crc(head: bytes, payload: bytes) -> int:

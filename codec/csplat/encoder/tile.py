@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder import blocks
 from csplat.encoder.colour import ShTables, code_sh, quantise_colour
-from csplat.encoder.container import FileTile
+from csplat.encoder.container import FileTile, tile_payload
 from csplat.encoder.geometry import quantise_shape
 from csplat.encoder.measure import ErrorSums, covariance_errors, distance_errors, true_means, value_errors
 from csplat.encoder.morton import morton_codes
@@ -104,7 +104,7 @@ def encode_tile(
         corner=(int(corner[0]), int(corner[1]), int(corner[2])),
         extent=(int(extent[0]), int(extent[1]), int(extent[2])),
         max_scale=max_scale,
-        layers=layers,
+        layers={layer: tile_payload(layer, parts) for layer, parts in layers.items()},
         tables=used,
     )
     return EncodedTile(file_tile, rows, ErrorSums(len(rows), work.largest, work.squares), frozenset(work.coarsened))

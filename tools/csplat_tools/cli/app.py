@@ -23,6 +23,7 @@ _MODULES = {
     "info": "info",
     "verify": "verify",
     "lint": "lint",
+    "extract": "extract",
     "convert": "convert",
     "formats": "convert",
     "compare": "compare",

@@ -14,7 +14,7 @@ from csplat.model import UNSPECIFIED
 from csplat.turning import USUAL
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.options import ShDegree, command
-from csplat_tools.cli.parsing import parse_axes
+from csplat_tools.cli.parsing import parse_axes, parse_numbers
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.console import format_bytes, format_table, note
 from csplat_tools.files.converting import convert_file, format_rows
@@ -65,9 +65,9 @@ class _Changes(Group):
         """What is asked for."""
         if self.scale is not None and not (math.isfinite(self.scale) and self.scale > 0.0):
             raise typer.BadParameter(f"--scale is {self.scale:g}, wanted a number above 0")
-        x, y, z = _numbers("--rotate", self.rotate, 3) or (0.0, 0.0, 0.0)
-        a, b, c = _numbers("--translate", self.translate, 3) or (0.0, 0.0, 0.0)
-        sphere = _numbers("--crop-sphere", self.crop_sphere, 4)
+        x, y, z = parse_numbers("--rotate", self.rotate, 3) or (0.0, 0.0, 0.0)
+        a, b, c = parse_numbers("--translate", self.translate, 3) or (0.0, 0.0, 0.0)
+        sphere = parse_numbers("--crop-sphere", self.crop_sphere, 4)
         if sphere is not None and sphere[3] <= 0.0:
             raise typer.BadParameter(f"--crop-sphere has a radius of {sphere[3]:g}, wanted one above 0")
         return Filters(
@@ -75,7 +75,7 @@ class _Changes(Group):
             rotate=None if self.rotate is None else (x, y, z),
             scale=self.scale,
             translate=None if self.translate is None else (a, b, c),
-            crop_box=_numbers("--crop-box", self.crop_box, 6),
+            crop_box=parse_numbers("--crop-box", self.crop_box, 6),
             crop_sphere=sphere,
             drop_floaters=self.drop_floaters,
             sh_degree=sh_degree,
@@ -154,15 +154,3 @@ def formats(out: Output) -> None:
     rows = format_rows()
     table = format_table(_COLUMNS, rows, left=len(_COLUMNS))
     out.publish([dict(zip(_COLUMNS, row, strict=True)) for row in rows], table)
-
-
-def _numbers(option: str, text: str | None, count: int) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise typer.BadParameter(f"{option} is {text!r}, wanted {count} numbers with commas between them")
-    return numbers

@@ -11,7 +11,7 @@ from csplat.errors import InputError
 from csplat.model import check_axes
 from csplat.upright import Direction, unit_up
 
-__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_size", "parse_up", "up_word"]
+__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_numbers", "parse_size", "parse_up", "up_word"]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -26,6 +26,23 @@ def parse_size(text: str) -> tuple[int, int]:
     if found is None:
         raise typer.BadParameter(f"a size is {text!r}, wanted width and height in pixels, as 640x480")
     return int(found[1]), int(found[2])
+
+
+def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...] | None:
+    """So many finite numbers from `1,0.5,-2`; `None` where nothing was given.
+
+    Raises:
+        typer.BadParameter: it is something else.
+    """
+    if text is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise typer.BadParameter(f"{option} is {text!r}, wanted {count} numbers with commas between them")
+    return numbers
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
