@@ -3,7 +3,7 @@
 
 import { Controls } from './controls.mjs';
 import { createEngine } from './engine.mjs';
-import { E_REPLACED } from './engine_error.mjs';
+import { E_REPLACED, EngineError } from './engine_error.mjs';
 import { fetchCameras } from './page.mjs';
 import { Rig } from './rig.mjs';
 import { SceneView, emptyPose } from './sceneview.mjs';
@@ -190,11 +190,5 @@ export class Showing {
  */
 function asReport(error) {
   const { code = 'E_UNKNOWN', message = String(error), offset, clause } = /** @type {any} */ (error);
-  return {
-    code,
-    message,
-    ...(offset !== undefined && { offset }),
-    ...(clause !== undefined && { clause }),
-    fatal: true,
-  };
+  return new EngineError({ code, message, offset, clause }).report();
 }

@@ -114,7 +114,10 @@ async function meshOf(scene, opened, keepInRam = false) {
   const degree = opened.progressive ? 0 : opened.degree;
   const bands = new Bands(header.splatCount, degree, width);
   const rows = await rowsOf(opened, bands);
-  if (scene.isDisposed) throw new Error('the scene was disposed of before its splats had come');
+  if (scene.isDisposed) {
+    opened.release();
+    throw new Error('the scene was disposed of before its splats had come');
+  }
   const mesh = new GaussianSplattingMesh('GaussianSplatting', null, scene, keepInRam);
   mesh.onDisposeObservable.addOnce(() => opened.abort());
   try {
@@ -128,6 +131,7 @@ async function meshOf(scene, opened, keepInRam = false) {
     mesh.metadata = { csplat: opened.facts(() => addBands(mesh, rows, opened, width), undefined) };
   } catch (error) {
     mesh.dispose(false, true); // with its material
+    opened.release();
     throw error;
   }
   return mesh;

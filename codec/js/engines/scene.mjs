@@ -140,7 +140,7 @@ export class SplatScene {
   /** As soon as layer 0 has come, so that nothing competes with it, and the line does not rest meanwhile. */
   fetchBandsNext() {
     const { life, header, degree } = this;
-    const base = Math.max(...header.tiles.map(({ layers: [{ offset, size }] }) => offset + size)); // it lies first
+    const base = header.tiles.reduce((end, { layers: [{ offset, size }] }) => Math.max(end, offset + size), 0); // it lies first
     life.onBytes = () => {
       if (life.received < base || life.signal.aborted) return;
       life.onBytes = () => {};
