@@ -16,7 +16,7 @@ import csplat
 from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
 from csplat.encoder.apart import cut_scene
 from csplat.encoder.curvature import GRADED, Curvatures, step_errors
-from csplat.encoder.draft import sample_rows
+from csplat.encoder.draft import tried_rows
 from csplat.encoder.grades import choose_grades
 from csplat.encoder.importance import trusted
 from csplat.encoder.measure import covariance_entries
@@ -203,10 +203,10 @@ def test_codings_are_tried_on_splats_of_all_grades(model):
         model, unequal(model), make_plan(model, EncodeOptions(), importance_given=True), EncodeOptions()
     )
     tiles = cut_scene(model, plan, grades)
-    found = grades.index[sample_rows(model, tiles, grades)]
+    found = grades.index[tried_rows(model, tiles, grades)]
     assert set(found) == set(grades.index)
     np.testing.assert_allclose(np.bincount(found) / len(found), np.bincount(grades.index) / COUNT, atol=0.05)
-    assert set(sample_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
+    assert set(tried_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
 
 
 def test_one_splat_does_not_say_how_precise_the_others_have_to_be(model):

@@ -6,22 +6,25 @@ A tile's lattices grow coarser until the largest value fits 32 bits. One explode
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.buckets import bucket_rows
 from csplat.encoder.grades import Grades
 from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import largest_exact, lattice_step
-from csplat.encoder.tiling import EVEN, Tile, cut
+from csplat.encoder.tiling import EVEN, Coarse, Tile, cut
 from csplat.model import SplatModel
 
 __all__ = ["cut_scene"]
 
 F32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
+Rows = NDArray[np.intp]
 
 _BLOCK = 1 << 14  # splats that are looked at at a time
 
@@ -35,22 +38,32 @@ def cut_scene(model: SplatModel, plan: Plan, grades: Grades | None = None) -> li
         grades: which splats share steps; None: all do.
 
     Returns:
-        As `cut`, grade by grade, and after those the tiles of splats some of whose values their lattices hold with
-        coarser steps only, those alike in which attributes that are together.
+        As `cut`, bucket by bucket, or grade by grade; and after those of each the tiles of splats some of whose values
+        their lattices hold with coarser steps only, those alike in which attributes that are together.
     """
     kinds = _huge(model, plan)
-    if kinds is None and grades is None:
-        return cut(model.means, plan.lattice, plan.tile_splats)
-    index = np.zeros(len(model), np.uint8) if grades is None else grades.index
-    coarse = [EVEN] if grades is None else grades.coarse
-    groups = index if kinds is None else index + np.uint8(len(coarse)) * kinds
+    if grades is not None:
+        groups = grades.index if kinds is None else grades.index + np.uint8(len(grades.coarse)) * kinds
+        return _cut_groups(model.means, np.arange(len(model)), groups, grades.coarse, plan)
     tiles: list[Tile] = []
-    for group in np.unique(groups):
-        rows, shared = np.flatnonzero(groups == group), coarse[int(group) % len(coarse)]
+    for rows in bucket_rows(model.means):
+        found = None if kinds is None else kinds[rows]
+        tiles += _cut_groups(model.means, rows, found, [EVEN], plan)
+    return tiles
+
+
+def _cut_groups(
+    means: F32, rows: Rows, groups: Flags | None, coarse: Sequence[Coarse], plan: Plan
+) -> list[Tile]:  # fmt: skip
+    """Cut the splats `rows`, those of each group by themselves; group g has the steps of grade g modulo the grades."""
+    tiles: list[Tile] = []
+    for group in (0,) if groups is None else np.unique(groups):
+        chosen = rows if groups is None else rows[groups == group]
+        shared = coarse[int(group) % len(coarse)]
         lattice = replace(plan.lattice, step=lattice_step(plan.lattice.step, shared.means))
         tiles += (
-            Tile(rows[tile.rows], tile.exponent + shared.means, shared)
-            for tile in cut(model.means[rows], lattice, plan.tile_splats)
+            Tile(chosen[tile.rows], tile.exponent + shared.means, shared)
+            for tile in cut(means[chosen], lattice, plan.tile_splats)
         )
     return tiles
 

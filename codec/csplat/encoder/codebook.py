@@ -14,7 +14,8 @@ from csplat import _spec
 from csplat.encoder import blocks
 from csplat.encoder.colour import ShBook, ShTables, quantise_rows
 from csplat.encoder.container import CodebookTable, FileChunk
-from csplat.encoder.kmeans import cluster, rank_by_frequency
+from csplat.encoder.importance import splat_weights
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency
 from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan, Progress
@@ -25,7 +26,7 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Books", "books_of", "choose_sh"]
+__all__ = ["Books", "Service", "books_of", "choose_sh", "served", "settled"]
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -44,13 +45,29 @@ _IMPORTANT = 0.95  # quantile of the weights from which on a splat is quantised 
 _CODEBOOK_ID = 0
 
 
+@dataclass(frozen=True, eq=False)
+class Service:
+    """How splats are served that a codebook was not trained on.
+
+    Attributes:
+        entries: [size, 3K] int32, R, G, B of each coefficient.
+        near_groups: as of `assign`.
+        threshold: weighted squared error from which on a splat is coded directly.
+    """
+
+    entries: I32
+    near_groups: int
+    threshold: float
+
+
 @dataclass(frozen=True)
 class Books:
-    """What was decided of SH: what tiles need, what the index says, and chunks."""
+    """What was decided of SH: what tiles need, what the index says, chunks, and what becomes of other splats."""
 
     tables: ShTables
     records: Sequence[CodebookTable] = ()
     chunks: Sequence[FileChunk] = ()
+    service: Service | None = None
 
 
 @dataclass(frozen=True)
@@ -61,11 +78,13 @@ class _Trained:
         index: [N] int32; the size says "escaped".
         entries: [size, 3K] int32, R, G, B of each coefficient.
         error: weighted mean of the squared error that is left.
+        service: of splats that had no part in it.
     """
 
     index: I32
     entries: I32
     error: float
+    service: Service
 
 
 def choose_sh(
@@ -94,7 +113,7 @@ def choose_sh(
         return scalar
     judge = _Judge(weights, None if metric is None else metric.first(kept), draft.importance is not None)
     trained = _train(model, judge, fine, options, report)
-    books = _books(tables, trained, fine)
+    books = replace(_books(tables, trained, fine), service=trained.service)
     if plan.sh_coding == "auto" and not _codebook_pays(model, judge, trained, books, sample[:_SAMPLE], plan):
         return scalar
     return fine, books
@@ -142,10 +161,38 @@ def _train(model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions,
     index = ranked.astype(np.int32)
     errors = _errors(model.shN, index, entries, plan, judge)
     escaped = _escapes(model.shN, errors, plan, options, judge)
+    threshold = float(errors[escaped].min(initial=np.inf))
     errors[escaped] = 0.0
     index[escaped] = len(entries)
     total = float(weights.sum(dtype=np.float64)) or 1.0
-    return _Trained(index, entries, float(errors.sum()) / total)
+    service = Service(entries, effort.get("near_groups", 0), threshold)
+    return _Trained(index, entries, float(errors.sum()) / total, service)
+
+
+def settled(plan: Plan, largest: float) -> Plan:
+    """The plan for a scene whose largest SH coefficient is that: no codebook where it would not fit beside one."""
+    fine = replace(plan, sh_step=plan.codebook_step)
+    return replace(plan, sh_coding="scalar") if plan.sh_coding == "auto" and not _fits(largest, fine) else plan
+
+
+def served(books: Books, model: SplatModel, plan: Plan, threads: int) -> ShTables:
+    """What tiles need of splats that nothing was decided on.
+
+    Args:
+        books: as decided on a sample of the scene.
+        model: at most a bucket of the scene: what is searched together may depend on that.
+        plan: as decided.
+        threads: of the search; no effect on the result.
+    """
+    tables, service = books.tables, books.service
+    weights = None if tables.weights is None else splat_weights(model, None)
+    if service is None or tables.book is None or weights is None:
+        return replace(tables, weights=weights)
+    points = _lattice_points(model.shN, plan)
+    found = assign(points, service.entries, near_groups=service.near_groups, threads=threads).astype(np.int32)
+    errors = _errors(model.shN, found, service.entries, plan, _Judge(weights, None, measured=False))
+    found[errors >= service.threshold] = tables.book.size
+    return replace(tables, weights=weights, book=ShBook(tables.book.entries, found))
 
 
 def _refined(
@@ -180,7 +227,11 @@ def _size(count: int, plan: Plan, options: EncodeOptions) -> int:
 
 def _escapes_fit(shN: F32, plan: Plan) -> bool:
     """Whether every splat could be coded directly beside a codebook, whose lattice no tile makes coarser."""
-    return 2.0 * float(max(shN.max(initial=0.0), -shN.min(initial=0.0))) < largest_exact(plan.sh_step)
+    return _fits(float(max(shN.max(initial=0.0), -shN.min(initial=0.0))), plan)
+
+
+def _fits(largest: float, plan: Plan) -> bool:
+    return 2.0 * largest < largest_exact(plan.sh_step)
 
 
 def _errors(shN: F32, index: I32, entries: I32, plan: Plan, judge: _Judge) -> NDArray[np.float64]:

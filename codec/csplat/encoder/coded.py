@@ -25,7 +25,7 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Coded", "EncodeReport", "EncodeResult"]
+__all__ = ["Coded", "EncodeReport", "EncodeResult", "notes_on"]
 
 _FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of one, that nobody has to be told of
 
@@ -130,8 +130,8 @@ class Coded:
         chunks = file_chunks(draft, self.errors, settings)
         data = write(file_scene(draft, self.books, chunks), [part.tile for part in self.tiles])
         stated = stated_errors(self.errors, draft.origin)
-        notes = _notes(self.tiles, strict=plan.lattice.strict)
-        report = EncodeReport(settings, stated, len(draft.model), len(self.tiles), len(data), notes)
+        notes = notes_on(self.tiles, strict=plan.lattice.strict)
+        report = EncodeReport(settings, stated, self.errors.count, len(self.tiles), len(data), notes)
         return EncodeResult(data, self.source_index, report)
 
 
@@ -153,13 +153,13 @@ def _coded_tiles(draft: Draft, books: Books, progress: Progress | None) -> list[
         return list(pool.map(one, tiles))
 
 
-def _notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
+def notes_on(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
     """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours.
 
     And where a bound of the means, finer than 16 bits of a tile of many, took tiles of few.
     """
     notes = []
-    splats = sum(len(part.rows) for part in tiles)
+    splats = sum(part.tile.splat_count for part in tiles)
     if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
         notes.append(
             f"means: so small an error takes {counted(len(tiles), 'tile')}, each of which takes bytes of its own"

@@ -6,14 +6,44 @@ import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from csplat import _spec
 from csplat.encoder.streams import Coding, unsigned_stream
 
-__all__ = ["CodebookTable", "FileChunk", "FileTile", "SceneFields", "json_payload", "tile_payload", "write"]
+__all__ = [
+    "CodebookTable",
+    "FileChunk",
+    "FileTile",
+    "Payload",
+    "SceneFields",
+    "Stored",
+    "chunk_crc",
+    "json_payload",
+    "parts",
+    "tile_payload",
+    "write",
+]
+
+
+class Stored(Protocol):
+    """A payload that lies elsewhere until the file is written."""
+
+    @property
+    def crc(self) -> int:
+        """As of `chunk_crc`."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def read(self) -> bytes:
+        """All of it."""
+        ...
+
+
+Payload = bytes | Stored
 
 
 @dataclass(frozen=True)
@@ -21,7 +51,7 @@ class FileChunk:
     """A chunk of the whole file: type, payload, and for codebooks id and layer."""
 
     type: bytes
-    payload: bytes
+    payload: Payload
     id: int = 0
     layer: int = 0
 
@@ -35,7 +65,7 @@ class FileTile:
     corner: tuple[int, int, int]
     extent: tuple[int, int, int]
     max_scale: float
-    layers: Mapping[int, bytes]
+    layers: Mapping[int, Payload]
     tables: tuple[int, ...] = ()
 
 
@@ -76,25 +106,38 @@ def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
 
 
 def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
-    """Lay out header, index and chunks in the order the spec recommends (4.3.6)."""
+    """Lay out a file in memory; see `parts`."""
+    return b"".join(parts(scene, tiles))
+
+
+def parts(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
+    """Lay out header, index and chunks in the order the spec recommends (4.3.6), and give the file piece by piece."""
     index_size = _index_size(scene, tiles)
     offset = _spec.HEADER_SIZE + index_size
-    parts: list[bytes] = []
     directory: list[_spec.DirectoryRecord] = []
     layers: dict[tuple[int, int], _spec.LayerRecord] = {}
     for place, chunk in _in_order(scene, tiles):
-        flags = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[chunk.type])
-        head = _spec.pack_chunk_header(_spec.ChunkHeader(chunk.type, flags, 0, len(chunk.payload)))
-        where = (len(head) + len(chunk.payload), offset, _crc(head, chunk.payload))
+        where = (_spec.CHUNK_HEADER_SIZE + len(chunk.payload), offset, chunk_crc(chunk.type, chunk.payload))
         if place is None:
-            directory.append(_spec.DirectoryRecord(chunk.type, flags, chunk.id, chunk.layer, 0, 0, *where))
+            directory.append(_spec.DirectoryRecord(chunk.type, _flags(chunk.type), chunk.id, chunk.layer, 0, 0, *where))
         else:
             layers[place] = _spec.LayerRecord(chunk.layer, 0, 0, *where)
-        parts += [head, chunk.payload]
         offset += where[0]
     index = _index(scene, tiles, directory, layers)
     assert len(index) == index_size
-    return b"".join([_header(len(index), offset), index, *parts])
+    yield _header(len(index), offset)
+    yield index
+    for _, chunk in _in_order(scene, tiles):
+        yield _head(chunk.type, len(chunk.payload))
+        yield chunk.payload if isinstance(chunk.payload, bytes) else chunk.payload.read()
+
+
+def _flags(kind: bytes) -> int:
+    return sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[kind])
+
+
+def _head(kind: bytes, size: int) -> bytes:
+    return _spec.pack_chunk_header(_spec.ChunkHeader(kind, _flags(kind), 0, size))
 
 
 def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
@@ -109,9 +152,11 @@ def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[t
                 yield (number, layer), FileChunk(_spec.CHUNK_TILE, tile.layers[layer], layer=layer)
 
 
-def _crc(head: bytes, payload: bytes) -> int:
+def chunk_crc(kind: bytes, payload: Payload) -> int:
     """CHK-1: of a chunk's header and payload."""
-    return zlib.crc32(payload, zlib.crc32(head))
+    if not isinstance(payload, bytes):
+        return payload.crc
+    return zlib.crc32(payload, zlib.crc32(_head(kind, len(payload))))
 
 
 def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:

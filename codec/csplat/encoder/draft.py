@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.encoder.apart import cut_scene
-from csplat.encoder.codebook import Books, choose_sh
+from csplat.encoder.buckets import WHOLE, bucket_rows, looked_at, sample_rows
+from csplat.encoder.codebook import Books, choose_sh, served, settled
 from csplat.encoder.coded import Coded
+from csplat.encoder.colour import ShBook
 from csplat.encoder.frozen import Frozen
 from csplat.encoder.gauge import fix_gauge
 from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
@@ -42,12 +44,13 @@ from csplat.encoder.plan import Plan, Progress, make_plan
 from csplat.encoder.scene import extra_columns
 from csplat.encoder.shape_codebook import choose_shapes
 from csplat.encoder.shape_tables import ShapeTables
+from csplat.encoder.statistics import contrast_of
 from csplat.encoder.tile import tile_order
 from csplat.encoder.tiling import Tile
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 
-__all__ = ["Draft", "Origin", "sample_rows"]
+__all__ = ["Draft", "Origin", "tried_rows", "within_binary32"]
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
@@ -84,6 +87,8 @@ class Draft:
         extras: records of the extra columns that are carried.
         shapes: the codebook of shapes, if there is one.
         grades: of the splats, if there are several.
+        sample: of a scene of many splats that nothing but itself says anything of: the draft of its sample, on which
+            is decided.
     """
 
     model: SplatModel
@@ -95,6 +100,7 @@ class Draft:
     extras: Sequence[_spec.ExtraRecord]
     shapes: ShapeTables | None
     grades: Grades | None
+    sample: Draft | None = None
 
     @classmethod
     def of(
@@ -105,6 +111,7 @@ class Draft:
         importance: NDArray[Any] | Importance | None = None,
         origin: Origin | None = None,
         graded: bool = True,
+        contrast: float | None = None,
         progress: Progress | None = None,
     ) -> Draft:
         """Decide a scene's geometry.
@@ -115,6 +122,7 @@ class Draft:
             importance: [N] weights >= 0 of the splats, in place of opacity × projected area; or more than that.
             origin: what the scene stands for; `None`: itself.
             graded: splats may be sorted into grades; otherwise all are of one, whatever is known of them.
+            contrast: of the scene that the model is a sample of (`contrast_of`).
             progress: called with the stage's name and the share done, 0 to 1; from any thread.
 
         Raises:
@@ -128,8 +136,10 @@ class Draft:
         origin = origin or Origin(len(model), np.arange(len(model)))
         if len(origin.source_index) != len(model):
             raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
-        model = _within_binary32(model)
-        plan = make_plan(model, options, importance_given=importance is not None)
+        model = within_binary32(model)
+        if len(model) > WHOLE and importance is None and not options.shape_codebook_size:
+            return cls._of_many(model, options, origin, progress)
+        plan = make_plan(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_columns(model, options)
         curvatures = known_curvatures(model, importance) if graded else None
         plan, grades = choose_grades(model, curvatures, plan, options)
@@ -140,6 +150,16 @@ class Draft:
             metric = shape_metric(weights, importance)
             shapes = choose_shapes(model, weights, metric, tiles, plan, options, progress or _silent)
         return cls(model, options, origin, importance, plan, tiles, extras, shapes, grades)
+
+    @classmethod
+    def _of_many(cls, model: SplatModel, options: EncodeOptions, origin: Origin, progress: Progress | None) -> Draft:
+        buckets = bucket_rows(model.means)
+        contrast = contrast_of(model.select(buckets[place]) for place in looked_at(len(buckets)))
+        sample = cls.of(model.select(sample_rows(len(model))), options, contrast=contrast, progress=progress)
+        largest = float(max(model.shN.max(initial=0.0), -model.shN.min(initial=0.0)))
+        sample = replace(sample, plan=settled(sample.plan, largest))
+        plan, extras = sample.plan, extra_columns(model, options)
+        return cls(model, options, origin, None, plan, cut_scene(model, plan), extras, None, None, sample)
 
     @cached_property
     def scene(self) -> SplatModel:
@@ -168,7 +188,7 @@ class Draft:
         Raises:
             InputError: values that no lattice can hold.
         """
-        plan, books = self._sh(progress)
+        plan, books = self.decided(progress)
         return Coded.of(replace(self, plan=plan), books, progress=progress)
 
     def frozen(self, source: SplatModel | None = None, progress: Progress | None = None) -> Frozen:
@@ -188,19 +208,40 @@ class Draft:
         source = self.model if source is None else source
         if len(source) != self.origin.source_count:
             raise InputError(f"a source of {len(source)} splats, wanted {self.origin.source_count}: that of the origin")
-        plan, books = self._sh(progress)
+        plan, books = self.decided(progress)
         plan = replace(plan, gauged=True)
         rows = [tile_order(self.model, tile, plan)[0] for tile in self.tiles]
         order = np.concatenate(rows).astype(np.int64)
         draft = replace(self._in_order(order, [len(part) for part in rows]), plan=plan)
         return Frozen.of(draft, books.tables.select(order), source)
 
-    def _sh(self, progress: Progress | None) -> tuple[Plan, Books]:
+    def decided(self, progress: Progress | None = None) -> tuple[Plan, Books]:
+        """Decide how SH is coded.
+
+        Returns:
+            The plan, complete, and the codebooks, with what they say of each splat.
+        """
         model, plan, importance = self.model, self.plan, self.importance
+        if self.sample is not None:
+            return self._served(*self.sample.decided(progress))
         needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
         weights = splat_weights(model, importance) if needs_weights else None
-        sample = sample_rows(model, self.tiles, self.grades)
+        sample = tried_rows(model, self.tiles, self.grades)
         return choose_sh(self, weights, sh_metric(model, weights, importance), sample, progress or _silent)
+
+    def _served(self, plan: Plan, books: Books) -> tuple[Plan, Books]:
+        """What was decided on the sample, for all splats."""
+        tables, count = books.tables, len(self.model)
+        index = None if tables.book is None else np.empty(count, np.int32)
+        weights = None if tables.weights is None else np.empty(count, np.float32)
+        for rows in bucket_rows(self.model.means) if index is not None or weights is not None else ():
+            part = served(books, self.model.select(rows), plan, self.options.thread_count)
+            if weights is not None and part.weights is not None:
+                weights[rows] = part.weights
+            if index is not None and part.book is not None:
+                index[rows] = part.book.index
+        book = None if tables.book is None or index is None else ShBook(tables.book.entries, index)
+        return plan, replace(books, tables=replace(tables, weights=weights, book=book))
 
     def _in_order(self, order: I64, counts: Sequence[int]) -> Draft:
         """The same for splats in the order of their tiles, in their gauge; what SH needs of importance is decided."""
@@ -217,10 +258,11 @@ class Draft:
                 for tile, count, end in zip(self.tiles, counts, ends, strict=True)
             ],
             shapes=None if self.shapes is None else self.shapes.select(order),
+            sample=None,
         )
 
 
-def sample_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
+def tried_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
     """Rows like those of one tile, on which codings are tried: of all grades, where there are several."""
     if not tiles:
         return np.zeros(0, np.intp)
@@ -233,7 +275,7 @@ def _silent(stage: str, done: float) -> None:
     """Report to nobody."""
 
 
-def _within_binary32(model: SplatModel) -> SplatModel:
+def within_binary32(model: SplatModel) -> SplatModel:
     """Write scales beyond ±88 as ±88, as they count (CNF-6): no other splat's lattice has to be coarser for them."""
     if not len(model) or float(np.abs(model.scales).max()) <= SCALE_MOST:
         return model

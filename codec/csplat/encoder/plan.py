@@ -93,8 +93,10 @@ class Plan:
         return records
 
 
-def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bool) -> Plan:
-    """Resolve options, preset and scene into a plan."""
+def make_plan(
+    model: SplatModel, options: EncodeOptions, *, importance_given: bool, contrast: float | None = None
+) -> Plan:
+    """Resolve options, preset and scene, of which `contrast` may be known, into a plan."""
     preset = PRESETS[options.preset]
     degree = model.sh_degree if options.sh_degree is None else min(options.sh_degree, model.sh_degree)
     if options.sh_coding == "none":
@@ -104,7 +106,7 @@ def make_plan(model: SplatModel, options: EncodeOptions, *, importance_given: bo
     sh_quality = preset.sh_quality
     if options.attribute_psnr is not None:
         quality, sh_quality = options.attribute_psnr, options.attribute_psnr + preset.sh_quality - preset.quality[0]
-    statistics = scene_statistics(model)
+    statistics = scene_statistics(model, contrast)
     steps = _steps(statistics, quality, sh_quality, has_sh=degree > 0)
     return Plan(
         lattice=_lattice(model, options, steps.means),

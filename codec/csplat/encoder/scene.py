@@ -129,7 +129,7 @@ def _stated_errors(draft: Draft, errors: ErrorSums) -> bytes:
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
     bounds = sorted((ids[name], *pair) for name, pair in stated_errors(errors, origin).items())
     count, flags = origin.source_count, origin.refitted * _spec.ERROR_FLAG_REFITTED
-    head = _spec.StatedErrorsHead(count, count - len(model), model.sh_degree, flags, len(bounds))
+    head = _spec.StatedErrorsHead(count, count - errors.count, model.sh_degree, flags, len(bounds))
     records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
     return _spec.pack_stated_errors_head(head) + b"".join(records)
 

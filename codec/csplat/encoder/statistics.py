@@ -7,6 +7,7 @@ shows in proportion to the scene's extent on the screen; a rotation in proportio
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from csplat.encoder.morton import morton_codes
 from csplat.model import SplatModel
 
-__all__ = ["COLOUR_PER_SH0", "Statistics", "scene_statistics"]
+__all__ = ["COLOUR_PER_SH0", "Statistics", "contrast_of", "scene_statistics"]
 
 #: A channel's colour per coefficient of degree 0.
 COLOUR_PER_SH0 = 0.28209479177387814
@@ -44,35 +45,57 @@ class Statistics:
     size: float
 
 
-def scene_statistics(model: SplatModel) -> Statistics:
-    """Look at a sample of a scene; the same model gives the same numbers."""
-    count = len(model)
-    if count == 0:
+def scene_statistics(model: SplatModel, contrast: float | None = None) -> Statistics:
+    """Look at a sample of a scene; the same model gives the same numbers.
+
+    Args:
+        model: the scene.
+        contrast: as of `contrast_of`, where the model is a sample itself, whose splats are no neighbours.
+    """
+    if len(model) == 0:
         return Statistics(0.0, 0.2, 0.01)
-    spread = np.arange(0, count, max(1, count // _SAMPLE))
-    points = np.take(model.means, spread, axis=0).astype(np.float64)
-    distance = points - np.median(points, axis=0)
-    top = float(np.abs(distance).max())
-    reach = top and top * float(np.quantile(np.sqrt(np.square(distance / top).sum(axis=1)), _CORE))
-    largest = np.take(model.scales, spread, axis=0).max(axis=1)
+    points, reach = _reach(model.means)
+    largest = np.take(model.scales, _spread(len(model)), axis=0).max(axis=1)
     size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
-    contrast = _contrast(model, points, reach)
+    if contrast is None:
+        contrast = _rms(*_contrast(model, points, reach))
     return Statistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
 
 
-def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> float:
-    """Return the rms colour difference of splats a few places apart in Morton order."""
-    if len(model) <= _APART or not reach:
-        return 0.2
-    runs = _neighbours(model.means, np.median(sample, axis=0), 2.0 * reach)
+def contrast_of(parts: Iterable[SplatModel]) -> float:
+    """Contrast of a scene of which these are parts, each with all splats of its place."""
+    sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
+    return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
+
+
+def _spread(count: int) -> NDArray[np.intp]:
+    return np.arange(0, count, max(1, count // _SAMPLE))
+
+
+def _reach(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """The centres that are looked at, and how far 80 % of them lie from the median one."""
+    points = np.take(means, _spread(len(means)), axis=0).astype(np.float64)
+    distance = points - np.median(points, axis=0)
+    top = float(np.abs(distance).max())
+    return points, top and top * float(np.quantile(np.sqrt(np.square(distance / top).sum(axis=1)), _CORE))
+
+
+def _rms(squares: float, weights: float) -> float:
+    return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
+
+
+def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> tuple[float, float]:
+    """Return the summed weighted squares of colour differences of splats a few places apart in Morton order."""
     squares = weights = 0.0
-    for rows in runs:
+    if len(model) <= _APART or not reach:
+        return squares, weights
+    for rows in _neighbours(model.means, np.median(sample, axis=0), 2.0 * reach):
         near, far = rows[:-_APART], rows[_APART:]
         weight = model.opacities[near].astype(np.float64) * model.opacities[far]
         colour = np.clip(model.sh0[near].astype(np.float64) - model.sh0[far], -10, 10)
         squares += float((np.square(colour).mean(axis=1) * weight).sum())
         weights += float(weight.sum())
-    return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
+    return squares, weights
 
 
 def _neighbours(means: NDArray[np.float32], centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:

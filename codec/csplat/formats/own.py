@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from csplat._spec import MAGIC
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, encode
-from csplat.files import atomic_writer
+from csplat.encoder import EncodeOptions
 from csplat.formats.format import Format
+from csplat.large import encode_scene
 from csplat.scene import Scene, scene_of
 
 __all__ = ["FORMAT"]
@@ -22,9 +23,8 @@ def _open(path: Path) -> Iterator[Scene]:
 
 
 def _write(path: Path, scene: Scene) -> None:
-    data = encode(scene.model(), EncodeOptions(keep_extra=True))
-    with atomic_writer(path) as stream:
-        stream.write(data)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        encode_scene(scene, path, EncodeOptions(keep_extra=True), folder=Path(folder) / "work")
 
 
 FORMAT = Format(

@@ -21,10 +21,11 @@ from csplat_tools.cli.options import Importance, SourceIndex, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
-from csplat_tools.files.console import Progress, format_bytes, format_table, note
+from csplat_tools.files.by_disk import Scale, expected
+from csplat_tools.files.console import Progress, format_about, format_bytes, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.streams import check_name
+from csplat_tools.files.streams import check_name, source_path
 from csplat_tools.inspect.glance import SIZE, glance
 
 if TYPE_CHECKING:
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
 __all__ = ["encode"]
 
 _TARGET = "Targets (one of the first four, which want the render extra)"
+_ROOM = "Large scenes"
 _RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
+_WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # what wants the scene in memory
 _SPLATS_LOOKED_AT = 1_000_000  # more take longer to render than anybody wants to wait for a remark
 
 
@@ -100,6 +103,53 @@ class Goal(Group):
         return Target(psnr, size, loss, self.keep, bounds)
 
 
+@dataclass(frozen=True)
+class Room(Group):
+    """Where a large scene lies while it is encoded."""
+
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="2GB", rich_help_panel=_ROOM, hidden=True, help="Of all processes; else half of what is free."
+        ),
+    ] = None
+    work: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER", rich_help_panel=_ROOM, hidden=True, help="Where splats wait on the disk; else OUT.work."
+        ),
+    ] = None
+    resume: Annotated[
+        bool, typer.Option("--resume", rich_help_panel=_ROOM, hidden=True, help="Go on with an interrupted encoding.")
+    ] = False
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            rich_help_panel=_ROOM,
+            hidden=True,
+            help="Let the workers of a Dask cluster code, which see the --work folder under the same name.",
+        ),
+    ] = None
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", rich_help_panel=_ROOM, hidden=True, help="Only say what memory, disk and time it takes."
+        ),
+    ] = False
+
+    def read(self) -> Scale:
+        """What was asked for.
+
+        Raises:
+            InputError: the memory is no size.
+        """
+        from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
+
+        memory = None if self.memory is None else parse_size_bytes(self.memory)
+        return Scale(memory, self.work, self.resume, self.dask)
+
+
 @command(
     beside=".csplat",
     one_of=(
@@ -107,6 +157,7 @@ class Goal(Group):
         ("prune_unseen", "max_error"),
         ("attribute_psnr", "target_psnr", "target_size", "max_loss"),
         ("keep", "importance"),
+        *((name, other) for name in ("memory", "work", "resume", "dask", "dry_run") for other in _WHOLE),
     ),
     needs={
         "prune_unseen": ("importance",),
@@ -126,6 +177,7 @@ def encode(
     facts: Facts,
     views: Views,
     virtual: Virtual,
+    room: Room,
     out: Output,
     settings: Settings,
     importance: Importance = None,
@@ -158,6 +210,10 @@ def encode(
     (relative), opacities, sh0, sh1, sh2, sh3; a length may have a unit, as mm,
     where the scene's is known.
 
+    A scene that does not fit the memory is sorted into buckets on the disk, in
+    OUT.csplat.work, and coded by --threads processes. The bytes are the same.
+    What an interrupt leaves there --resume goes on with.
+
     More examples:
       csplat encode scene.ply scene.csplat --keep 0.5
       csplat encode scene.ply scene.csplat --max-loss 0.3dB --data photographs
@@ -167,6 +223,8 @@ def encode(
       csplat encode scene.ply scene.csplat --importance scene.npz
       csplat encode scene.ply scene.csplat --source-index scene.npy
       csplat verify scene.csplat --source scene.ply --source-index scene.npy
+      csplat encode city.ply city.csplat --memory 4GB
+      csplat encode city.ply city.csplat --memory 4GB --dry-run
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
     options = encoding.options(facts, settings)
@@ -179,6 +237,10 @@ def encode(
         goal.read(1.0)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
+    scale = room.read()
+    if room.dry_run:
+        _say_expected(source, options, scale, out)
+        return
     out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".csplat", "encode", source)
     if goal.is_rendered:
@@ -187,22 +249,38 @@ def encode(
     with out.bar() as progress:
         encoded = encode_file(
             source, output, options, facts=facts.read(), strict=facts.strict, importance=importance,
-            prune_unseen=prune_unseen, source_index=source_index,
+            prune_unseen=prune_unseen, source_index=source_index, scale=scale,
             encoder=reaching if goal.is_rendered or goal.max_error is not None else None, progress=progress,
         )  # fmt: skip
     out.findings(encoded.findings)
-    for line in encoded.result.report.notes:
+    for line in encoded.report.notes:
         note(line)
-    out.remark(*encoded.made.lines, *_stated(encoded))
+    out.remark(*(() if encoded.made is None else encoded.made.lines), *_stated(encoded))
     with out.bar() as progress:
         if progress is not None:
             progress("eight small renders", 0.0)
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
-    if not out.quiet and len(encoded.source) <= _SPLATS_LOOKED_AT:
+    if not out.quiet and encoded.made is not None and len(encoded.source) <= _SPLATS_LOOKED_AT:
         facts.seeming(seeming_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
+
+
+def _say_expected(source: str, options: EncodeOptions, scale: Scale, out: Output) -> None:
+    """What an encoding would take."""
+    with source_path(source) as local, out.bar() as progress:
+        if progress is not None:
+            progress("opening", 0.0)
+        found = expected(local, options, scale)
+    needs = found.needs
+    where = "in memory" if needs.in_memory else f"by way of the disk, {counted(needs.workers, 'process', 'processes')}"
+    text = (
+        f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
+        f" {format_about(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
+        f" {format_bytes(needs.disk_bytes)} of disk; the file about {format_bytes(found.file_bytes)}"
+    )
+    out.publish(found.as_json(), text)
 
 
 def _reach(
@@ -242,7 +320,7 @@ def _reach(
 
 
 def _stated(encoded: Encoded) -> list[str]:
-    errors = encoded.result.report.errors
+    errors = encoded.report.errors
     names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
     rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
     return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
@@ -250,24 +328,26 @@ def _stated(encoded: Encoded) -> list[str]:
 
 def _psnr(encoded: Encoded, threads: int | None) -> float | None:
     """About how like its source a scene looks that is not too large; `None` where that is known, or not soon."""
-    is_known = encoded.made.said.get("psnr") is not None
-    if is_known or find_spec("numba") is None or not 0 < len(encoded.source) <= _SPLATS_LOOKED_AT:
+    made = encoded.made
+    if made is None or made.said.get("psnr") is not None or find_spec("numba") is None:
         return None
-    return glance(encoded.source, encoded.result.data, threads=threads)
+    if not 0 < len(encoded.source) <= _SPLATS_LOOKED_AT:
+        return None
+    return glance(encoded.source, made.result.data, threads=threads)
 
 
 def _summary(encoded: Encoded, psnr: float | None, source: str, output: str) -> str:
     """The last line: what it took, and what became of it."""
-    report = encoded.result.report
+    report = encoded.report
     per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", encoded.made.said.get("psnr")
+    quality, found = "", None if encoded.made is None else encoded.made.said.get("psnr")
     if psnr is not None:
         quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
     elif found is not None:
         quality = f", PSNR {found:.2f} dB"
-    elif len(encoded.source) and "-" not in (source, output):
+    elif encoded.made is not None and len(encoded.source) and "-" not in (source, output):
         quality = f"; `csplat compare {source} {output}` says how it looks"
     return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -12,7 +12,7 @@ from csplat_tools.cli.groups import Group
 from csplat_tools.cli.options import chosen
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
-from csplat_tools.files.convert import SceneOverrides
+from csplat_tools.files.facts import SceneOverrides
 
 __all__ = ["ENCODER", "Encoding", "Facts", "Preset"]
 

@@ -13,7 +13,7 @@ from csplat.upright import Direction
 from csplat_render.standing import seeming_up
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up, up_word
-from csplat_tools.files.convert import SceneOverrides
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
 __all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual"]

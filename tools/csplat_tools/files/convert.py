@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from csplat import formats
 from csplat.decoder import Limits, decode
-from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.upright import Direction, with_up
+from csplat_tools.files.by_disk import Scale, encode_by_disk
 from csplat_tools.files.console import Progress
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.scenes import LoadedModel, size_of, without_bands
 from csplat_tools.files.streams import mapped_csplat, source_path, write_array, write_bytes, write_model
 
@@ -23,7 +24,6 @@ __all__ = [
     "Encoded",
     "EncodedScene",
     "Encoder",
-    "SceneOverrides",
     "decode_file",
     "encode_file",
     "findings_as_json",
@@ -56,58 +56,28 @@ _SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
 
 
 @dataclass(frozen=True)
-class SceneOverrides:
-    """What a PLY may not say of its scene; `None` keeps what it says.
-
-    Attributes:
-        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
-        licence: goes into the metadata.
-        up: which direction is up, see `with_up`.
-    """
-
-    coordinate_system: str | None = None
-    unit_metres: float | None = None
-    antialiased: bool | None = None
-    licence: str | None = None
-    up: Direction | None = None
-
-    def applied(self, model: SplatModel) -> SplatModel:
-        """Return the model with these facts."""
-        changes: dict[str, Any] = {
-            name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
-        }
-        if self.licence is not None:
-            changes["metadata"] = {**model.metadata, "licence": self.licence}
-        model = replace(model, **changes) if changes else model
-        return with_up(model, self.up, self.coordinate_system)
-
-
-@dataclass(frozen=True)
 class Encoded:
     """What an encoding took and gave.
 
     Attributes:
-        source: the scene, as it was encoded.
-        made: the file.
+        source: the scene, as it was encoded; of one that did not stay in memory, all but its splats.
+        report: choices and errors.
+        made: the file; `None` where it did not stay in memory.
         findings: what lint noticed in the PLY.
         source_bytes: size of the PLY.
         seconds: reading, encoding and writing.
     """
 
     source: SplatModel
-    made: EncodedScene
+    report: EncodeReport
+    made: EncodedScene | None
     findings: tuple[Finding, ...]
     source_bytes: int
     seconds: float
 
-    @property
-    def result(self) -> EncodeResult:
-        """Of the encoder."""
-        return self.made.result
-
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        report = self.result.report
+        report, made = self.report, self.made
         count = report.splat_count
         return {
             "splats": count,
@@ -121,7 +91,7 @@ class Encoded:
             "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
-            **({self.made.key: dict(self.made.said)} if self.made.key else {}),
+            **({made.key: dict(made.said)} if made is not None and made.key else {}),
         }
 
 
@@ -167,6 +137,7 @@ def encode_file(
     prune_unseen: bool = False,
     source_index: str | None = None,
     encoder: Encoder | None = None,
+    scale: Scale | None = None,
     progress: Progress | None = None,
 ) -> Encoded:
     """Read a PLY, encode it, write the file.
@@ -181,14 +152,22 @@ def encode_file(
         prune_unseen: leave out the splats that no view of the sensitivities saw.
         source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
         encoder: does more than to encode; `importance` is not for it.
+        scale: where the scene may lie. It has to lie in memory for an `encoder`, an importance or a source index.
         progress: is told the stages.
 
     Raises:
         CsplatError: the PLY or the options cannot be used.
         OSError: a file cannot be read or written.
     """
-    start = time.perf_counter()
-    read = read_source(source, facts, strict=strict, keep_extra=options.keep_extra, progress=progress)
+    start, scale = time.perf_counter(), scale or Scale()
+    in_memory = encoder is not None or importance is not None or source_index is not None
+    with source_path(source) as local:
+        if not in_memory and scale.may_leave_memory(local):
+            done = encode_by_disk(local, target, options, facts, scale, strict=strict, progress=progress)
+            if done is not None:
+                seconds = time.perf_counter() - start
+                return Encoded(done.facts, done.report, None, done.findings, size_of(local), seconds)
+        read = read_source(local, facts, strict=strict, keep_extra=options.keep_extra, progress=progress)
     model = read.model
     if encoder is not None:
         made = encoder(model, options, progress)
@@ -205,7 +184,9 @@ def encode_file(
     write_bytes(target, made.result.data)
     if source_index is not None:
         write_array(source_index, made.result.source_index)
-    return Encoded(model, made, read.findings, read.size_bytes, time.perf_counter() - start)
+    return Encoded(
+        model, made.result.report, made, read.findings, read.size_bytes, time.perf_counter() - start
+    )  # fmt: skip
 
 
 def decode_file(

@@ -14,7 +14,8 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat_tools.files.console import Progress
-from csplat_tools.files.convert import SceneOverrides, findings_as_json
+from csplat_tools.files.convert import findings_as_json
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
 from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import local_path

@@ -18,7 +18,8 @@ from csplat.upright import Direction
 from csplat_render.cameras import load_cameras
 from csplat_render.standing import seeming_up
 from csplat_tools.files.console import Progress
-from csplat_tools.files.convert import SceneOverrides, read_source
+from csplat_tools.files.convert import read_source
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 
 __all__ = ["ViewScene", "open_scene", "seeming_wishes", "view_wishes"]

@@ -11,8 +11,8 @@ from csplat.training import TrainedOn
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.files.console import note, step_progress
-from csplat_tools.files.convert import SceneOverrides
 from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import write_model
 from csplat_tools.views import DataOptions
 from csplat_trainer.checkpoint import load_checkpoint

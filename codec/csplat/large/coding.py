@@ -1,0 +1,166 @@
+"""One bucket, from its splats on disk to chunks on disk: what a worker does, in whatever process."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat.encoder.apart import cut_scene
+from csplat.encoder.codebook import Books, served
+from csplat.encoder.container import FileTile, chunk_crc
+from csplat.encoder.draft import within_binary32
+from csplat.encoder.measure import ErrorSums
+from csplat.encoder.plan import Plan
+from csplat.encoder.tile import EncodedTile, encode_tile
+from csplat.files import atomic_writer
+from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats
+
+__all__ = ["Bucket", "Coding", "code_bucket", "coded_bucket"]
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """Splats that are coded together.
+
+    Attributes:
+        number: of all buckets.
+        place: whose file they are in. start, stop: which of its rows.
+    """
+
+    number: int
+    place: int
+    start: int
+    stop: int
+
+    @property
+    def rows(self) -> slice:
+        """Of its file."""
+        return slice(self.start, self.stop)
+
+
+@dataclass(frozen=True, eq=False)
+class Coding:
+    """What all buckets share.
+
+    Attributes:
+        layout: of the splats.
+        plan: complete. books: as decided on the sample, without what is said of its splats.
+    """
+
+    layout: Layout
+    plan: Plan
+    books: Books
+
+
+@dataclass(frozen=True)
+class StoredChunk:
+    """A payload in a file of chunks; see `csplat.encoder.container.Stored`."""
+
+    path: Path
+    offset: int
+    size: int
+    crc: int
+
+    def __len__(self) -> int:
+        return self.size
+
+    def read(self) -> bytes:
+        """Its bytes.
+
+        Raises:
+            InputError: they are not those that were written.
+            OSError: they cannot be read.
+        """
+        with self.path.open("rb") as stream:
+            stream.seek(self.offset)
+            data = stream.read(self.size)
+        if len(data) != self.size or chunk_crc(_spec.CHUNK_TILE, data) != self.crc:
+            raise damaged(self.path)
+        return data
+
+
+def code_bucket(folder: Path, bucket: Bucket, coding: Coding, threads: int = 1) -> int:
+    """Code a bucket, unless that is done.
+
+    Args:
+        folder: the working folder.
+        bucket: which splats.
+        coding: what was decided.
+        threads: of searches; the result does not depend on it.
+
+    Returns:
+        Its splats.
+
+    Raises:
+        InputError: values that no lattice can hold, or a damaged file.
+        OSError: a file cannot be read or written.
+    """
+    if _said_path(folder, bucket).exists():
+        return bucket.stop - bucket.start
+    model = within_binary32(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
+    tables = served(coding.books, model, coding.plan, threads)
+    said, size = [], 0
+    with atomic_writer(_chunks_path(folder, bucket)) as stream:
+        for tile in cut_scene(model, coding.plan):
+            coded = encode_tile(model, tile, coding.plan, tables)
+            said.append(_said(coded, size))
+            for payload in coded.tile.layers.values():
+                assert isinstance(payload, bytes)
+                stream.write(payload)
+                size += len(payload)
+    text = json.dumps(said).encode()
+    with atomic_writer(_said_path(folder, bucket)) as stream:  # last: where it is, all is
+        stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
+    return len(model)
+
+
+def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
+    """The tiles of a bucket; `None` where it is not coded yet.
+
+    Raises:
+        InputError: a file is damaged.
+        OSError: it cannot be read.
+    """
+    path = _said_path(folder, bucket)
+    if not path.exists():
+        return None
+    data = path.read_bytes()
+    if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
+        raise damaged(path)
+    return [_tile(said, _chunks_path(folder, bucket)) for said in json.loads(data[4:])]
+
+
+def _chunks_path(folder: Path, bucket: Bucket) -> Path:
+    return folder / f"chunks-{bucket.number:06}"
+
+
+def _said_path(folder: Path, bucket: Bucket) -> Path:
+    return folder / f"tiles-{bucket.number:06}"
+
+
+def _said(coded: EncodedTile, start: int) -> dict[str, Any]:
+    """Everything of a coded tile but its payloads, JSON-compatible."""
+    layers, at = {}, start
+    for layer, payload in coded.tile.layers.items():
+        assert isinstance(payload, bytes)
+        layers[layer] = (at, len(payload), chunk_crc(_spec.CHUNK_TILE, payload))
+        at += len(payload)
+    tile = {**asdict(replace(coded.tile, layers={})), "layers": layers}
+    return {"tile": tile, "errors": asdict(coded.errors), "coarsened": sorted(coded.coarsened)}
+
+
+def _tile(said: Mapping[str, Any], chunks: Path) -> EncodedTile:
+    fields = dict(said["tile"])
+    fields["layers"] = {int(layer): StoredChunk(chunks, *where) for layer, where in fields["layers"].items()}
+    for name in ("corner", "extent", "tables"):
+        fields[name] = tuple(fields[name])
+    return EncodedTile(
+        FileTile(**fields), np.zeros(0, np.intp), ErrorSums(**said["errors"]), frozenset(said["coarsened"])
+    )  # fmt: skip

@@ -1,0 +1,278 @@
+"""A scene of any size to a file: in memory where it fits, else bucket by bucket by way of the disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from csplat import __version__
+from csplat.encoder import EncodeOptions, EncodeReport, encode_with_report
+from csplat.encoder.buckets import WHOLE, looked_at
+from csplat.encoder.codebook import Books, settled
+from csplat.encoder.coded import notes_on
+from csplat.encoder.container import parts
+from csplat.encoder.draft import Draft, Origin
+from csplat.encoder.measure import ErrorSums
+from csplat.encoder.plan import Plan
+from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene
+from csplat.encoder.statistics import contrast_of
+from csplat.encoder.tile import EncodedTile
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.large.bucket_files import BucketWriter, Layout, bucket_path, read_splats
+from csplat.large.coding import Coding, coded_bucket
+from csplat.large.survey import take_survey
+from csplat.large.work import Work
+from csplat.large.workers import code_here, code_on_cluster
+from csplat.memory import default_bytes
+from csplat.scene import Scene
+
+__all__ = ["Needs", "encode_scene", "needs_of"]
+
+Progress = Callable[[str, float], None]
+
+_MB = 1_000_000
+_PROGRAM = 120 * _MB  # a process that has loaded the encoder
+_PER_ROW = 2.2  # of a bucket or sample in memory, in times of its arrays: what coding takes beside them
+_WHOLE_ROW = 3.0  # the same of a scene that is encoded in memory
+_CODED = 0.3  # bytes of a file per byte of its splats, at most
+_ROOM = 96 * _MB  # splats that wait for being written to their buckets
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What an encoding takes.
+
+    Attributes:
+        in_memory: whether the scene stays in memory.
+        workers: processes that code buckets.
+        memory_bytes: of all processes together, about.
+        disk_bytes: of the working folder and the file, at most.
+    """
+
+    in_memory: bool
+    workers: int
+    memory_bytes: int
+    disk_bytes: int
+
+
+def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = None) -> Needs:
+    """Say what the encoding of a scene will take.
+
+    Args:
+        scene: whose blocks are not looked at.
+        options: of the encoder.
+        memory_bytes: a bound; `None`: half of what is free.
+
+    Raises:
+        InputError: the bound is too low for any way.
+    """
+    bound = default_bytes() if memory_bytes is None else memory_bytes
+    row = Layout(scene.facts).row_bytes
+    whole = _PROGRAM + int(scene.count * row * _WHOLE_ROW)
+    file_bytes = int(scene.count * row * _CODED)
+    if scene.count <= WHOLE or whole <= bound:
+        if memory_bytes is not None and whole > bound:
+            raise _too_low(bound, whole)
+        return Needs(True, options.thread_count, whole, file_bytes)
+    if options.shape_codebook_size:
+        raise InputError(f"a codebook of shapes wants the scene in memory, about {whole / _MB:,.0f} MB")
+    worker = _PROGRAM + int(WHOLE * row * _PER_ROW)
+    here = worker + _ROOM
+    if here > bound:
+        raise _too_low(bound, here)
+    workers = max(1, min(options.thread_count, (bound - _PROGRAM) // worker))
+    memory = here if workers == 1 else max(here, _PROGRAM + workers * worker)
+    return Needs(False, workers, memory, scene.count * row + file_bytes)
+
+
+def _too_low(bound: int, least: int) -> InputError:
+    return InputError(f"{bound / _MB:,.0f} MB of memory are too little for this scene, which wants {least / _MB:,.0f}")
+
+
+def encode_scene(
+    scene: Scene,
+    target: str | os.PathLike[str],
+    options: EncodeOptions | None = None,
+    *,
+    memory_bytes: int | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    cluster: str | None = None,
+    source: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> EncodeReport:
+    """Compress a scene that is read some splats at a time, to the bytes that `encode` makes of it.
+
+    A scene that does not fit the memory is sorted into buckets of neighbours in a working folder on the disk, which
+    are coded one by one, by `options.threads` processes. What is done stays there if it is interrupted. Started from
+    a script, the script's own work has to stand under `if __name__ == "__main__":`, as for all worker processes.
+
+    Args:
+        scene: as `csplat.formats.open_scene` gives it.
+        target: the file, which takes its name when it is complete.
+        options: presets and knobs.
+        memory_bytes: a bound on what all processes take together; `None`: half of what is free. The file does not
+            depend on it.
+        folder: the working folder; `None`: beside the target, its name and `.work`.
+        resume: go on with what an interrupted encoding left in the folder, if it left anything.
+        cluster: address of a Dask scheduler, whose workers see the folder under the same name; they code the buckets.
+        source: what tells this scene from others, JSON-compatible, for `resume`.
+        progress: is told the stage and the share of it that is done, 0 to 1.
+
+    Returns:
+        What was chosen, and errors, as the file states them.
+
+    Raises:
+        InputError: as `encode`; the bound is too low; the disk is too small; the folder is there, or is about another
+            scene; or it is damaged.
+        CsplatError: the scene cannot be read.
+        OSError: a file cannot be read or written; or a worker was killed.
+    """
+    options = options or EncodeOptions()
+    needs = needs_of(scene, options, memory_bytes)
+    if needs.in_memory and not (cluster and scene.count > WHOLE):
+        result = encode_with_report(scene.model(), options, progress=progress)
+        with atomic_writer(target) as stream:
+            stream.write(result.data)
+        return result.report
+    facts = scene.facts if options.keep_extra else replace(scene.facts, extra={})
+    path = Path(target)
+    work_folder = path.with_name(path.name + ".work") if folder is None else Path(folder)
+    key = {
+        "source": dict(source or {}),
+        "options": options.chosen(),
+        "splats": scene.count,
+        "csplat": __version__,
+    }
+    work = Work.begun(work_folder, Layout(facts), key, resume=resume)
+    return _Encoding(scene, path, options, work, needs, cluster, progress or _silent).run()
+
+
+@dataclass(eq=False)
+class _Encoding:
+    """The stages of one encoding by way of the disk, each of which is skipped where the folder has it."""
+
+    scene: Scene
+    target: Path
+    options: EncodeOptions
+    work: Work
+    needs: Needs
+    cluster: str | None
+    progress: Progress
+
+    def run(self) -> EncodeReport:
+        work = self.work
+        if "counts" not in work.state:
+            self._check_disk()
+            self._sort()
+        if "contrast" not in work.state:
+            buckets = work.buckets
+            parts_ = (
+                read_splats(bucket_path(work.folder, one.place), work.layout, one.rows)
+                for one in (buckets[place] for place in looked_at(len(buckets)))
+            )
+            work.note(contrast=contrast_of(parts_))
+        draft, books = self._decide()
+        self._code(Coding(work.layout, draft.plan, books))
+        report = self._write(draft, books)
+        work.remove()
+        return report
+
+    def _check_disk(self) -> None:
+        free = shutil.disk_usage(self.work.folder).free
+        if free < self.needs.disk_bytes:
+            wanted = self.needs.disk_bytes / _MB
+            self.work.remove()
+            raise InputError(
+                f"{self.work.folder.parent} has {free / _MB:,.0f} MB free, and {wanted:,.0f} are wanted while this"
+                " scene is encoded"
+            )
+
+    def _sort(self) -> None:
+        """Two passes over the scene: what it is like, and its splats into their buckets."""
+        work, survey = self.work, self.work.survey
+        if survey is None:
+            survey = take_survey(self._watched("looking"), work.layout)
+            work.keep(survey)
+        work.clear_buckets()
+        writer = BucketWriter(work.folder, work.layout, survey.curve, _ROOM)
+        del survey
+        for block in self._watched("sorting").blocks():
+            writer.add(block)
+        writer.flush()
+        work.note(counts=writer.counts.tolist())
+
+    def _watched(self, stage: str) -> Scene:
+        """The scene, which tells how far it is read."""
+
+        def blocks() -> Any:
+            done = 0
+            for block in self.scene.blocks():
+                done += len(block)
+                self.progress(stage, done / self.scene.count)
+                yield block
+
+        return replace(self.scene, blocks=blocks)
+
+    def _decide(self) -> tuple[Draft, Books]:
+        """Decide on the sample; what comes back has no splats."""
+        work, survey = self.work, self.work.survey
+        assert survey is not None
+        sample = Draft.of(
+            survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress
+        )  # fmt: skip
+        plan, books = replace(sample, plan=settled(sample.plan, survey.largest)).decided(self.progress)
+        return self._without_splats(plan, books)
+
+    def _without_splats(self, plan: Plan, books: Books) -> tuple[Draft, Books]:
+        facts, tables = self.work.layout.facts, books.tables
+        none = np.zeros(0, np.intp)
+        origin = Origin(self.scene.count, none)
+        extras = extra_columns(facts, self.options)
+        draft = Draft(facts, self.options, origin, None, plan, [], extras, None, None)
+        return draft, replace(books, tables=tables.select(none))
+
+    def _code(self, coding: Coding) -> None:
+        folder, buckets = self.work.folder, self.work.buckets
+        left = {one.number: one for one in buckets if coded_bucket(folder, one) is None}
+        for bucket in buckets:
+            if bucket.number not in left:
+                self.work.drop(bucket, list(left.values()))
+        done = sum(one.stop - one.start for one in buckets if one.number not in left)
+        pending = list(left.values())
+        if self.cluster is None:
+            found = code_here(folder, pending, coding, self.needs.workers)
+        else:
+            found = code_on_cluster(folder, pending, coding, self.cluster)
+        for bucket in found:
+            del left[bucket.number]
+            self.work.drop(bucket, list(left.values()))
+            done += bucket.stop - bucket.start
+            self.progress("coding", done / self.scene.count)
+
+    def _write(self, draft: Draft, books: Books) -> EncodeReport:
+        tiles: list[EncodedTile] = []
+        for bucket in self.work.buckets:
+            tiles += coded_bucket(self.work.folder, bucket) or ()
+        errors = ErrorSums.total(part.errors for part in tiles)
+        settings = chosen_settings(draft, books.tables)
+        fields = file_scene(draft, books, file_chunks(draft, errors, settings))
+        size, about = 0, max(1, self.needs.disk_bytes - self.scene.count * self.work.layout.row_bytes)
+        with atomic_writer(self.target) as stream:
+            for piece in parts(fields, [part.tile for part in tiles]):
+                stream.write(piece)
+                size += len(piece)
+                self.progress("writing", min(1.0, size / about))
+        notes = notes_on(tiles, strict=draft.plan.lattice.strict)
+        return EncodeReport(settings, errors.stated(), errors.count, len(tiles), size, notes)
+
+
+def _silent(stage: str, done: float) -> None:
+    """Report to nobody."""

@@ -1,0 +1,47 @@
+"""The first pass over a scene: a sample of it, on which is decided, and how its buckets lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from csplat.encoder.buckets import Curve, sample_rows
+from csplat.large.bucket_files import Layout
+from csplat.model import SplatModel
+from csplat.scene import Scene
+
+__all__ = ["Survey", "take_survey"]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What is known of a scene after one look at each splat.
+
+    Attributes:
+        sample: some of its splats, in the scene's order.
+        largest: magnitude of its largest SH coefficient.
+        curve: its buckets.
+    """
+
+    sample: SplatModel
+    largest: float
+    curve: Curve
+
+
+def take_survey(scene: Scene, layout: Layout) -> Survey:
+    """Look at a scene of more than `WHOLE` splats, and take a sample that has the arrays of the layout.
+
+    Raises:
+        CsplatError: its blocks cannot be read.
+        OSError: likewise.
+    """
+    rows = sample_rows(scene.count)
+    arrays, largest = layout.empty(len(rows)), 0.0
+    for where, block in scene.numbered():
+        first, last = np.searchsorted(rows, (where.start, where.stop))
+        for array, values in zip(arrays, layout.arrays(block), strict=True):
+            array[first:last] = values[rows[first:last] - where.start]
+        largest = max(largest, float(block.shN.max(initial=0.0)), float(-block.shN.min(initial=0.0)))
+    sample = layout.model(arrays)
+    return Survey(sample, largest, Curve.through(sample.means, scene.count))

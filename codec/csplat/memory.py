@@ -1,0 +1,40 @@
+"""How much memory there is."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+__all__ = ["available_bytes", "default_bytes"]
+
+_SHARE = 0.5  # of what is free: others want some, too
+_UNKNOWN = 4 << 30  # where the system does not say
+_LIMITS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+
+
+def available_bytes() -> int:
+    """Bytes that programs can still take: of the machine, or of the control group that this process runs in."""
+    found = [_of_machine()]
+    for limit, current in _LIMITS:
+        with suppress(OSError, ValueError):
+            found.append(int(Path(limit).read_text()) - int(Path(current).read_text()))
+    return max(0, min(found))
+
+
+def default_bytes() -> int:
+    """What a command takes that is not told: half of what is free."""
+    return int(_SHARE * available_bytes())
+
+
+def _of_machine() -> int:
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    with suppress(ValueError, OSError, AttributeError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    return _UNKNOWN

@@ -1,0 +1,270 @@
+"""Scenes that do not fit the memory: encoded by way of the disk, to the bytes that they have in memory."""
+
+import errno
+import json
+import multiprocessing
+import os
+import signal
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, read_ply, write_ply
+from csplat.encoder import buckets, draft
+from csplat.encoder.buckets import Curve, bucket_rows
+from csplat.formats import open_scene
+from csplat.large import bucket_files, encode_scene, encoding
+from csplat.scene import scene_of
+from csplat_conformance.validator import validate
+from csplat_tools.cli.app import app
+
+WHOLE = 1500  # splats, in place of half a million
+FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32)
+
+
+@pytest.fixture(autouse=True)
+def small_buckets(monkeypatch):
+    """Scenes of thousands of splats are large, and fit no memory."""
+    for module in (buckets, draft, encoding):
+        monkeypatch.setattr(module, "WHOLE", WHOLE)
+    monkeypatch.setattr(encoding, "_WHOLE_ROW", 1e6)
+
+
+@pytest.fixture(scope="module")
+def model(sample_path):
+    sample, rng = read_ply(sample_path), np.random.default_rng(5)
+    many = sample.select(rng.integers(0, len(sample), 9000))
+    means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
+    extra = {"confidence": np.arange(9000, dtype=np.uint16)}
+    return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
+
+
+@pytest.fixture(scope="module")
+def expected(model):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(buckets, "WHOLE", WHOLE)
+        patch.setattr(draft, "WHOLE", WHOLE)
+        return encode(model, FAST)
+
+
+def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, expected, tmp_path):
+    stages = {}
+    report = encode_scene(
+        scene_of(model), tmp_path / "out.csplat", FAST, progress=lambda stage, done: stages.update({stage: done})
+    )
+    assert expected == (tmp_path / "out.csplat").read_bytes()
+    assert ["out.csplat"] == [path.name for path in tmp_path.iterdir()]
+    assert (len(model), len(expected)) == (report.splat_count, report.size_bytes)
+    assert {"looking", "sorting", "codebook", "coding", "writing"} == set(stages)
+    assert 1.0 == stages["looking"] == stages["sorting"] == stages["coding"]
+
+
+def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, expected):
+    assert validate(expected).conforms
+    result = encode_with_report(model, FAST)
+    assert 9000 == len(np.unique(result.source_index))
+    decoded = decode(result.data)
+    distance = np.linalg.norm(decoded.means - model.means[result.source_index], axis=1)
+    assert distance.max() <= result.report.errors["means"][0]
+    assert 8 <= result.report.tile_count <= 12
+
+
+def test_two_processes_give_the_bytes_of_one(model, expected, tmp_path):
+    encode_scene(scene_of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
+    assert expected == (tmp_path / "out.csplat").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True),
+        EncodeOptions(preset="small", sh_degree=0),
+        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300),
+    ],
+)
+def test_options_are_those_of_memory(model, options, tmp_path):
+    encode_scene(scene_of(model), tmp_path / "out.csplat", options)
+    assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
+
+
+def test_positions_in_doubles_huge_values_and_huge_sh_are_those_of_memory(model, tmp_path):
+    origin = (4.5e5, 5.4e6, 100.0)
+    doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9
+    scales, shN = model.scales.copy(), model.shN.copy()
+    scales[17], scales[4000], shN[8000] = 95.0, 1e5, 3e8
+    means = (doubles - np.array(origin)).astype(np.float32)
+    hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    encode_scene(scene_of(hard), tmp_path / "out.csplat", options)
+    assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
+
+
+class Interrupt:
+    """Progress that is interrupted in a stage."""
+
+    def __init__(self, stage, error=KeyboardInterrupt, after=0):
+        self.stage, self.error, self.after = stage, error, after
+
+    def __call__(self, stage, _done):
+        if stage == self.stage:
+            self.after -= 1
+            if self.after < 0:
+                raise self.error
+
+
+@pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
+def test_an_interrupted_encoding_goes_on(model, expected, tmp_path, stage, after):
+    target, scene = tmp_path / "out.csplat", scene_of(model)
+    with pytest.raises(KeyboardInterrupt):
+        encode_scene(scene, target, FAST, progress=Interrupt(stage, after=after))
+    assert not target.exists()
+    assert (tmp_path / "out.csplat.work").is_dir()
+    with pytest.raises(InputError, match="left of an encoding that was interrupted"):
+        encode_scene(scene, target, FAST)
+    with pytest.raises(InputError, match="another options"):
+        encode_scene(scene, target, replace(FAST, seed=1), resume=True)
+    coded = []
+    encode_scene(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
+    assert expected == target.read_bytes()
+    if stage == "coding":
+        assert "sorting" not in coded
+    assert [target] == list(tmp_path.iterdir())
+
+
+def test_a_killed_worker_is_said_and_nothing_is_lost(model, expected, tmp_path):
+    target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
+
+    def kill(stage, _done):
+        if stage == "coding":
+            for child in multiprocessing.active_children():
+                os.kill(child.pid, signal.SIGKILL)
+
+    with pytest.raises(OSError, match="a worker process was killed") as error:
+        encode_scene(scene_of(model), target, two, progress=kill)
+    assert errno.ENOMEM == error.value.errno
+    assert not target.exists()
+    encode_scene(scene_of(model), target, two, resume=True)
+    assert expected == target.read_bytes()
+
+
+def test_a_full_disk_is_said_before_and_survived_within(model, expected, tmp_path, monkeypatch):
+    target = tmp_path / "out.csplat"
+    with monkeypatch.context() as patch:
+        patch.setattr(encoding.shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
+        with pytest.raises(InputError, match="0 MB free, and 3 are wanted"):
+            encode_scene(scene_of(model), target, FAST)
+    assert not list(tmp_path.iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(bucket_files, "_append", full)
+        with pytest.raises(OSError, match="No space left"):
+            encode_scene(scene_of(model), target, FAST)
+    assert not target.exists()
+    encode_scene(scene_of(model), target, FAST, resume=True)
+    assert expected == target.read_bytes()
+
+
+def full(stream, _arrays):
+    stream.write(b"half of it")
+    raise OSError(errno.ENOSPC, "No space left on device", stream.name)
+
+
+@pytest.mark.parametrize("kind", ["sample", "bucket-000003", "chunks-000001", "tiles-000001", "state.json"])
+def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
+    target = tmp_path / "out.csplat"
+    with pytest.raises(KeyboardInterrupt):
+        encode_scene(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
+    path = tmp_path / "out.csplat.work" / kind
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 if kind != "state.json" else 0] ^= 0x10
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
+        encode_scene(scene_of(model), target, FAST, resume=True)
+    assert not target.exists()
+
+
+def test_too_little_memory_is_refused(model, tmp_path):
+    with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which wants 2"):
+        encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
+    with pytest.raises(InputError, match="a codebook of shapes wants the scene in memory"):
+        encode_scene(scene_of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
+    assert not list(tmp_path.iterdir())
+
+
+def test_buckets_are_neighbours_and_hold_every_splat_once(model):
+    rows = bucket_rows(model.means)
+    assert np.array_equal(np.arange(len(model)), np.sort(np.concatenate(rows)))
+    assert max(map(len, rows)) <= WHOLE
+    assert all((np.diff(part) > 0).all() for part in rows)
+    whole = np.ptp(model.means, axis=0).prod()
+    assert np.median([np.ptp(model.means[part], axis=0).prod() for part in rows]) < whole / 4
+
+
+def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
+    rng = np.random.default_rng(1)
+    means = rng.normal(0, 1, (9000, 3)).astype(np.float32)
+    means[buckets.sample_rows(9000)] += 100.0  # what is looked at lies where nothing else is
+    parts = bucket_rows(means)
+    assert np.array_equal(np.arange(9000), np.sort(np.concatenate(parts)))
+    assert max(map(len, parts)) <= WHOLE
+    same = bucket_rows(np.ones((4000, 3), np.float32))
+    assert [1333, 1333, 1334] == [len(part) for part in same]
+    assert [0, 1333, 2666, 4000] == [part[0] for part in same] + [4000]
+    assert all(first[-1] < second[0] for first, second in pairwise(same))
+
+
+def test_a_small_scene_has_one_bucket():
+    assert 1 == Curve.through(np.zeros((10, 3), np.float32), WHOLE).count
+
+
+def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, expected, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra `scale` is not installed")
+    target = tmp_path / "out.csplat"
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        victims = [one.pid for one in cluster.workers.values()]
+
+        def kill(stage, _done):
+            if stage == "coding" and victims:
+                os.kill(victims.pop(), signal.SIGKILL)
+                victims.clear()
+
+        encode_scene(scene_of(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
+    assert not victims
+    assert expected == target.read_bytes()
+
+
+def test_a_cluster_that_does_not_answer_is_said(model, tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="the extra `scale` is not installed")
+    monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
+        encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
+
+
+def partial_client(client):
+    return lambda address, **options: client(address, **{**options, "timeout": 0.2})
+
+
+def test_the_command_goes_by_the_disk_where_it_is_told(model, tmp_path, monkeypatch):
+    source, target = tmp_path / "scene.ply", tmp_path / "out.csplat"
+    write_ply(source, replace(model, extra={}, metadata={}))
+    run = CliRunner().invoke
+    foretold = run(app, ["encode", str(source), str(target), "--memory", "300MB", "--dry-run", "--json"])
+    assert 0 == foretold.exit_code
+    said = json.loads(foretold.stdout)
+    assert (9000, 3, False) == (said["splats"], said["sh_degree"], said["in_memory"])
+    assert 0 < said["memory_bytes"] <= 300e6
+    assert not target.exists()
+    options = ["--memory", "300MB", "--preset", "fast", "--sh-degree", "1", "--threads", "1"]
+    monkeypatch.setattr("csplat_tools.files.by_disk._SMALL", 0)
+    monkeypatch.setattr("csplat_tools.files.by_disk._FOLDS", 1000)
+    found = run(app, ["encode", str(source), str(target), *options])
+    assert 0 == found.exit_code, found.output
+    with open_scene(source) as scene:
+        assert encode(scene.model(), EncodeOptions(preset="fast", sh_degree=1)) == target.read_bytes()
+    refused = run(app, ["encode", str(source), str(target), "--resume", "--target-psnr", "40", "--force"])
+    assert 2 == refused.exit_code

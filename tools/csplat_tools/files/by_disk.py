@@ -1,0 +1,154 @@
+"""Encoding a scene that may not fit the memory: what `csplat encode --memory` does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from csplat.encoder import EncodeOptions, EncodeReport
+from csplat.errors import InputError
+from csplat.formats import format_of, open_scene
+from csplat.large import Needs, encode_scene, needs_of
+from csplat.lint import Finding, refuse
+from csplat.memory import default_bytes
+from csplat.model import SplatModel
+from csplat_tools.files.console import Progress
+from csplat_tools.files.facts import SceneOverrides
+from csplat_tools.files.scenes import size_of
+from csplat_tools.files.streams import STANDARD_STREAM
+
+__all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected"]
+
+_FOLDS = 4  # a scene in memory, in times of a PLY's bytes; of others it has to be looked at
+#: By SH degree: seconds per million splats to read and sort, and to code; seconds for a codebook.
+_SECONDS = ((0.3, 3.5, 0.0), (0.45, 5.5, 8.0), (0.7, 8.0, 12.0), (1.0, 11.0, 20.0))
+#: By preset and SH degree, bytes of a file per splat.
+_FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
+_SMALL = 4 << 20  # bytes of a file of any format that fits every memory
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where a scene lies while it is encoded.
+
+    Attributes:
+        memory_bytes: a bound; `None`: half of what is free.
+        folder: the working folder; `None`: beside the file.
+        resume: go on with what the folder has.
+        cluster: address of a Dask scheduler.
+    """
+
+    memory_bytes: int | None = None
+    folder: str | None = None
+    resume: bool = False
+    cluster: str | None = None
+
+    def may_leave_memory(self, path: Path) -> bool:
+        """Whether it has to be found out if a scene fits the memory."""
+        if self.cluster is not None or self.resume:
+            return True
+        bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
+        size = size_of(path)
+        return size > _SMALL and (format_of(path).name != "ply" or size * _FOLDS > bound)
+
+
+@dataclass(frozen=True)
+class ByDisk:
+    """A scene that was encoded without being in memory."""
+
+    facts: SplatModel
+    report: EncodeReport
+    findings: tuple[Finding, ...]
+
+
+def encode_by_disk(
+    local: Path,
+    target: str,
+    options: EncodeOptions,
+    facts: SceneOverrides | None,
+    scale: Scale,
+    *,
+    strict: bool,
+    progress: Progress | None,
+) -> ByDisk | None:
+    """Encode a scene by way of the disk; `None` where it fits the memory.
+
+    Args:
+        local: the scene, in any format.
+        target: the file to write.
+        options: of the encoder.
+        facts: what the scene does not say.
+        scale: memory, disk, workers.
+        strict: refuse what would be repaired.
+        progress: is told the stages.
+
+    Raises:
+        CsplatError: as of `encode_scene`; or it is too large to go to standard output.
+        OSError: likewise.
+    """
+    if progress is not None:
+        progress("opening", 0.0)
+    with open_scene(local) as opened:
+        needs = needs_of(opened, options, scale.memory_bytes)
+        if needs.in_memory and scale.cluster is None and not scale.resume:
+            return None
+        if target == STANDARD_STREAM:
+            raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
+        refuse(opened.findings, strict=strict)
+        told = facts or SceneOverrides()
+        scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
+        status = local.stat()
+        report = encode_scene(
+            scene, target, options, memory_bytes=scale.memory_bytes, folder=scale.folder, resume=scale.resume,
+            cluster=scale.cluster, progress=progress,
+            source={"name": local.name, "size": size_of(local), "changed": status.st_mtime_ns},
+        )  # fmt: skip
+        return ByDisk(scene.facts, report, tuple(opened.findings))
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What an encoding will take.
+
+    Attributes:
+        count, sh_degree: of the scene.
+        needs: memory, disk, workers.
+        seconds: about, by what was measured on one core of 2024, here with as many as will work.
+        file_bytes: of the file, about, at the preset's precision.
+    """
+
+    count: int
+    sh_degree: int
+    needs: Needs
+    seconds: float
+    file_bytes: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, JSON-compatible."""
+        return {
+            "splats": self.count,
+            "sh_degree": self.sh_degree,
+            "in_memory": self.needs.in_memory,
+            "workers": self.needs.workers,
+            "memory_bytes": self.needs.memory_bytes,
+            "disk_bytes": self.needs.disk_bytes,
+            "seconds": round(self.seconds, 1),
+            "file_bytes": self.file_bytes,
+        }
+
+
+def expected(local: Path, options: EncodeOptions, scale: Scale) -> Expected:
+    """Say what encoding a scene will take, without looking at its splats.
+
+    Raises:
+        CsplatError: it cannot be read, or the memory is too little.
+        OSError: it cannot be read.
+    """
+    with open_scene(local) as opened:
+        needs, count = needs_of(opened, options, scale.memory_bytes), opened.count
+        degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)
+    read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
+    passes = 1 if needs.in_memory else 4
+    seconds = count / 1e6 * (read * passes + code / needs.workers) + book * min(1.0, count / 5e5) / needs.workers
+    return Expected(count, degree, needs, seconds, round(count * _FILE_BYTES[options.preset][degree]))

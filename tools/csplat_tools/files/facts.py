@@ -1,0 +1,38 @@
+"""What a file may not say of its scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from csplat.model import SplatModel
+from csplat.upright import Direction, with_up
+
+__all__ = ["SceneOverrides"]
+
+
+@dataclass(frozen=True)
+class SceneOverrides:
+    """What a PLY may not say of its scene; `None` keeps what it says.
+
+    Attributes:
+        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
+        licence: goes into the metadata.
+        up: which direction is up, see `with_up`.
+    """
+
+    coordinate_system: str | None = None
+    unit_metres: float | None = None
+    antialiased: bool | None = None
+    licence: str | None = None
+    up: Direction | None = None
+
+    def applied(self, model: SplatModel) -> SplatModel:
+        """Return the model with these facts."""
+        changes: dict[str, Any] = {
+            name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
+        }
+        if self.licence is not None:
+            changes["metadata"] = {**model.metadata, "licence": self.licence}
+        model = replace(model, **changes) if changes else model
+        return with_up(model, self.up, self.coordinate_system)
