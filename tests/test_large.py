@@ -123,7 +123,7 @@ def test_an_interrupted_encoding_goes_on(model, expected, tmp_path, stage, after
         encode_scene(scene, target, FAST, progress=Interrupt(stage, after=after))
     assert not target.exists()
     assert (tmp_path / "out.csplat.work").is_dir()
-    with pytest.raises(InputError, match="left of an encoding that was interrupted"):
+    with pytest.raises(InputError, match="left of an interrupted encoding"):
         encode_scene(scene, target, FAST)
     with pytest.raises(InputError, match="another options"):
         encode_scene(scene, target, replace(FAST, seed=1), resume=True)

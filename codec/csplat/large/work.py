@@ -60,7 +60,9 @@ class Work:
             return work
         if folder.exists():
             if not resume:
-                raise InputError(f"{folder} is left of an encoding that was interrupted: go on with it, or remove it")
+                raise InputError(
+                    f"{folder} is left of an interrupted encoding: `--resume` goes on with it; or remove it"
+                )
             shutil.rmtree(folder)
         folder.mkdir()
         work.note(key=key)

@@ -13,7 +13,7 @@ from csplat.large import Needs, encode_scene, needs_of
 from csplat.lint import Finding, refuse
 from csplat.memory import default_bytes
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress
+from csplat_tools.files.console import Progress, note
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import STANDARD_STREAM
@@ -99,11 +99,17 @@ def encode_by_disk(
         told = facts or SceneOverrides()
         scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
         status = local.stat()
-        report = encode_scene(
-            scene, target, options, memory_bytes=scale.memory_bytes, folder=scale.folder, resume=scale.resume,
-            cluster=scale.cluster, progress=progress,
-            source={"name": local.name, "size": size_of(local), "changed": status.st_mtime_ns},
-        )  # fmt: skip
+        try:
+            report = encode_scene(
+                scene, target, options, memory_bytes=scale.memory_bytes, folder=scale.folder, resume=scale.resume,
+                cluster=scale.cluster, progress=progress,
+                source={"name": local.name, "size": size_of(local), "changed": status.st_mtime_ns},
+            )  # fmt: skip
+        except (KeyboardInterrupt, OSError):
+            folder = Path(scale.folder or f"{target}.work")
+            if folder.exists():
+                note(f"{folder} keeps what is done: --resume goes on with it")
+            raise
         return ByDisk(scene.facts, report, tuple(opened.findings))
 
 

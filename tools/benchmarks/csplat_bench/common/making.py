@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_render import Camera
 from csplat_render.rasterise import Rasteriser
 
-__all__ = ["ARRAYS", "blow_up", "crowd", "split", "with_splats"]
+__all__ = ["ARRAYS", "blow_up", "copies", "crowd", "split", "with_splats"]
 
 F32 = NDArray[np.float32]
 
@@ -30,17 +30,21 @@ def blow_up(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
         count: splats of the result.
         seed: of the differences.
     """
-    rng = np.random.default_rng(seed)
-    low, high = np.quantile(model.means, (0.01, 0.99), axis=0)
-    copies = math.ceil(count / len(model))
-    columns = math.ceil(math.sqrt(copies))
-    parts = []
-    for copy in range(copies):
-        part = model.select(slice(0, min(len(model), count - copy * len(model))))
-        shift = (high - low) * 1.5 * np.array([copy % columns, copy // columns, 0])
-        parts.append(_vary(part, rng, shift.astype(np.float32)) if copy else part)
+    parts = list(copies(model, count, seed))
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     return replace(model, **arrays)
+
+
+def copies(model: SplatModel, count: int, seed: int = 0) -> Iterator[SplatModel]:
+    """What `blow_up` puts together, copy by copy; the rest as there."""
+    rng = np.random.default_rng(seed)
+    low, high = np.quantile(model.means, (0.01, 0.99), axis=0)
+    many = math.ceil(count / len(model))
+    columns = math.ceil(math.sqrt(many))
+    for copy in range(many):
+        part = model.select(slice(0, min(len(model), count - copy * len(model))))
+        shift = (high - low) * 1.5 * np.array([copy % columns, copy // columns, 0])
+        yield _vary(part, rng, shift.astype(np.float32)) if copy else part
 
 
 def _vary(model: SplatModel, rng: np.random.Generator, shift: F32) -> SplatModel:
