@@ -73,6 +73,14 @@ def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, expected):
     assert 8 <= result.report.tile_count <= 12
 
 
+def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
+    other = draft.Draft.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
+    assert other.sample is not None
+    assert np.array_equal(-model.shN[buckets.sample_rows(9000)], other.sample.model.shN)
+    decoded = decode(other.coded().write().data)
+    assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
+
+
 def test_two_processes_give_the_bytes_of_one(model, expected, tmp_path):
     encode_scene(scene_of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
     assert expected == (tmp_path / "out.csplat").read_bytes()

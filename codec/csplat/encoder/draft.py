@@ -180,7 +180,9 @@ class Draft:
             InputError: they are of another shape or type, or not finite.
         """
         model = replace(self.model, sh0=sh0, shN=shN)
-        return replace(self, model=model, origin=replace(self.origin, refitted=True))
+        rows = None if self.sample is None else sample_rows(len(model))
+        sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
+        return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
     def coded(self, progress: Progress | None = None) -> Coded:
         """Decide how SH is coded, and code the tiles: most of the work.
