@@ -241,9 +241,11 @@ def test_a_budget_counts_four_bytes_for_each_entry_and_column_of_a_codebook(kind
         decode(built.data, limits=Limits(bytes=limit - 1))
 
 
-def test_limits_bind_the_chosen_tiles_and_tiles_one_by_one():
+def test_limits_bind_the_chosen_tiles():
     assert 2 == len(decode(RICH, limits=Limits(splats=2), tiles=[1]))
-    assert 2 == len(list(iter_tiles(RICH, limits=Limits(splats=0))))
+    assert 2 == len(list(iter_tiles(RICH, limits=Limits(splats=5))))
+    with pytest.raises(LimitError, match="splats"):
+        iter_tiles(RICH, limits=Limits(splats=4))
 
 
 @pytest.mark.parametrize(

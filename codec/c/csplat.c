@@ -49,7 +49,6 @@
 #define SPEC_ANCILLARY_ID_MIN 128
 #define SPEC_ANCILLARY_SCENE_FLAGS 240
 #define SPEC_ANCILLARY_CHUNK_FLAGS 65280
-#define SPEC_BUDGET_SPLATS 33554432
 #define SPEC_BUDGET_BYTES INT64_C(8589934592)
 #define SPEC_BUDGET_BYTES_JS INT64_C(2147483648)
 #define SPEC_BUDGET_JSON_BYTES 67108864
@@ -2786,7 +2785,7 @@ static csplat_code open_file(csplat **out, const void *memory, const csplat_sour
     memset(error, 0, sizeof *error);
     if (options)
         o = *options;
-    o.splats_max = o.splats_max ? o.splats_max : SPEC_BUDGET_SPLATS;
+    o.splats_max = o.splats_max ? o.splats_max : UINT64_MAX;
     o.bytes_max = o.bytes_max ? o.bytes_max : SPEC_BUDGET_BYTES;
     o.json_bytes_max = o.json_bytes_max ? o.json_bytes_max : SPEC_BUDGET_JSON_BYTES;
     if (!o.allocate || !o.release) {

@@ -69,7 +69,7 @@ typedef struct csplat_source {
 
 /* Everything here may be 0, which is the default. */
 typedef struct csplat_options {
-    uint64_t splats_max;     /* of csplat_decode, 2^25 */
+    uint64_t splats_max;     /* of csplat_decode, any number */
     uint64_t bytes_max;      /* of the arrays of csplat_decode and of codebooks, 8 GiB */
     uint64_t json_bytes_max; /* of one text of csplat_read_text, 64 MiB */
     /* malloc and free. Both or none. */

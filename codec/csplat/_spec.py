@@ -31,8 +31,7 @@ EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
 ANCILLARY_ID_MIN: Final = 128  # least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
 ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
-BUDGET_SPLATS: Final = 33554432  # default budget: splats of one whole-scene decode, 2^25
-BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables, 8 GiB
+BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
 BUDGET_BYTES_JS: Final = 2147483648  # default budget in JavaScript, 2 GiB
 BUDGET_JSON_BYTES: Final = 67108864  # default budget: bytes of one JSON chunk after inflation, 64 MiB
 

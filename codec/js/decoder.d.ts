@@ -2,7 +2,7 @@
 
 /** What a file may ask for. Defaults are those of the spec, section 8. */
 export interface Limits {
-  /** Splats of one decode, 2^25. */
+  /** Splats of one decode; any number, if left out. */
   splats?: number;
   /** Bytes of decoded arrays and tables, 2 GiB; also of a file that a server sends without ranges. */
   bytes?: number;

@@ -23,8 +23,7 @@ export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
 export const ANCILLARY_ID_MIN = 128; // least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
 export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
-export const BUDGET_SPLATS = 33554432; // default budget: splats of one whole-scene decode, 2^25
-export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables, 8 GiB
+export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
 export const BUDGET_BYTES_JS = 2147483648; // default budget in JavaScript, 2 GiB
 export const BUDGET_JSON_BYTES = 67108864; // default budget: bytes of one JSON chunk after inflation, 64 MiB
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,15 +18,15 @@ __all__ = ["Limits", "check_budget", "float_bytes", "integer_bytes"]
 
 @dataclass(frozen=True)
 class Limits:
-    """Budgets of one decode; the defaults are the registry's.
+    """Budgets of one decode; the defaults of `bytes` and `json_bytes` are the registry's.
 
     Attributes:
-        splats: splats of a decode of the whole scene, or of the chosen tiles.
+        splats: splats of a decode of the whole scene, or of the chosen tiles; any number if left out.
         bytes: memory of the arrays that are returned and of the codebooks they need.
         json_bytes: length of one JSON text.
     """
 
-    splats: int = _spec.BUDGET_SPLATS
+    splats: int = sys.maxsize
     bytes: int = _spec.BUDGET_BYTES
     json_bytes: int = _spec.BUDGET_JSON_BYTES
 
@@ -73,7 +74,7 @@ def check_budget(
     """
     counts = [tile.splat_count for tile in tiles]
     at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
-    if at_once and sum(counts) > limits.splats:
+    if sum(counts) > limits.splats:
         raise LimitError("splats", sum(counts), limits.splats, offset=at, clause="LIM-1")
     splats = sum(counts) if at_once else max(counts, default=0)
     wanted = splats * splat_bytes + table_bytes(header, tiles, degree, whole=whole)

@@ -13,12 +13,13 @@ from csplat_conformance.scene import Block, Stream
 
 __all__ = ["index_recipes"]
 
+_SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # in the arrays of section 3, at SH degree 3
 _NAN, _INF = float("nan"), float("inf")
 
 
 def index_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [*_index(), *_attributes(), _splats_beyond_budget()]
+    return [*_index(), *_attributes(), _arrays_beyond_budget()]
 
 
 def _index() -> list[Recipe]:
@@ -208,15 +209,15 @@ def _full_runs(block: Block) -> Stream:
     return Stream(1, (_spec.TRANSFORM_RUN_LENGTH,), packed=bytes(q & 255 for q in row) + b"\xff\xff" * len(row))
 
 
-def _splats_beyond_budget() -> Recipe:
-    """Return a sound file of one splat more than the default budget; those of a tile are all the same."""
-    tiles = -(-_spec.BUDGET_SPLATS // _spec.TILE_SPLATS_MAX)
+def _arrays_beyond_budget() -> Recipe:
+    """Return a sound file of SH degree 3 whose arrays exceed the default budget; splats of a tile are all the same."""
+    tiles = _spec.BUDGET_BYTES // (_SPLAT_BYTES * _spec.TILE_SPLATS_MAX) + 1
     one = tile(1, 1, 0, {SCALES: signed([[-4, -5, -6]]), SH0: signed([[7, 8, 9]])})
     run = {attribute: replace(block, how=_full_runs(block)) for attribute, block in one.blocks.items()}
 
     @cache
     def data() -> bytes:
-        built = build(scene(tiles=[*[replace(one, blocks=run)] * tiles, one]))
+        built = build(scene(3, tiles=[*[replace(one, blocks=run)] * tiles, one]))
         n = _spec.TILE_SPLATS_MAX
         changes = {"index.splat_count": tiles * n + 1}
         for i in range(tiles):
@@ -227,5 +228,5 @@ def _splats_beyond_budget() -> Recipe:
         return built.patched(changes)
 
     place = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
-    why = "2^25 + 1 splats, one beyond the default budget"
-    return Recipe("invalid/splats_beyond_budget", why, ("LIM-1",), data, None, "E_LIMIT", place)
+    why = "arrays of a little more than 8 GiB, the default budget"
+    return Recipe("invalid/arrays_beyond_budget", why, ("LIM-1",), data, None, "E_LIMIT", place)

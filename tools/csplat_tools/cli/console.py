@@ -35,7 +35,10 @@ _WORDS = {
     "E_CRC": _DAMAGED,
     "E_CODER": _DAMAGED,
     "E_UNSUPPORTED": ("", _NEWER),
-    "E_LIMIT": ("the scene is larger than is allowed here", "`csplat decode --max-splats` allows more"),
+    "E_LIMIT": (
+        "the scene is larger than is allowed here",
+        "`csplat decode` and `csplat verify` take scenes of any size",
+    ),
 }
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {

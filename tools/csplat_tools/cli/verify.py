@@ -29,7 +29,7 @@ def verify(
     ] = None,
     max_splats: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Refuse a scene of more splats; 2^25 by default with --source."),
+        typer.Option(metavar="N", min=1, help="Refuse a scene of more splats."),
     ] = None,
 ) -> None:
     """Check a file against every clause of the format, and its stated errors.
