@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import mmap as mmaps
 import os
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["BinaryFile", "Buffer", "File", "mapped"]
+__all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped"]
+
+
+_STEP_BYTES = 1 << 25  # of a file are read from one time that it is let go of to the next
 
 
 class BinaryFile(Protocol):
@@ -36,3 +40,26 @@ def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
             return mmap(stream.fileno(), 0, access=ACCESS_READ)
         except (ValueError, OSError):  # empty, or a pipe
             return stream.read()
+
+
+class LetGo:
+    """Keeps a mapped file from filling the memory of who goes through it. Owns how much was read since the last time.
+
+    What was read counts as memory of the process until the machine is short of it; let go of, it is read again when it
+    is wanted again. Bytes in memory stay as they are.
+
+    Args:
+        view: the file.
+    """
+
+    def __init__(self, view: memoryview) -> None:
+        known = hasattr(mmap, "madvise") and hasattr(mmaps, "MADV_DONTNEED")
+        self._file = view.obj if known and isinstance(view.obj, mmap) else None
+        self._read_bytes = 0
+
+    def after(self, size_bytes: int) -> None:
+        """Note that so much has been read, and let go of everything now and then."""
+        self._read_bytes += size_bytes
+        if self._file is not None and self._read_bytes >= _STEP_BYTES:
+            self._read_bytes = 0
+            self._file.madvise(mmaps.MADV_DONTNEED)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+from csplat.decoder import decode
 from csplat.errors import InputError
 from csplat.files import local_file
 from csplat.foreign import HEAD_SIZE, unknown
@@ -37,7 +38,7 @@ __all__ = [
     "write_scene",
 ]
 
-_PLY = "ply"  # its reader needs no second pass where all of a scene is wanted at once
+_PLY, _OWN = "ply", "csplat"  # their readers need no second copy where all of a scene is wanted at once
 
 _MODULES = (
     "csplat.formats.compressed_ply",
@@ -94,6 +95,9 @@ def read(
         found = _readable(path, format)
         if found.name == _PLY:
             return read_ply(path, strict=strict, keep_extra=keep_extra, report=report)
+        if found.name == _OWN:
+            model = decode(path)
+            return model if keep_extra or not model.extra else replace(model, extra={})
         with _opened(found, path) as scene:
             model = scene.model()
             if report is not None:

@@ -8,18 +8,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from csplat._spec import MAGIC
-from csplat.decoder import decode
+from csplat.decoder import open_tiles
 from csplat.encoder import EncodeOptions
 from csplat.formats.format import Format
 from csplat.large import encode_scene
-from csplat.scene import Scene, scene_of
+from csplat.scene import Scene
 
 __all__ = ["FORMAT"]
 
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
-    yield scene_of(decode(path))
+    opened = open_tiles(path)
+    yield Scene(opened.header.splat_count, opened.facts, opened.models)
 
 
 def _write(path: Path, scene: Scene) -> None:

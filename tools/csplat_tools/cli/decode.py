@@ -25,13 +25,12 @@ def decode(
     absolute: Annotated[
         bool, typer.Option("--absolute", help="Add the origin to the positions and write them as doubles.")
     ] = False,
-    max_splats: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Refuse a scene of more splats; 2^25 by default.")
-    ] = None,
+    max_splats: Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse a scene of more splats.")] = None,
 ) -> None:
     """Turn a .csplat file into a PLY that every 3DGS viewer opens.
 
-    All checks of the format are made first: a damaged file gives no PLY.
+    All checks of the format are made: a damaged file gives no PLY. Goes
+    tile by tile: a scene need not fit the memory.
 
     Examples:
       csplat decode scene.csplat scene.ply
@@ -41,8 +40,8 @@ def decode(
     out.check(output, inputs=(source,))
     check_name(output, ".ply", "decode", source)
     with out.bar() as progress:
-        model = decode_file(
+        count, degree = decode_file(
             source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, facts=upright.upright(),
             progress=progress,
         )  # fmt: skip
-    out.publish({"splats": len(model), "sh_degree": model.sh_degree})
+    out.publish({"splats": count, "sh_degree": degree})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,8 +96,7 @@ def encode_by_disk(
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
         refuse(opened.findings, strict=strict)
-        told = facts or SceneOverrides()
-        scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
+        scene = (facts or SceneOverrides()).applied_to_all(opened)
         status = local.stat()
         try:
             report = encode_scene(

@@ -8,17 +8,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from csplat import formats
-from csplat.decoder import Limits, decode
+from csplat.decoder import Limits, open_tiles
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
+from csplat.scene import Scene
 from csplat_tools.files.by_disk import Scale, encode_by_disk
 from csplat_tools.files.console import Progress
 from csplat_tools.files.facts import SceneOverrides
-from csplat_tools.files.scenes import LoadedModel, size_of, without_bands
-from csplat_tools.files.streams import mapped_csplat, source_path, write_array, write_bytes, write_model
+from csplat_tools.files.filters import Filters
+from csplat_tools.files.scenes import LoadedModel, size_of, watched
+from csplat_tools.files.streams import is_one_way, mapped_csplat, source_path, write_array, write_bytes, write_model
 
 __all__ = [
     "Encoded",
@@ -27,7 +29,6 @@ __all__ = [
     "decode_file",
     "encode_file",
     "findings_as_json",
-    "limits_for",
     "read_source",
 ]
 
@@ -51,8 +52,6 @@ class EncodedScene:
 
 #: Makes a file of a scene.
 Encoder = Callable[[SplatModel, EncodeOptions, Progress | None], EncodedScene]
-
-_SPLAT_BYTES_MAX = 512  # 236 at SH degree 3, and room for extra columns
 
 
 @dataclass(frozen=True)
@@ -198,44 +197,35 @@ def decode_file(
     max_splats: int | None = None,
     facts: SceneOverrides | None = None,
     progress: Progress | None = None,
-) -> SplatModel:
-    """Read a .csplat file, write a PLY.
+) -> tuple[int, int]:
+    """Read a .csplat file, write a PLY, some splats at a time.
 
     Args:
         source: the file, or `-`.
         target: the PLY to write, or `-`. Whether it may be replaced has been settled before.
         sh_degree: leave out the bands above.
         absolute: add the origin and write doubles.
-        max_splats: budget; the default is the decoder's.
+        max_splats: refuse more; `None`: none are too many.
         facts: what the PLY is to say instead of what the file does.
         progress: called with the stage's name and the share done.
 
     Returns:
-        What was written.
+        How many splats were written, and their SH degree.
 
     Raises:
-        CsplatError: the file is not valid, or too large.
+        CsplatError: the file is not valid, or too large; then there is no PLY.
         OSError: a file cannot be read or written.
     """
-    report = progress or (lambda _stage, _done: None)
-    report("decoding", 0.0)
     with mapped_csplat(source) as data:
-        # All bands, even if not all are wanted: damage anywhere gives no PLY.
-        model = (facts or SceneOverrides()).applied(decode(data, limits=limits_for(max_splats)))
-    if sh_degree is not None:
-        model = without_bands(model, sh_degree)
-    report("decoding", 1.0)
-    report("writing", 0.0)
-    write_model(target, model, absolute=absolute)
-    report("writing", 1.0)
-    return model
-
-
-def limits_for(max_splats: int | None) -> Limits:
-    """Return the decoder's budgets, or what that many splats can take."""
-    if max_splats is None:
-        return Limits()
-    return Limits(splats=max_splats, bytes=max(Limits().bytes, max_splats * _SPLAT_BYTES_MAX))
+        opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
+        decoded = Scene(opened.header.splat_count, opened.facts, opened.models)
+        # All bands are decoded, even if not all are wanted: damage anywhere gives no PLY.
+        scene = Filters(sh_degree=sh_degree).applied((facts or SceneOverrides()).applied_to_all(decoded))
+        if is_one_way(target):
+            for _ in watched(decoded, "checking", progress).blocks():
+                pass
+        write_model(target, watched(scene, "decoding", progress), absolute=absolute)
+    return scene.count, scene.facts.sh_degree
 
 
 def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,11 @@ from csplat.errors import InputError
 from csplat.formats import Format, formats, named, named_by, open_scene
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat.model import SplatModel
-from csplat.scene import Scene
 from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
-from csplat_tools.files.scenes import size_of
+from csplat_tools.files.scenes import size_of, watched
 from csplat_tools.files.streams import local_path
 
 __all__ = ["Converted", "convert_file", "format_rows"]
@@ -106,8 +103,7 @@ def convert_file(
     if writes.write is None:
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
     with local_path(source) as local, open_scene(local, read_as, level=level) as opened:
-        told = facts or SceneOverrides()
-        scene = replace(opened, facts=told.applied(opened.facts), blocks=lambda: map(told.applied, opened.blocks()))
+        scene = (facts or SceneOverrides()).applied_to_all(opened)
         before = scene.facts.coordinate_system
         scene = (filters or Filters()).applied(scene)
         lost = writes.losses(scene.facts)
@@ -122,7 +118,7 @@ def convert_file(
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {made.losses()}")
         if not dry_run:
-            writes.write(Path(target), _watched(scene, progress))
+            writes.write(Path(target), watched(scene, "reading", progress))
             made = replace(made, size_bytes=size_of(Path(target)))
         return replace(made, findings=tuple(opened.findings))
 
@@ -146,20 +142,3 @@ def format_rows() -> list[tuple[str, ...]]:
 
 def _exactness(one: Format) -> str:
     return "all" if set(ARRAYS) <= one.exact else ", ".join(name for name in ARRAYS if name in one.exact) or "-"
-
-
-def _watched(scene: Scene, progress: Progress | None) -> Scene:
-    """The same scene; who goes through its blocks tells how far it has come."""
-    if progress is None:
-        return scene
-
-    def blocks() -> Iterator[SplatModel]:
-        done = 0
-        for model in scene.blocks():
-            progress("reading", done / max(1, scene.count))
-            yield model
-            done += len(model)
-        progress("reading", 1.0)
-        progress("writing", 0.0)  # or going through it once more, which begins anew
-
-    return replace(scene, blocks=blocks)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from csplat.model import SplatModel
+from csplat.scene import Scene
 from csplat.upright import Direction, with_up
 
 __all__ = ["SceneOverrides"]
@@ -36,3 +37,7 @@ class SceneOverrides:
             changes["metadata"] = {**model.metadata, "licence": self.licence}
         model = replace(model, **changes) if changes else model
         return with_up(model, self.up, self.coordinate_system)
+
+    def applied_to_all(self, scene: Scene) -> Scene:
+        """Return the scene with these facts."""
+        return replace(scene, facts=self.applied(scene.facts), blocks=lambda: map(self.applied, scene.blocks()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,11 @@ from csplat.decoder import SceneHeader, StatedErrors, decode_scene
 from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
+from csplat.scene import Scene
+from csplat_tools.files.console import Progress
 from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
 
-__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "without_bands"]
+__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "watched", "without_bands"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,3 +112,20 @@ def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:
     if sh_degree >= model.sh_degree:
         return model
     return replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
+
+
+def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
+    """The same scene; who goes through its blocks tells how far it has come."""
+    if progress is None:
+        return scene
+
+    def blocks() -> Iterator[SplatModel]:
+        done = 0
+        for model in scene.blocks():
+            progress(stage, done / max(1, scene.count))
+            yield model
+            done += len(model)
+        progress(stage, 1.0)
+        progress("writing", 0.0)  # or going through it once more, which begins anew
+
+    return replace(scene, blocks=blocks)

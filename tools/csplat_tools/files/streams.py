@@ -10,7 +10,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from mmap import mmap
 from pathlib import Path
@@ -26,7 +26,8 @@ from csplat.foreign import HEAD_SIZE, foreign_name, refuse_known
 from csplat.formats import formats
 from csplat.inputs import File, mapped
 from csplat.model import SplatModel
-from csplat.ply import write_ply
+from csplat.ply_write import write_ply, write_scene_ply
+from csplat.scene import Scene
 
 __all__ = [
     "STANDARD_STREAM",
@@ -34,6 +35,7 @@ __all__ = [
     "check_output",
     "check_outputs",
     "is_csplat",
+    "is_one_way",
     "local_path",
     "mapped_csplat",
     "open_output",
@@ -258,14 +260,20 @@ def write_json(path: str, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def write_model(path: str, model: SplatModel, *, absolute: bool) -> None:
+def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None:
     """Write a PLY, or one to standard output."""
+    write: Callable[..., None] = write_scene_ply if isinstance(model, Scene) else write_ply
     if path != STANDARD_STREAM:
         with open_output(path) as stream:
-            write_ply(stream, model, absolute=absolute)
+            write(stream, model, absolute=absolute)
         return
-    write_ply(sys.stdout.buffer, model, absolute=absolute)
+    write(sys.stdout.buffer, model, absolute=absolute)
     sys.stdout.buffer.flush()
+
+
+def is_one_way(path: str) -> bool:
+    """Whether what is written there cannot be taken back: standard output, a device, a named pipe."""
+    return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
 @contextmanager

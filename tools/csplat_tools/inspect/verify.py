@@ -11,7 +11,6 @@ from csplat.files import read_array
 from csplat_conformance.stated import Proof, Source, prove
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
-from csplat_tools.files.convert import limits_for
 from csplat_tools.files.streams import mapped_csplat, source_path
 
 __all__ = ["Verified", "verify_file"]
@@ -80,7 +79,7 @@ def verify_file(
         validation = validate(data, splats_max=max_splats, progress=progress)
         if source is None or not validation.conforms:
             return Verified(validation, None)
-        scene = decode_scene(data, limits=limits_for(max_splats))
+        scene = decode_scene(data)
     with source_path(source) as path_of_source:
         model = formats.read(path_of_source, keep_extra=bool(scene.header.extras))
     proof = prove(Source.of(model), scene.model, scene.header, scene.stated_errors, rows, progress=progress)

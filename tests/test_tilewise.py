@@ -1,0 +1,138 @@
+"""Scenes that are decoded tile by tile."""
+
+import io
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+from csplat import formats, inputs
+from csplat.decoder import Limits, decode, open_tiles, read_header
+from csplat.errors import CsplatError, LimitError
+from csplat.ply import write_ply
+from csplat_conformance.manifest import load
+from csplat_tools.cli.app import app
+from csplat_tools.files.convert import decode_file
+
+VECTORS = load()
+VALID = [vector for vector in VECTORS if not vector.error]
+#: But the one that is too large to lie in memory at once, which tiles need not.
+INVALID = [vector for vector in VECTORS if vector.error and vector.name != "invalid/arrays_beyond_budget"]
+
+
+def ply_of(model):
+    buffer = io.BytesIO()
+    write_ply(buffer, model)
+    return buffer.getvalue()
+
+
+def answer(make):
+    """What is made, or why not: some names of extra columns are none for a PLY."""
+    try:
+        return make()
+    except csplat.InputError as error:
+        return str(error)
+
+
+def assert_same(expected, found):
+    for field in fields(expected):
+        ours, theirs = getattr(expected, field.name), getattr(found, field.name)
+        if isinstance(ours, np.ndarray):
+            assert (ours.dtype, ours.shape, ours.tobytes()) == (theirs.dtype, theirs.shape, theirs.tobytes())
+        elif field.name == "extra":
+            assert {name: column.tobytes() for name, column in ours.items()} == {
+                name: column.tobytes() for name, column in theirs.items()
+            }
+        else:
+            assert ours == theirs
+
+
+@pytest.fixture
+def many_tiles(make_model, tmp_path):
+    """A file of eleven tiles, and where it lies."""
+    data = csplat.encode(make_model(2000, 2), csplat.EncodeOptions(tile_splats=200))
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(data)
+    assert len(read_header(data).tiles) > 8
+    return path
+
+
+@pytest.mark.parametrize("vector", VALID, ids=lambda vector: vector.name)
+def test_a_scene_and_its_ply_are_those_of_a_decode_at_once(vector, tmp_path):
+    path, ply = tmp_path / "scene.csplat", tmp_path / "scene.ply"
+    path.write_bytes(vector.data)
+    expected = decode(vector.data)
+    with formats.open_scene(path) as scene:
+        assert scene.count == len(expected)
+        assert_same(expected, scene.model())
+    wanted = answer(lambda: ply_of(expected))
+    found = answer(lambda: (decode_file(str(path), str(ply)), ply.read_bytes()))
+    assert found == (wanted if isinstance(wanted, str) else ((len(expected), expected.sh_degree), wanted))
+
+
+@pytest.mark.parametrize("vector", INVALID, ids=lambda vector: vector.name)
+def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(vector, tmp_path):
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(vector.data)
+    with pytest.raises(CsplatError) as expected:
+        decode(vector.data)
+    with pytest.raises(CsplatError) as found:
+        decode_file(str(path), str(tmp_path / "scene.ply"))
+    assert str(expected.value) == str(found.value)
+    assert ["scene.csplat"] == [one.name for one in tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7])
+def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, monkeypatch):
+    monkeypatch.setattr(inputs, "_STEP_BYTES", 1)
+    expected = decode(many_tiles)
+    opened = open_tiles(many_tiles, threads=threads)
+    for _ in range(2):
+        models = list(opened.models())
+        assert [tile.splat_count for tile in opened.header.tiles] == [len(model) for model in models]
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            together = np.concatenate([getattr(model, name) for model in models])
+            assert getattr(expected, name).tobytes() == together.tobytes()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_first_damaged_tile_is_told_and_those_before_it_come(many_tiles, threads):
+    data = bytearray(many_tiles.read_bytes())
+    tiles = read_header(data).tiles
+    for place in (4, 6):
+        layer = tiles[place].layers[0]
+        data[layer.offset + layer.size - 1] ^= 1
+    models = open_tiles(bytes(data), threads=threads).models()
+    assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
+    with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
+        next(models)
+
+
+def test_nothing_of_a_damaged_file_goes_to_standard_output(many_tiles):
+    data = bytearray(many_tiles.read_bytes())
+    whole = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
+    assert ply_of(decode(bytes(data))) == whole.stdout_bytes
+    data[-1] ^= 1
+    many_tiles.write_bytes(data)
+    found = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
+    assert (1, b"") == (found.exit_code, found.stdout_bytes)
+
+
+def test_a_caller_bounds_the_splats_and_a_tile_the_bytes(many_tiles):
+    with pytest.raises(LimitError, match="splats"):
+        open_tiles(many_tiles, limits=Limits(splats=1999))
+    tile = max(one.splat_count for one in read_header(many_tiles.read_bytes()).tiles)
+    limits = Limits(bytes=tile * 4 * (11 + 27))
+    assert 2000 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
+    with pytest.raises(LimitError, match="bytes"):
+        decode(many_tiles, limits=limits)
+
+
+def test_progress_goes_from_nothing_to_all(many_tiles, tmp_path):
+    told = []
+    decode_file(str(many_tiles), str(tmp_path / "scene.ply"), progress=lambda stage, done: told.append((stage, done)))
+    shares = [done for stage, done in told if stage == "decoding"]
+    assert shares == sorted(shares)
+    assert (0.0, 1.0) == (shares[0], shares[-1])
