@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder import SceneHeader
+from csplat.decoder import SceneHeader, Tile
 from csplat.model import SplatModel
 from csplat_conformance.room import room
 from csplat_conformance.stated.pairs import differences
 from csplat_conformance.stated.source import Source
 
-__all__ = ["UNDECIDED", "UNMATCHED", "Progress", "lattice_radii", "match"]
+__all__ = ["STAGE", "UNDECIDED", "UNMATCHED", "Progress", "lattice_radii", "match", "tile_radii"]
 
 #: Is told a stage's name and how far it has come, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -32,6 +34,9 @@ U64 = NDArray[np.uint64]
 
 UNMATCHED = -1  #: no source splat lies within the bounds
 UNDECIDED = -2  #: more candidates than were looked at
+
+#: What `Progress` is told of.
+STAGE = "matching splats"
 
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats at a time
@@ -46,7 +51,9 @@ def match(
     bounds: Mapping[str, float],
     radii: F64,
     *,
+    reach: float | None = None,
     candidates_max: int = _CANDIDATES_MAX,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> I64:
     """Find partners.
@@ -57,7 +64,9 @@ def match(
         bounds: largest error by measure, to which comes what SER-7 allows. `means` is among them; measures that are
             not named are not looked at.
         radii: [N], how near the partner's centre is expected; where there is none, the search goes on up to the bound.
+        reach: of all of the scene, as `Source.reach` has it, where the splats are a part of it.
         candidates_max: how many splats of one cell are looked at for one partner.
+        threads: how many to use, one per core by default. The result does not depend on it.
         progress: is told how much is done.
 
     Returns:
@@ -66,20 +75,23 @@ def match(
     found = np.full(len(decoded), UNMATCHED, np.int64)
     if not len(source):
         return found
-    reach, source = source.reach(decoded.origin), source.about(decoded.origin)
+    reach = source.reach(decoded.origin) if reach is None else reach
+    source = source.about(decoded.origin)
     bounds = {name: bound + room(name, bound, reach) for name, bound in bounds.items()}
     bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
     bound = bounds["means"]
     levels = _levels(radii, bound)
     for radius in [*np.unique(levels[levels < bound]), bound]:
         rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
-        grid = _Grid(source, float(radius), bounds) if len(rows) else None
-        for start in range(0, len(rows), _BLOCK):
-            if grid is not None:
-                part = rows[start : start + _BLOCK]
-                found[part] = _search(grid, source, decoded, part, bounds, candidates_max)
-            if progress is not None:
-                progress("matching splats", float(np.count_nonzero(found >= 0)) / len(found))
+        if not len(rows):
+            continue
+        search = partial(_search, _Grid(source, float(radius), bounds), source, decoded, bounds, candidates_max)
+        parts = [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
+        with ThreadPoolExecutor(threads) as pool:
+            for part, partners in zip(parts, pool.map(search, parts), strict=True):
+                found[part] = partners
+                if progress is not None:
+                    progress(STAGE, float(np.count_nonzero(found >= 0)) / len(found))
     return found
 
 
@@ -136,9 +148,9 @@ def _search(
     grid: _Grid,
     source: Source,
     decoded: SplatModel,
-    rows: I64,
     bounds: Mapping[str, float],
     candidates_max: int,
+    rows: I64,
 ) -> I64:
     found = np.full(len(rows), UNMATCHED, np.int64)
     cells = grid.cells(decoded, rows)
@@ -188,10 +200,15 @@ def _within(
 
 def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
     """Half the diagonal of each splat's lattice cell, and what rounding to float32 adds: how near its source lies."""
-    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     radii = np.empty(len(decoded))
     for tile in header.tiles:
         rows = slice(tile.start, tile.start + tile.splat_count)
-        radii[rows] = 0.87 * math.ldexp(step, tile.exponent)
-        radii[rows] += np.abs(decoded.means[rows]).max(axis=1).astype(np.float64) * 2.0**-22
+        radii[rows] = tile_radii(decoded.means[rows], header, tile)
+    return radii
+
+
+def tile_radii(means: NDArray[np.float32], header: SceneHeader, tile: Tile) -> F64:
+    """`lattice_radii` of some splats of a tile."""
+    cell = 0.87 * math.ldexp(header.attribute(_spec.ATTRIBUTE_MEANS).step, tile.exponent)
+    radii: F64 = cell + np.abs(means).max(axis=1).astype(np.float64) * 2.0**-22
     return radii

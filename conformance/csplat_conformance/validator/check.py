@@ -9,6 +9,7 @@ from functools import partial
 from mmap import mmap
 
 from csplat import _spec
+from csplat.inputs import LetGo
 from csplat_conformance.validator.ancillary import read_stated_errors, read_text
 from csplat_conformance.validator.chunks import Chunk, check_coverage, check_frame, read_directory
 from csplat_conformance.validator.codebooks import Books, read_codebook
@@ -207,8 +208,10 @@ def _read_tile_chunks(
     findings: Findings,
     progress: Callable[[str, float], None],
 ) -> None:
+    let_go = LetGo(view)
     for tile in tiles:
         progress(_STAGE, tile.place / len(tiles))
+        let_go.after(sum(chunk.size for chunk in tile.chunks))
         reader = TileReader(view, index, tile, books, findings, read_coded)
         for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
             if not chunk.whole:
