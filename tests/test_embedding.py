@@ -182,12 +182,20 @@ def check_stream(given, scene):
     assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
 
 
-def test_the_sample_in_python(tmp_path, model):
-    (tmp_path / "scene.csplat").write_bytes(encode(model, FAST))
-    (program,) = samples("python")
-    assert len([line for line in program.splitlines() if line.strip()]) <= 5
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"{len(model)} float32 3 {model.coordinate_system}\n" == done.stdout
+def test_the_samples_in_python(tmp_path, model):
+    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=1000)))
+    whole, part = samples("python")
+    assert len([line for line in whole.splitlines() if line.strip()]) <= 5
+    said = [
+        subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        for program in (whole, part)
+    ]
+    assert f"{len(model)} float32 3 {model.coordinate_system}\n" == said[0]
+    first, *tiles, last = said[1].splitlines()
+    assert first.startswith(f"{len(model)} {model.coordinate_system} {{")
+    assert [str(place) for place in range(9)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
+    assert last.endswith(f" of {(tmp_path / 'scene.csplat').stat().st_size}")
+    assert 0 < len(decode(tmp_path / "part.csplat")) < len(model)
 
 
 def test_the_engine_without_a_page(tab, site, model):

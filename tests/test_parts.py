@@ -1,5 +1,6 @@
 """Parts of a file as files of their own."""
 
+import io
 import math
 from pathlib import Path
 
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import csplat
 import csplat_conformance
-from csplat import EncodeOptions, FormatError, InputError, decode, encode, extract, read_header, read_ply
+from csplat import EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
 from csplat.decoder import read_metadata, read_options, read_stated_errors
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
@@ -22,6 +24,14 @@ def data(sample_path):
     return encode(read_ply(sample_path), EncodeOptions(preset="balanced", tile_splats=1000))
 
 
+def extract(data, box):
+    """The part, and its bytes."""
+    stream = io.BytesIO()
+    part = csplat.extract(data, box, stream)
+    assert part.size == len(stream.getvalue())
+    return part, stream.getvalue()
+
+
 def box_of(tile, header):
     step = math.ldexp(header.attributes[3].step, tile.exponent)
     low = [corner * step for corner in tile.corner]
@@ -31,10 +41,10 @@ def box_of(tile, header):
 def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     header = read_header(data)
     low, high = box_of(header.tiles[2], header)
-    part = extract(data, (*high, *low))
+    part, cut = extract(data, (*high, *low))
     assert 2 in part.tiles
     assert 1 <= len(part.tiles) < len(header.tiles)
-    whole, found = decode(data, tiles=part.tiles), decode(part.data)
+    whole, found = decode(data, tiles=part.tiles), decode(cut)
     assert part.splat_count == len(found) == len(whole)
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(found, name))
@@ -42,12 +52,12 @@ def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
         least, most = box_of(tile, header)
         touches = all(least[k] <= high[k] and most[k] >= low[k] for k in range(3))
         assert touches == (index in part.tiles)
-    assert () == validate(part.data).violations
-    assert len(part.data) < 0.9 * len(data)
+    assert () == validate(cut).violations
+    assert len(cut) < 0.9 * len(data)
 
 
 def test_a_part_says_of_the_scene_what_the_file_says_and_nothing_of_its_errors(data):
-    part = extract(data, ALL).data
+    part = extract(data, ALL)[1]
     assert read_metadata(data) == read_metadata(part)
     assert decode(data).cameras == decode(part).cameras
     assert read_stated_errors(data) is not None
@@ -56,14 +66,14 @@ def test_a_part_says_of_the_scene_what_the_file_says_and_nothing_of_its_errors(d
     before, after = read_header(data), read_header(part)
     for name in ("origin", "coordinate_system", "antialiased", "flat", "unit_metres", "sh_degree", "codebooks"):
         assert getattr(before, name) == getattr(after, name)
-    assert part == extract(part, ALL).data
+    assert part == extract(part, ALL)[1]
 
 
 def test_extra_columns_come_along(sample_path):
     model = read_ply(sample_path).select(slice(0, 500))
     model.extra["id"] = np.arange(500, dtype=np.uint32)
     data = encode(model, EncodeOptions(preset="fast", keep_extra=True))
-    np.testing.assert_array_equal(decode(data).extra["id"], decode(extract(data, ALL).data).extra["id"])
+    np.testing.assert_array_equal(decode(data).extra["id"], decode(extract(data, ALL)[1]).extra["id"])
 
 
 @pytest.mark.parametrize(
@@ -71,9 +81,9 @@ def test_extra_columns_come_along(sample_path):
 )
 def test_everything_of_a_vector_decodes_to_the_same(name):
     data = (VECTORS / f"{name}.csplat").read_bytes()
-    part = extract(data, (-1e300, -1e300, -1e300, 1e300, 1e300, 1e300))
-    assert () == validate(part.data).violations
-    whole, found = decode(data), decode(part.data)
+    _, part = extract(data, (-1e300, -1e300, -1e300, 1e300, 1e300, 1e300))
+    assert () == validate(part).violations
+    whole, found = decode(data), decode(part)
     for array in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(whole, array), getattr(found, array))
     assert whole.extra.keys() == found.extra.keys()
@@ -104,7 +114,7 @@ def test_the_command_says_what_it_cut(data, tmp_path):
     done = CliRunner().invoke(app, [*words, box])
     assert 0 == done.exit_code, done.stderr
     assert "splats in" in done.stderr
-    assert extract(data, (*low, *high)).data == (tmp_path / "out.csplat").read_bytes()
+    assert extract(data, (*low, *high))[1] == (tmp_path / "out.csplat").read_bytes()
     assert 1 == CliRunner().invoke(app, [*words, box]).exit_code  # it is there
     refused = CliRunner().invoke(app, [*words, "--force", "--box=1,2,3"])
     assert 2 == refused.exit_code

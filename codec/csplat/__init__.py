@@ -4,11 +4,13 @@
     >>> model = csplat.read_ply("scene.ply")
     >>> data = csplat.encode(model, csplat.EncodeOptions(preset="small"))
     >>> model = csplat.decode(data)
+    >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: only what is wanted is read
+    ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
 
 One rule for what goes in: where a *file* is read (`read_ply`, `decode`, `read_header`), a path, an open binary file and
 bytes are taken alike; where a *scene* is wanted (`encode`, `write_ply`, `to_gsplat`), it is a `SplatModel`.
 Errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` are the file's, `InputError` is the
-caller's; what the system says of a path stays an `OSError`.
+caller's, `StoreError` a server's; what the system says of a path stays an `OSError`.
 
 The names below load their modules when first used (PEP 562): `import csplat.decoder` brings in
 neither the encoder nor the PLY reader, so that a decoder can be embedded alone.
@@ -30,11 +32,12 @@ if TYPE_CHECKING:
         FormatError,
         InputError,
         LimitError,
+        StoreError,
         UnsupportedError,
     )
     from csplat.formats import read, write
     from csplat.model import SplatModel
-    from csplat.parts import extract
+    from csplat.opened import SplatFile, extract, open
     from csplat.ply import lint_ply, read_ply, write_ply
     from csplat.upright import with_up
 
@@ -47,7 +50,9 @@ __all__ = [
     "FormatError",
     "InputError",
     "LimitError",
+    "SplatFile",
     "SplatModel",
+    "StoreError",
     "UnsupportedError",
     "__version__",
     "decode",
@@ -58,6 +63,7 @@ __all__ = [
     "extract",
     "from_gsplat",
     "lint_ply",
+    "open",
     "read",
     "read_header",
     "read_ply",
@@ -102,16 +108,19 @@ _MODULE_OF = {
     "FormatError": "csplat.errors",
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
+    "SplatFile": "csplat.opened",
     "SplatModel": "csplat.model",
+    "StoreError": "csplat.errors",
     "UnsupportedError": "csplat.errors",
     "decode": "csplat.decoder",
     "decode_integers": "csplat.decoder",
     "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
     "encode_with_report": "csplat.encoder",
-    "extract": "csplat.parts",
+    "extract": "csplat.opened",
     "from_gsplat": "csplat.bridges",
     "lint_ply": "csplat.ply",
+    "open": "csplat.opened",
     "read_header": "csplat.decoder",
     "read": "csplat.formats",
     "read_ply": "csplat.ply",

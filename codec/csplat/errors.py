@@ -6,13 +6,23 @@
 | `UnsupportedError` | nobody: the file asks for what this decoder does not do | a newer decoder |
 | `LimitError` | nobody: the file asks for more than the caller allows | larger limits |
 | `InputError` | the caller's data: a PLY, an array, an option | the message says |
+| `StoreError` | a server, or the line to it: a file's bytes do not come, or are others | trying again |
 
 Every error has a `code`, a short constant string that programs may compare.
 """
 
 from __future__ import annotations
 
-__all__ = ["CsplatError", "FormatError", "InputError", "LimitError", "UnsupportedError", "counted", "missing"]
+__all__ = [
+    "CsplatError",
+    "FormatError",
+    "InputError",
+    "LimitError",
+    "StoreError",
+    "UnsupportedError",
+    "counted",
+    "missing",
+]
 
 
 class CsplatError(Exception):
@@ -132,6 +142,19 @@ class InputError(CsplatError):
     """
 
     code = "E_INPUT"
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+
+
+class StoreError(CsplatError):
+    """The store that a file lies in did not give its bytes: a server without parts, a lost connection, another file.
+
+    Args:
+        message: one line that names the file and says what came instead.
+    """
+
+    code = "E_STORE"
 
     def __init__(self, message: str) -> None:
         super().__init__(message)

@@ -2,132 +2,196 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import accumulate
 
 from csplat import _spec
-from csplat.decoder.container import check_length, open_chunk, view_of
+from csplat.decoder.container import open_chunk
 from csplat.decoder.header import SceneHeader, Tile
-from csplat.decoder.index import read_header
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, SceneFields, write
-from csplat.errors import InputError
-from csplat.inputs import File
+from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Payload, SceneFields, parts
+from csplat.files import BinaryWriter, opened_for_writing
+from csplat.stores import Window
 
-__all__ = ["Part", "extract"]
+__all__ = ["InTurn", "Later", "Part", "TileCopies", "chunk_payload", "scene_fields", "write_part"]
 
 #: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
+_TILE_FLAGS = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
+_BATCH = 1 << 23  # bytes of one file that are fetched together, and of all files
+_ALL = 1 << 26
 
 
 @dataclass(frozen=True)
 class Part:
-    """A file that was cut out of another one.
+    """What was cut out of a file.
 
     Attributes:
-        data: the file.
-        tiles: which tiles of the other one it has.
+        tiles: which tiles of the file it has.
         splat_count: its splats.
+        size: its bytes.
     """
 
-    data: bytes
     tiles: tuple[int, ...]
     splat_count: int
+    size: int
 
 
-def extract(file: File, box: Sequence[float]) -> Part:
-    """Cut the tiles whose boxes touch a box out of a file.
-
-    Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Stated errors
-    and what the encoder says of its work are left out: they are about the whole. So are chunks of unknown types.
+def write_part(
+    window: Window, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
+) -> Part:
+    """Write some tiles of a file as a file of their own, as `csplat.extract` says.
 
     Args:
-        file: a `.csplat` file, as of `decode`.
-        box: two corners, x, y, z each, in any order; scene units, as the means: relative to the origin.
-
-    Examples:
-        >>> import csplat
-        >>> part = csplat.extract("scene.csplat", (-1, -1, -1, 1, 1, 1))
-        >>> part.splat_count == len(csplat.decode(part.data))
-        True
-
-    Raises:
-        InputError: six finite numbers are wanted; or no tile touches the box.
-        FormatError: a clause on header, index, or the chunks that are copied is broken.
-        UnsupportedError: as of `decode`.
+        window: the file.
+        header: its header.
+        tiles: in the order of the file.
+        output: a path or an open binary file.
     """
-    low, high = _corners(box)
-    view = view_of(file)
-    header = read_header(view)
-    check_length(view, header.file_size)
-    step = header.attributes[_spec.ATTRIBUTE_MEANS - 1].step
-    tiles = [tile for tile in header.tiles if _touches(tile, step, low, high)]
-    if not tiles:
-        raise InputError(f"no tile touches the box {_text(low)} to {_text(high)}: {_extent(header, step)}")
-    copied = [_copied(view, tile) for tile in tiles]
-    data = write(_fields(view, header, {table for tile in tiles for table in tile.tables}), copied)
-    return Part(data, tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles))
+    tables = {table for tile in tiles for table in tile.tables}
+    kept = [
+        record
+        for record in header.directory
+        if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in tables)
+    ]
+    copies = TileCopies(window)
+    copied = [copies.of(tile) for tile in tiles]
+    copies.begin(kept)
+    chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in kept]
+    fields = scene_fields(window, header, tables, chunks)
+    size = 0
+    with opened_for_writing(output) as stream:
+        for part in parts(fields, copied):
+            stream.write(part)
+            size += len(part)
+    return Part(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
 
 
-def _corners(box: Sequence[float]) -> tuple[list[float], list[float]]:
-    numbers = [float(value) for value in box]
-    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
-        raise InputError(f"a box is {tuple(box)!r}, wanted six finite numbers: two corners, x, y, z each")
-    pairs = list(zip(numbers[:3], numbers[3:], strict=True))
-    return [min(pair) for pair in pairs], [max(pair) for pair in pairs]
+@dataclass(frozen=True)
+class Later:
+    """A payload that is read when it is written; see `csplat.encoder.container.Stored`.
+
+    Attributes:
+        size: its bytes.
+        crc: of its chunk.
+        give: reads it.
+    """
+
+    size: int
+    crc: int
+    give: Callable[[], bytes]
+
+    def __len__(self) -> int:
+        return self.size
+
+    def read(self) -> bytes:
+        """Its bytes."""
+        return self.give()
 
 
-def _sides(tile: Tile, step: float) -> tuple[list[float], list[float]]:
-    """Corners of the box around a tile's centres (spec 4.3.5), scene units."""
-    scaled = math.ldexp(step, tile.exponent)
-    low = [corner * scaled for corner in tile.corner]
-    return low, [(corner + extent) * scaled for corner, extent in zip(tile.corner, tile.extent, strict=True)]
+class InTurn:
+    """Chunks of a file that are read one after the other, several in a request.
+
+    Args:
+        window: the file; what was fetched into it is forgotten in the end.
+        records: of the chunks, as they are wanted.
+        files: how many are read by turns.
+    """
+
+    def __init__(self, window: Window, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
+        self._window = window
+        self._records = records
+        self._batch = min(_BATCH, _ALL // files)
+        self._here = range(0)
+
+    def take(self, place: int, beside: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
+        """See to it that the window has a chunk, perhaps the next ones, and others beside; return its record."""
+        if place not in self._here:
+            stop, size = place + 1, self._records[place].size
+            while stop < len(self._records) and size + self._records[stop].size <= self._batch:
+                size += self._records[stop].size
+                stop += 1
+            if self._here:
+                self._window.forget()
+            wanted = [(one.offset, one.size) for one in beside]
+            self._window.fetch(wanted + [(one.offset, one.size) for one in self._records[place:stop]])
+            self._here = range(place, stop)
+        return self._records[place]
 
 
-def _touches(tile: Tile, step: float, low: Sequence[float], high: Sequence[float]) -> bool:
-    least, most = _sides(tile, step)
-    return all(least[axis] <= high[axis] and most[axis] >= low[axis] for axis in range(3))
+class TileCopies:
+    """Tiles that are written again as they are. Their chunks are read when they are written.
+
+    Args:
+        window, files: as of `InTurn`.
+    """
+
+    def __init__(self, window: Window, files: int = 1) -> None:
+        self._window = window
+        self._files = files
+        self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
+
+    def of(self, tile: Tile, changed: Mapping[int, Later] | None = None) -> FileTile:
+        """A tile; layers of unknown ids are left out.
+
+        Args:
+            tile: its record.
+            changed: by layer, what stands in the place of the file's.
+        """
+        layers: dict[int, Payload] = dict(changed or {})
+        for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
+            record, places = tile.layers[layer], self._records[layer]
+            read = partial(self._read, layer, len(places))
+            layers[layer] = Later(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
+            places.append(record)
+        return FileTile(
+            tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.tables
+        )  # fmt: skip
+
+    def begin(self, beside: Sequence[_spec.DirectoryRecord]) -> None:
+        """Once all tiles are known, read the first chunks, and others beside, which are looked at before any tile."""
+        self._turn[0].take(0, beside)
+
+    @cached_property
+    def _turn(self) -> tuple[InTurn, dict[int, int]]:
+        """All chunks, in the order in which files are written, and where each layer begins among them."""
+        starts = dict(zip(self._records, accumulate(map(len, self._records.values()), initial=0), strict=False))
+        records = [one for records in self._records.values() for one in records]
+        return InTurn(self._window, records, self._files), starts
+
+    def _read(self, layer: int, place: int) -> bytes:
+        turn, starts = self._turn
+        return chunk_payload(self._window, turn.take(starts[layer] + place))
 
 
-def _text(corner: Sequence[float]) -> str:
-    return ", ".join(f"{value:g}" for value in corner)
+def chunk_payload(window: Window, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:
+    """The payload of a chunk that was fetched, its CRC and header checked."""
+    with window.store.telling():
+        if isinstance(record, _spec.LayerRecord):
+            cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-1")
+        else:
+            cursor = open_chunk(window.view, record, record.type, record.flags, "CHK-3")
+    return bytes(window.view[cursor.at : cursor.end])
 
 
-def _extent(header: SceneHeader, step: float) -> str:
-    """Say where the splats are."""
-    if not header.tiles:
-        return "the scene has no splats"
-    sides = [_sides(tile, step) for tile in header.tiles]
-    low, high = ([change(side[k][axis] for side in sides) for axis in range(3)] for k, change in ((0, min), (1, max)))
-    return f"centres lie within {_text(low)} to {_text(high)}"
+def scene_fields(
+    window: Window, header: SceneHeader, tables: Container[int], chunks: Sequence[FileChunk]
+) -> SceneFields:
+    """What a file says of the scene, with other chunks.
 
-
-def _copied(view: memoryview, tile: Tile) -> FileTile:
-    """Its chunks, their CRCs checked; layers of unknown ids are left out."""
-    flags = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
-    layers = {}
-    for layer, record in tile.layers.items():
-        if layer in _spec.LAYER_NAMES:
-            cursor = open_chunk(view, record, _spec.CHUNK_TILE, flags, "TLE-1")
-            layers[layer] = bytes(view[cursor.at : record.offset + record.size])
-    return FileTile(
-        tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.tables
-    )  # fmt: skip
-
-
-def _fields(view: memoryview, header: SceneHeader, tables: set[int]) -> SceneFields:
-    """What header and index say of the scene, with the codebooks that are still used."""
-    head = _spec.unpack_index_head(view, _spec.HEADER_SIZE)
+    Args:
+        window: the file's header and index.
+        header: the same, read.
+        tables: ids of the codebooks that are used.
+        chunks: beside the tiles.
+    """
+    head = _spec.unpack_index_head(window.view, _spec.HEADER_SIZE)
     at = _spec.HEADER_SIZE + head.head_size + head.attribute_count * head.attribute_size
     at += head.codebook_count * head.codebook_size
-    extras = [_spec.unpack_extra_record(view, at + i * head.extra_size) for i in range(head.extra_count)]
+    extras = [_spec.unpack_extra_record(window.view, at + i * head.extra_size) for i in range(head.extra_count)]
     books = [book for book in header.codebooks if book.codebook_id in tables]
-    chunks = []
-    for record in header.directory:
-        if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in tables):
-            cursor = open_chunk(view, record, record.type, record.flags, "CHK-3")
-            payload = bytes(view[cursor.at : record.offset + record.size])
-            chunks.append(FileChunk(record.type, payload, record.id, record.layer))
     return SceneFields(
         sh_degree=header.sh_degree,
         scene_flags=header.antialiased * _spec.SCENE_FLAG_ANTIALIASED | header.flat * _spec.SCENE_FLAG_FLAT,

@@ -21,6 +21,7 @@ __all__ = [
     "layer_columns",
     "read_codebooks",
     "table_bytes",
+    "wanted_codebooks",
 ]
 
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
@@ -61,7 +62,7 @@ def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whol
     """
     books = {book.codebook_id: book for book in header.codebooks}
     elements = 0
-    for record in _codebook_chunks(header) if whole else _wanted(header, tiles, degree):
+    for record in _codebook_chunks(header) if whole else wanted_codebooks(header, tiles, degree):
         book = books[record.id]
         elements += book.size * layer_columns(book, record.layer)
     return 4 * elements
@@ -71,7 +72,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
     """Read the codebooks that some tiles name, their bands up to `degree`."""
     records = {book.codebook_id: book for book in header.codebooks}
     books: dict[int, Codebook] = {}
-    for record in _wanted(header, tiles, degree):
+    for record in wanted_codebooks(header, tiles, degree):
         book = books.setdefault(record.id, Codebook(records[record.id]))
         book.entries[record.layer] = _read_chunk(view, header, record, book.record)
     for book in books.values():
@@ -93,7 +94,8 @@ def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
     return [record for record in header.directory if record.type == _spec.CHUNK_CODEBOOK]
 
 
-def _wanted(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_spec.DirectoryRecord]:
+def wanted_codebooks(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_spec.DirectoryRecord]:
+    """Return the records of those chunks of codebooks that some tiles name, their bands up to `degree`."""
     ids = {table for tile in tiles for table in tile.tables}
     chunks = [record for record in _codebook_chunks(header) if record.id in ids and record.layer <= degree]
     return sorted(chunks, key=lambda record: (record.id, record.layer))
@@ -123,7 +125,8 @@ def _read_chunk(
     elements = read_stream(cursor, book.size * columns, _ENTRY_WIDTH_MAX, signed=True).reshape(columns, book.size)
     _check_entries(elements, header, book, record.layer, stream_at)
     cursor.finish()
-    return np.ascontiguousarray(elements.T)  # rows of one entry: a gather then copies whole rows
+    # Rows of one entry: a gather then copies whole rows. A copy, which needs the file's bytes no longer.
+    return np.array(elements.T, order="C")
 
 
 def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecord, layer: int, at: int) -> None:

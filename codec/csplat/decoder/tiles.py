@@ -27,7 +27,7 @@ from csplat.decoder.reconstruct import (
 from csplat.decoder.streams import Ints
 from csplat.errors import FormatError
 
-__all__ = ["Arrays", "TileBlocks", "check_max_scale", "read_tile", "write_tile"]
+__all__ = ["Arrays", "TileBlocks", "check_max_scale", "read_tile", "wanted_layers", "write_tile"]
 
 _TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 
@@ -95,15 +95,18 @@ class TileBlocks:
     extra: list[Ints] = field(default_factory=list)
 
 
+def wanted_layers(tile: Tile, degree: int) -> list[_spec.LayerRecord]:
+    """Return what is read of a tile: all of its layers but the SH bands above `degree`."""
+    return [layer for layer in tile.layers.values() if not degree < layer.layer <= _spec.SH_DEGREE_MAX]
+
+
 def read_tile(
     view: memoryview, header: SceneHeader, tile: Tile, degree: int, books: Mapping[int, Codebook]
 ) -> TileBlocks:
     """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; of others only the frame."""
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
-    for layer in tile.layers.values():
-        if degree < layer.layer <= _spec.SH_DEGREE_MAX:
-            continue
+    for layer in wanted_layers(tile, degree):
         cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
         if layer.layer not in _spec.LAYER_NAMES:
             continue  # ANC-2

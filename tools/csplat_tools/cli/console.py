@@ -35,6 +35,7 @@ _WORDS = {
     "E_CRC": _DAMAGED,
     "E_CODER": _DAMAGED,
     "E_UNSUPPORTED": ("", _NEWER),
+    "E_STORE": ("", "nothing was kept; try again"),
     "E_LIMIT": (
         "the scene is larger than is allowed here",
         "`csplat decode` and `csplat verify` take scenes of any size",

@@ -7,19 +7,21 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
-from csplat.parts import extract as extracted
+from csplat.opened import open as opened
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
 from csplat_tools.cli.parsing import parse_numbers
-from csplat_tools.files.console import format_bytes, note
-from csplat_tools.files.streams import check_name, mapped_csplat, write_bytes
+from csplat_tools.files.console import format_bytes
+from csplat_tools.files.streams import check_name, csplat_file, whole_output
 
 __all__ = ["extract"]
 
 
 @command()
 def extract(
-    source: Annotated[str, typer.Argument(metavar="IN.csplat", help="A .csplat file, or - for standard input.")],
+    source: Annotated[
+        str, typer.Argument(metavar="IN.csplat", help="A .csplat file, its URL, or - for standard input.")
+    ],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -.")],
     out: Output,
     box: Annotated[
@@ -30,20 +32,31 @@ def extract(
 
     Tiles that touch the box are copied as they are, up to 65,536 splats each: nothing is decoded or coded again, and
     splats around the box come along. `csplat convert --crop-box` cuts splat by splat. Stated errors are left out: they
-    are those of the whole.
+    are those of the whole. Of a URL (https, s3 and others; pip install 'csplat[remote]') the index and what is copied
+    are fetched, no more.
 
     Examples:
       csplat extract city.csplat square.csplat --box -10,-2,-10,10,8,10
+      csplat extract s3://bucket/city.csplat square.csplat --box -10,-2,-10,10,8,10
     """
     corners = parse_numbers("--box", box, 6)
     assert corners is not None
     out.check(output, inputs=(source,))
     check_name(output, ".csplat", "extract", source)
-    with mapped_csplat(source) as data:
-        part = extracted(data, corners)
-        size = len(data)
-    write_bytes(output, part.data)
-    if not out.quiet:
-        tiles = counted(len(part.tiles), "tile")
-        note(f"{part.splat_count:,} splats in {tiles}: {format_bytes(len(part.data))} of {format_bytes(size)}")
-    out.publish({"splats": part.splat_count, "tiles": list(part.tiles), "bytes": len(part.data)})
+    with opened(csplat_file(source)) as file, whole_output(output) as stream:
+        part = file.extract(corners, stream)
+        size, read, requests = file.size, file.bytes_read, file.requests
+    out.remark(
+        f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size)};"
+        f" read {format_bytes(read)} of {format_bytes(size)}, in {counted(requests, 'request')}"
+    )
+    out.publish(
+        {
+            "splats": part.splat_count,
+            "tiles": list(part.tiles),
+            "bytes": part.size,
+            "source_bytes": size,
+            "bytes_read": read,
+            "requests": requests,
+        }
+    )

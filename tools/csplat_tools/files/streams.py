@@ -9,11 +9,13 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from mmap import mmap
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,6 +29,7 @@ from csplat.formats import formats
 from csplat.inputs import File, mapped
 from csplat.model import SplatModel
 from csplat.ply_write import write_ply, write_scene_ply
+from csplat.remote import is_url
 from csplat.scene import Scene
 
 __all__ = [
@@ -34,12 +37,14 @@ __all__ = [
     "check_name",
     "check_output",
     "check_outputs",
+    "csplat_file",
     "is_csplat",
     "is_one_way",
     "local_path",
     "mapped_csplat",
     "open_output",
     "source_path",
+    "whole_output",
     "write_array",
     "write_bytes",
     "write_json",
@@ -60,6 +65,11 @@ _MAKERS = {
 
 #: Endings of what csplat does not write, or beside a scene alone.
 _OTHERS = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
+
+
+class _StandardInput(io.BytesIO):
+    name = "standard input"
+
 
 _free: set[Path] = set()  # names that nobody had when they were checked: whoever takes one meanwhile keeps it
 
@@ -102,7 +112,7 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     Args:
         paths: the files to be written, or `-`; None for those that are not wanted.
         force: existing files may be replaced.
-        inputs: files that the command reads, or folders; None for those that are not given.
+        inputs: files that the command reads, folders or URLs; None for those that are not given.
 
     Raises:
         InputError: as `check_output`; or two paths name the same file.
@@ -113,7 +123,7 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     for number, place in enumerate(places):
         if place in places[:number]:
             raise InputError(f"{outputs[number]} is wanted for two outputs: name a file for each")
-    read = tuple(path for path in inputs if path is not None)
+    read = tuple(path for path in inputs if path is not None and not is_url(path))
     for path in read:
         if path != STANDARD_STREAM:
             Path(path).stat()  # an OSError that names it, before anything that takes time
@@ -219,6 +229,23 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
             _close(data)
 
 
+def csplat_file(path: str) -> File:
+    """What `csplat.open` takes of a .csplat file that is named by a path, a URL, or `-`.
+
+    Raises:
+        InputError: the path is that of a file in another format.
+        OSError: it cannot be read.
+    """
+    if path == STANDARD_STREAM:
+        data = sys.stdin.buffer.read()
+        _refuse_others(_StandardInput.name, data[:HEAD_SIZE])
+        return _StandardInput(data)
+    if not is_url(path) and Path(path).is_file():
+        with Path(path).open("rb") as stream:
+            _refuse_others(path, stream.read(HEAD_SIZE))
+    return path
+
+
 def write_array(path: str, array: NDArray[Any]) -> None:
     """Write a .npy file."""
     buffer = io.BytesIO()
@@ -228,12 +255,32 @@ def write_array(path: str, array: NDArray[Any]) -> None:
 
 def write_bytes(path: str, data: bytes) -> None:
     """Write a file, or to standard output; devices and named pipes are written directly."""
+    with _output_stream(path) as stream:
+        stream.write(data)
+
+
+@contextmanager
+def _output_stream(path: str) -> Iterator[BinaryIO]:
+    """Give standard output for `-`, else what `open_output` gives."""
     if path == STANDARD_STREAM:
-        sys.stdout.buffer.write(data)
+        yield sys.stdout.buffer
         sys.stdout.buffer.flush()
     else:
         with open_output(path) as stream:
-            stream.write(data)
+            yield stream
+
+
+@contextmanager
+def whole_output(path: str) -> Iterator[BinaryIO]:
+    """As `_output_stream`; standard output gets what is written when all of it is, too."""
+    if path != STANDARD_STREAM:
+        with open_output(path) as stream:
+            yield stream
+        return
+    with TemporaryFile() as spool, _output_stream(path) as stream:
+        yield spool
+        spool.seek(0)
+        shutil.copyfileobj(spool, stream)
 
 
 @contextmanager
@@ -263,12 +310,8 @@ def write_json(path: str, value: Any) -> None:
 def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None:
     """Write a PLY, or one to standard output."""
     write: Callable[..., None] = write_scene_ply if isinstance(model, Scene) else write_ply
-    if path != STANDARD_STREAM:
-        with open_output(path) as stream:
-            write(stream, model, absolute=absolute)
-        return
-    write(sys.stdout.buffer, model, absolute=absolute)
-    sys.stdout.buffer.flush()
+    with _output_stream(path) as stream:
+        write(stream, model, absolute=absolute)
 
 
 def is_one_way(path: str) -> bool:

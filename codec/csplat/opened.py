@@ -1,0 +1,321 @@
+"""A file that is read in parts, from wherever it lies: what stands in front of it first, then what is wanted."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.boxes import tile_boxes, touching
+from csplat.decoder import (
+    DecodedTile,
+    Limits,
+    SceneHeader,
+    Tile,
+    decode,
+    iter_tiles,
+    read_cameras,
+    read_header,
+    read_metadata,
+)
+from csplat.decoder.codebooks import wanted_codebooks
+from csplat.decoder.container import check_length, read_file_header
+from csplat.decoder.job import Job, prepare
+from csplat.decoder.limits import check_budget, float_bytes
+from csplat.decoder.tiles import wanted_layers
+from csplat.errors import InputError
+from csplat.files import BinaryWriter
+from csplat.inputs import File
+from csplat.model import SplatModel
+from csplat.parts import Part, write_part
+from csplat.remote import store_of
+from csplat.stores import Store, Window
+
+__all__ = ["SplatFile", "extract", "open"]
+
+_FIRST = 1 << 16  # the index of a scene of some twenty million splats
+_BATCH = 1 << 23  # bytes of tiles that are fetched together where tiles come one after the other
+
+
+class SplatFile:
+    """A `.csplat` file of which parts are read. `csplat.open` makes it; it is a context manager.
+
+    Whatever is read is checked as a decode of the same part checks it.
+
+    Attributes:
+        header: header and index.
+        splat_count: its splats; also its length.
+        name: the path or URL, for messages.
+        size: bytes of the file.
+        requests: how often the store was asked so far.
+        bytes_read: how many bytes it gave so far.
+    """
+
+    header: SceneHeader
+
+    def __init__(self, store: Store, limits: Limits) -> None:
+        self._store = store
+        self._limits = limits
+        self._open = True
+        with self._store.telling():
+            window = Window(store)
+            self._head = _read_head(store, window)
+            self.header = read_header(window.view)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return self.splat_count
+
+    def __repr__(self) -> str:
+        return f"SplatFile({self.name!r}, {self.splat_count} splats)"
+
+    @property
+    def splat_count(self) -> int:
+        """N."""
+        return self.header.splat_count
+
+    @property
+    def name(self) -> str:
+        """The path or URL, without what is secret in it."""
+        return self._store.name
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._store.size
+
+    @property
+    def requests(self) -> int:
+        """How often the store was asked, once for the size of a file at a URL."""
+        return self._store.requests
+
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes the store gave."""
+        return self._store.bytes_read
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Boxes around the centres of each tile: [T, 2, 3] float64, scene units, relative to the origin."""
+        return tile_boxes(self.header)
+
+    @cached_property
+    def metadata(self) -> dict[str, Any] | None:
+        """What the META chunk holds, `None` where there is none; read when it is first asked for."""
+        with self._store.telling():
+            window = self.window()
+            window.fetch(self._chunks(_spec.CHUNK_METADATA))
+            return read_metadata(window.view, limits=self._limits)
+
+    @cached_property
+    def cameras(self) -> list[dict[str, Any]] | None:
+        """What the CAMS chunk holds, `None` where there is none; read when it is first asked for."""
+        with self._store.telling():
+            window = self.window()
+            window.fetch(self._chunks(_spec.CHUNK_CAMERAS))
+            return read_cameras(window.view, limits=self._limits)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._open = False
+        self._store.close()
+
+    def tiles(self, box: Sequence[float] | None = None, *, sh_degree: int | None = None) -> Iterator[DecodedTile]:
+        """Decode tile by tile, in memory for the codebooks, a tile and some megabytes of the file.
+
+        Args:
+            box: tiles that touch it, whole; all where it is left out. Two corners, x, y, z each, in any order;
+                scene units, relative to the origin.
+            sh_degree: highest SH band wanted: others are not read; all where it is left out.
+
+        Raises:
+            InputError: an argument is at fault, or no tile touches the box.
+            FormatError, LimitError: as of `csplat.decoder.iter_tiles`.
+            StoreError, OSError: as of `csplat.open`.
+        """
+        chosen = None if box is None else [tile.index for tile in touching(self.header, box)]
+        with self._store.telling():
+            window = self.window()
+            job = prepare(window.view, self._limits, chosen, sh_degree)
+            decoded = iter_tiles(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
+        return self._iterate(window, job, decoded)
+
+    def read(
+        self,
+        box: Sequence[float] | None = None,
+        *,
+        tiles: Sequence[int] | None = None,
+        sh_degree: int | None = None,
+    ) -> SplatModel:
+        """Decode a part, or all.
+
+        Args:
+            box: as of `tiles`.
+            tiles: places of the tiles wanted, in the order wanted; not with a box.
+            sh_degree: as of `tiles`.
+
+        Examples:
+            >>> import csplat
+            >>> with csplat.open("scene.csplat") as file:
+            ...     corner = file.read((0, 0, 0, 1, 1, 1), sh_degree=1)
+            >>> len(corner) <= 1000
+            True
+
+        Raises:
+            InputError: an argument is at fault, or no tile touches the box.
+            FormatError, LimitError: as of `csplat.decode`.
+            StoreError, OSError: as of `csplat.open`.
+        """
+        if box is not None:
+            if tiles is not None:
+                raise InputError("a box and tiles are given: wanted one of them")
+            tiles = [tile.index for tile in touching(self.header, box)]
+        with self._store.telling():
+            window = self.window()
+            job = prepare(window.view, self._limits, tiles, sh_degree)
+            splat_bytes = float_bytes(self.header, job.degree)
+            check_budget(self.header, job.tiles, job.degree, splat_bytes, self._limits, whole=job.whole)
+            texts = self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
+            window.fetch([*texts, *_side(job), *_layers(job.tiles, job.degree)])
+            return decode(window.view, limits=self._limits, tiles=tiles, sh_degree=sh_degree)
+
+    def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> Part:
+        """Cut the tiles that touch a box out of the file, as `csplat.extract` does."""
+        with self._store.telling():
+            return write_part(self.window(), self.header, touching(self.header, box), output)
+
+    def window(self) -> Window:
+        """A place for bytes of the file, for what copies them."""
+        if not self._open:
+            raise InputError(f"{self.name} is closed")
+        return Window(self._store, self._head)
+
+    def _iterate(self, window: Window, job: Job, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
+        side = _side(job)
+        for batch in _batches(job.tiles, job.degree):
+            if not self._open:
+                raise InputError(f"{self.name} is closed")
+            window.forget()
+            with self._store.telling():
+                window.fetch([*side, *_layers(batch, job.degree)])
+            for _ in batch:
+                with self._store.telling():
+                    tile = next(decoded)
+                yield tile
+            side = []
+        with self._store.telling():
+            next(decoded, None)  # of a scene without tiles, all that there is to be checked
+
+    def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
+        return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
+
+
+def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
+    """Open a file to read parts of it: header and index are read, nothing else.
+
+    Args:
+        file: a path; a URL that fsspec knows (`https://…`, `s3://…`; wants the extra `remote`); an open binary file,
+            which is read to its end; or bytes.
+        limits: as of `decode`, for each part.
+        storage: options of fsspec's file system of the URL: `{"endpoint_url": …, "anon": True}`.
+
+    Examples:
+        >>> import csplat
+        >>> with csplat.open("scene.csplat") as file:
+        ...     for tile in file.tiles(sh_degree=0):
+        ...         print(len(tile.means), tile.shN.shape)
+        1000 (1000, 0, 3)
+
+    Raises:
+        FormatError, UnsupportedError: as of `read_header`, or the file is shorter or longer than it says.
+        InputError: the file is none of these; storage options for what is no URL; the extra is not installed.
+        StoreError: a server does not answer, gives no parts of files (HTTP Range), or not all of one; or the file
+            has changed since it was opened. Nothing of what was asked for is returned then.
+        OSError: the file is not there, or cannot be read.
+    """
+    store = store_of(file, storage)
+    try:
+        return SplatFile(store, limits or Limits())
+    except BaseException:
+        store.close()
+        raise
+
+
+def extract(
+    file: File,
+    box: Sequence[float],
+    output: str | os.PathLike[str] | BinaryWriter,
+    *,
+    storage: Mapping[str, Any] | None = None,
+) -> Part:
+    """Cut the tiles whose boxes touch a box out of a file, into a file of their own.
+
+    Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Stated errors
+    and what the encoder says of its work are left out: they are about the whole. So are chunks of unknown types. Read
+    are header, index and what is copied, written in memory for some megabytes.
+
+    Args:
+        file: as of `open`.
+        box: two corners, x, y, z each, in any order; scene units, as the means: relative to the origin.
+        output: a path, which the part takes when it is complete, replacing an older file; or an open binary file.
+        storage: as of `open`.
+
+    Examples:
+        >>> import csplat
+        >>> part = csplat.extract("scene.csplat", (-1, -1, -1, 1, 1, 1), "part.csplat")
+        >>> part.splat_count == len(csplat.decode("part.csplat"))
+        True
+
+    Raises:
+        InputError: six finite numbers are wanted; or no tile touches the box.
+        FormatError: a clause on header, index, or the chunks that are copied is broken.
+        UnsupportedError, StoreError, OSError: as of `open`; or the output cannot be written.
+    """
+    with open(file, storage=storage) as opened:
+        return opened.extract(box, output)
+
+
+def _read_head(store: Store, window: Window) -> bytes:
+    """Read what stands in front of the chunks, and as much behind it as came along."""
+    first = min(store.size, _FIRST)
+    window.fetch([(0, first)])
+    head = read_file_header(window.view)
+    check_length(window.view, head.file_size)
+    end = _spec.HEADER_SIZE + head.index_size
+    if end > first:
+        window.fetch([(first, end - first)])
+    return bytes(window.view[: max(first, end)])
+
+
+def _side(job: Job) -> list[tuple[int, int]]:
+    """What is read beside tiles: their codebooks; of all of a file, everything, which is checked."""
+    records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
+    return [(record.offset, record.size) for record in records]
+
+
+def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
+    return [(layer.offset, layer.size) for tile in tiles for layer in wanted_layers(tile, degree)]
+
+
+def _batches(tiles: Sequence[Tile], degree: int) -> Iterator[list[Tile]]:
+    """Tiles that are fetched together; a first batch in any case."""
+    batch: list[Tile] = []
+    size = 0
+    for tile in tiles:
+        added = sum(layer.size for layer in wanted_layers(tile, degree))
+        if batch and size + added > _BATCH:
+            yield batch
+            batch, size = [], 0
+        batch.append(tile)
+        size += added
+    yield batch

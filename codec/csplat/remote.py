@@ -1,0 +1,157 @@
+"""Files at URLs of any store that fsspec knows, and which store a file lies in."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
+
+from csplat.errors import InputError, StoreError, missing
+from csplat.inputs import File
+from csplat.stores import Disk, Memory, Store
+
+__all__ = ["is_url", "store_of"]
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
+#: File systems of servers that may send all of a file where a part is asked for.
+_WEB = {"http", "https"}
+#: What stores say of a version of a file, under the names that fsspec's file systems have for it.
+_VERSION = (
+    "size", "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "created", "VersionId",
+    "generation",
+)  # fmt: skip
+_STATUS = {401: errno.EACCES, 403: errno.EACCES, 404: errno.ENOENT, 410: errno.ENOENT}
+
+
+def is_url(file: object) -> bool:
+    """Whether a file is named by a URL, `s3://bucket/scene.csplat`, and not by a path."""
+    return isinstance(file, str) and _URL.match(file) is not None
+
+
+def store_of(file: File, storage: Mapping[str, Any] | None = None) -> Store:
+    """Open what a file lies in.
+
+    Args:
+        file: a path, a URL, an open binary file, or bytes.
+        storage: options of fsspec's file system, for a URL.
+
+    Raises:
+        InputError: it is none of these, or a URL that nothing here knows.
+        StoreError: the store does not answer.
+        OSError: it is not there, or cannot be read.
+    """
+    if isinstance(file, str) and is_url(file):
+        return _Remote(file, storage or {})
+    if storage:
+        raise InputError("storage options are for a URL, and the file is none")
+    if isinstance(file, (str, os.PathLike)) and stat.S_ISREG(Path(file).stat().st_mode):
+        return Disk(Path(file))
+    return Memory(file)
+
+
+class _Remote(Store):
+    """A file at a URL. Connections are fsspec's, which keeps them for the next file; so are retries."""
+
+    def __init__(self, url: str, options: Mapping[str, Any]) -> None:
+        self._fs, self._path = _file_system(url, options)
+        self._shown = _shown(url)
+        names = self._fs.protocol
+        self._web = not _WEB.isdisjoint((names,) if isinstance(names, str) else names)
+        self._proved = not self._web
+        self._info = self._asked()
+        size = self._info.get("size")
+        if self._info.get("type") == "directory":
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), self._shown)
+        if size is None:
+            raise StoreError(f"{self._shown}: the server does not say how long the file is, so no parts can be read")
+        super().__init__(self._shown, size, requests=1)
+
+    def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        parts: list[bytes] = []
+        while not self._proved and len(parts) < len(ranges):
+            parts.append(self._careful(*ranges[len(parts)]))
+        rest = ranges[len(parts) :]
+        # Of file systems without coroutines, files are opened, which would read more than is asked for.
+        how = {} if self._fs.async_impl else {"cache_type": "none"}
+        starts, stops = [start for start, _ in rest], [stop for _, stop in rest]
+        try:
+            found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **how)
+        except Exception as error:  # noqa: BLE001  # what a store raises is whatever its library raises
+            raise self._failure(error) from None
+        for one in found:
+            if isinstance(one, BaseException):
+                raise self._failure(one) from None
+        return parts + found
+
+    def _careful(self, start: int, stop: int) -> bytes:
+        """Read a part of a server that may not know parts; fsspec's file notices before all of the file has come."""
+        try:
+            with self._fs.open(self._path, "rb", cache_type="none", size=self.size) as stream:
+                stream.seek(start)
+                part: bytes = stream.read(stop - start)
+        except ValueError:  # fsspec's word for it
+            raise StoreError(f"{self.name}: the server sends whole files alone, no parts (HTTP Range)") from None
+        except Exception as error:  # noqa: BLE001  # as above
+            raise self._failure(error) from None
+        self._proved = start > 0  # the beginning comes from any server
+        return part
+
+    def _asked(self) -> dict[str, Any]:
+        try:
+            info: dict[str, Any] = self._fs.info(self._path)
+        except Exception as error:  # noqa: BLE001  # as above
+            raise self._failure(error) from None
+        return info
+
+    def _is_other(self) -> bool:
+        self._fs.invalidate_cache(self._path)
+        self.requests += 1
+        now = self._asked()
+        return any(self._info.get(name) != now.get(name) for name in _VERSION)
+
+    def _failure(self, error: BaseException) -> Exception:
+        """What is raised for what fsspec raises."""
+        if isinstance(error, ModuleNotFoundError):
+            return missing(error, extra="remote")
+        if self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None:
+            error = error.__cause__  # whatever went wrong, "not found" is what comes of it
+        status = getattr(error, "status", 0)
+        number = _STATUS.get(status, 0)
+        if isinstance(error, FileNotFoundError):
+            number = errno.ENOENT
+        elif isinstance(error, PermissionError):
+            number = errno.EACCES
+        if number:
+            return OSError(number, os.strerror(number), self._shown)  # of the class that the number has
+        said = f"HTTP status {status}" if status else str(error)  # aiohttp would add the address, secrets too
+        return StoreError(f"{self._shown}: {' '.join(said.split()) or type(error).__name__}")
+
+
+def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
+    """The file system that fsspec has for a URL, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError as error:
+        raise missing(error, extra="remote") from None
+    if url.startswith(("http://", "https://")):  # parts are of the file, not of what a server packs it into
+        options = {**options, "headers": {"Accept-Encoding": "identity", **options.get("headers", {})}}
+    try:
+        fs, path = url_to_fs(url, **options)
+    except ImportError as error:  # fsspec names the package in its own words
+        raise InputError(f"{_shown(url)}: {error}: pip install 'csplat[remote]' brings those of HTTP and S3") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{_shown(url)}: {' '.join(str(error).split())}") from None
+    return fs, path
+
+
+def _shown(url: str) -> str:
+    """A URL for messages: passwords and signatures are nobody's business."""
+    parts = urlsplit(url)
+    if not parts.netloc:
+        return url
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))

@@ -1,0 +1,201 @@
+"""Where a file lies, and parts of it."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from csplat.decoder.container import view_of
+from csplat.errors import CsplatError, FormatError, LimitError, StoreError
+from csplat.inputs import File
+
+__all__ = ["Disk", "Memory", "Store", "Window"]
+
+#: Bytes between two parts that are read along: they take less time than a request of their own.
+_GAP = 1 << 16
+#: Bytes of one request at most, and how many are under way together.
+_REQUEST, _AT_ONCE = 1 << 23, 8
+
+
+class Store:
+    """A file that is read in parts.
+
+    Attributes:
+        name: what it is called in messages; of a URL without passwords and signatures; empty where it has none.
+        size: its bytes.
+        requests: how often the store was asked, for its size too.
+        bytes_read: bytes that it gave.
+    """
+
+    def __init__(self, name: str, size: int, requests: int = 0) -> None:
+        self.name = name
+        self.size = size
+        self.requests = requests
+        self.bytes_read = 0
+
+    def read(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Read parts of the file: first byte and the one behind the last, of each.
+
+        Raises:
+            StoreError: the store gave something else, or broke off.
+            OSError: the file is not there any more, or may not be read.
+        """
+        self.requests += len(ranges)
+        try:
+            parts = self._parts(ranges)
+        except StoreError as error:
+            raise self._fault(str(error)) from None
+        for (start, stop), part in zip(ranges, parts, strict=True):
+            self.bytes_read += len(part)
+            if len(part) != stop - start:
+                raise self._fault(
+                    f"{self.name} gave {len(part)} bytes where {stop - start} from byte {start} were asked for"
+                )
+        return parts
+
+    def changed(self) -> str:
+        """What is to be said where the file is another one than when it was opened; else nothing."""
+        return f"{self.name} has changed while it was read: open it again" if self._is_other() else ""
+
+    def _fault(self, said: str) -> StoreError:
+        """What is raised where something else came: that the file is another one explains it."""
+        try:
+            return StoreError(self.changed() or said)
+        except (StoreError, OSError):
+            return StoreError(said)
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Say in errors which file they are about, and whether the file is at fault, or is another one by now."""
+        try:
+            yield
+        except CsplatError as error:
+            if isinstance(error, FormatError) and (changed := self.changed()):
+                raise StoreError(changed) from None
+            error.path = error.path or self.name or None
+            raise
+
+    def close(self) -> None:
+        """Let go of it."""
+
+    def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        raise NotImplementedError
+
+    def _is_other(self) -> bool:
+        return False
+
+
+class Memory(Store):
+    """Bytes, or an open file, which is read to its end."""
+
+    def __init__(self, file: File) -> None:
+        self._view = view_of(file)
+        said = file if isinstance(file, (str, os.PathLike)) else getattr(file, "name", None)
+        super().__init__(os.fspath(said) if isinstance(said, (str, os.PathLike)) else "", len(self._view))
+
+    def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        return [bytes(self._view[start:stop]) for start, stop in ranges]
+
+
+class Disk(Store):
+    """A file of this machine. It is not mapped: whoever cuts it short while it is read must not end the program."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        self._facts = os.fstat(self._file.fileno())
+        super().__init__(str(path), self._facts.st_size)
+
+    def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        return [os.pread(self._file.fileno(), stop - start, start) for start, stop in ranges]
+
+    def _is_other(self) -> bool:
+        now = os.fstat(self._file.fileno())
+        return (now.st_size, now.st_mtime_ns) != (self._facts.st_size, self._facts.st_mtime_ns)
+
+    def close(self) -> None:
+        """Close it."""
+        self._file.close()
+
+
+class Window:
+    """A file's bytes at their own places, as far as they were fetched; all others are 0, and take no memory.
+
+    Attributes:
+        view: as long as the file.
+        store: the file.
+
+    Args:
+        store: the file.
+        head: its beginning, where that was read already.
+    """
+
+    def __init__(self, store: Store, head: bytes = b"") -> None:
+        self.store = store
+        self._head = head
+        self._here = [(0, len(head))]
+        flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
+        try:
+            self._map = mmap.mmap(-1, store.size, flags=flags) if store.size else None
+        except (OSError, OverflowError):
+            raise LimitError("address space of this machine", store.size) from None
+        # Of an array, so that nobody takes it for a mapped file, which can be read again once it is let go of.
+        self.view = np.frombuffer(self._map or bytearray(), np.uint8).data
+        self.view[: len(head)] = head
+
+    def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
+        """Read parts of the file, each an offset and a size; those that lie together in one request, others not again.
+
+        Raises:
+            StoreError, OSError: as of `Store.read`.
+        """
+        wanted = _missing(((at, at + size) for at, size in parts), self._here)
+        waiting: list[tuple[int, int]] = []
+        for start, stop in _missing(_joined(wanted, _GAP), self._here):
+            for at in range(start, stop, _REQUEST):
+                waiting.append((at, min(at + _REQUEST, stop)))
+                if len(waiting) == _AT_ONCE:
+                    self._take(waiting)
+                    waiting = []
+        self._take(waiting)
+
+    def forget(self) -> None:
+        """Let go of all that was fetched; nothing may look at it any more."""
+        if self._map is not None:
+            self._map.madvise(mmap.MADV_DONTNEED)
+        self.view[: len(self._head)] = self._head
+        self._here = [(0, len(self._head))]
+
+    def _take(self, ranges: Sequence[tuple[int, int]]) -> None:
+        if not ranges:
+            return
+        for (start, stop), data in zip(ranges, self.store.read(ranges), strict=True):
+            self.view[start:stop] = data
+        self._here = _joined([*self._here, *ranges])
+
+
+def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
+    """Ranges in order, as one where no more than a gap lies between them."""
+    runs: list[tuple[int, int]] = []
+    for start, stop in sorted(ranges):
+        if runs and start - runs[-1][1] <= gap:
+            runs[-1] = runs[-1][0], max(runs[-1][1], stop)
+        else:
+            runs.append((start, stop))
+    return runs
+
+
+def _missing(ranges: Iterable[tuple[int, int]], held: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """What of ranges is in none of others, which are in order."""
+    for start, stop in ranges:
+        for first, end in held:
+            if start < end and first < stop:
+                if start < first:
+                    yield start, first
+                start = end  # noqa: PLW2901  # the rest
+        if start < stop:
+            yield start, stop
