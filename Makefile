@@ -61,6 +61,8 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).codec.formats
+	$(BIN)/csplat encode $(SAMPLE) out/parts.csplat --force --quiet --set tile-splats=1024
+	$(BENCH).codec.parts out/parts.csplat --share 0.2
 	$(BENCH).rendering
 	$(BENCH).rendering.removal pass
 	$(BENCH).rendering.removal removal --gone 20,40,60,80
