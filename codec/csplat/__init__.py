@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         UnsupportedError,
     )
     from csplat.formats import read, write
+    from csplat.merging import merge
     from csplat.model import SplatModel
     from csplat.opened import SplatFile, extract, open
     from csplat.ply import lint_ply, read_ply, write_ply
@@ -63,6 +64,7 @@ __all__ = [
     "extract",
     "from_gsplat",
     "lint_ply",
+    "merge",
     "open",
     "read",
     "read_header",
@@ -120,6 +122,7 @@ _MODULE_OF = {
     "extract": "csplat.opened",
     "from_gsplat": "csplat.bridges",
     "lint_ply": "csplat.ply",
+    "merge": "csplat.merging",
     "open": "csplat.opened",
     "read_header": "csplat.decoder",
     "read": "csplat.formats",

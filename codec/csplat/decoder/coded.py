@@ -22,7 +22,7 @@ from csplat.decoder.lattice import (
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError
 
-__all__ = ["TileContext", "read_coded"]
+__all__ = ["TileContext", "leads", "read_coded"]
 
 _ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 _WIDE = np.dtype(np.int64)
@@ -75,6 +75,13 @@ def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) ->
     return block
 
 
+def leads(book: _spec.CodebookRecord, attribute: int) -> bool:
+    """Whether the block of that attribute has the indices of a codebook, which its other blocks use."""
+    if book.kind == _spec.CODEBOOK_KIND_SH:
+        return attribute == _spec.ATTRIBUTE_SH0 + book.band_first
+    return _spec.ATTRIBUTE_NAMES[attribute] == _spec.CODEBOOK_KIND_ATTRIBUTES[book.kind][0]
+
+
 def _indices(
     cursor: Cursor,
     context: TileContext,
@@ -85,11 +92,7 @@ def _indices(
 ) -> Indices:
     """Read the indices, or find those of the tile's first block of the codebook (CBK-4)."""
     name = _spec.ATTRIBUTE_NAMES[attribute]
-    if book.record.kind == _spec.CODEBOOK_KIND_SH:
-        first = attribute == _spec.ATTRIBUTE_SH0 + book.record.band_first
-    else:
-        first = name == _spec.CODEBOOK_KIND_ATTRIBUTES[book.record.kind][0]
-    if first:
+    if leads(book.record, attribute):
         indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
         context.first[params.codebook_id] = indices
         return indices

@@ -24,6 +24,7 @@ _MODULES = {
     "verify": "verify",
     "lint": "lint",
     "extract": "extract",
+    "merge": "merge",
     "convert": "convert",
     "formats": "convert",
     "compare": "compare",

@@ -1,0 +1,250 @@
+"""Several files as one: tiles are copied where that is possible, else the scenes are coded again together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat.decoder import read_header
+from csplat.encoder import EncodeOptions
+from csplat.encoder.container import FileChunk, FileTile, SceneFields, json_payload, parts
+from csplat.encoder.streams import Coding
+from csplat.errors import InputError
+from csplat.files import BinaryWriter, opened_for_writing
+from csplat.inputs import File
+from csplat.large import encode_scene
+from csplat.model import UNSPECIFIED, SplatModel
+from csplat.opened import SplatFile
+from csplat.opened import open as opened
+from csplat.parts import scene_fields
+from csplat.renumbering import Books, Spool, renumbered
+from csplat.scene import Scene
+
+__all__ = ["Merged", "merge"]
+
+_BOOKS_MAX = (1 << 16) - 1  # codebook_count is a u16
+#: What must not differ, for it says how all splats of a file are to be shown: words for it, and the field.
+_FACTS = (
+    ("axes", "coordinate_system"),
+    ("a unit in metres", "unit_metres"),
+    ("antialiasing", "antialiased"),
+    ("flatness", "flat"),
+)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What became of several files.
+
+    Attributes:
+        splat_count: splats of the file.
+        tile_count: its tiles.
+        size: its bytes.
+        why: the reason for which the scenes were decoded and coded again; empty where tiles were copied.
+        dropped: extra columns that not all of them had, where they were coded again.
+    """
+
+    splat_count: int
+    tile_count: int
+    size: int
+    why: str = ""
+    dropped: tuple[str, ...] = ()
+
+
+def merge(
+    files: Sequence[File],
+    output: str | os.PathLike[str] | BinaryWriter,
+    *,
+    options: EncodeOptions | None = None,
+    storage: Mapping[str, Any] | None = None,
+) -> Merged:
+    """Join files: the splats of the first, then those of the second, and so on.
+
+    Tiles are copied bit for bit, without decoding, where the files agree on steps and levels of all attributes, SH
+    degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
+    steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
+    are decoded and coded again together, as `csplat.large.encode_scene` does it, which costs quality once more;
+    `Merged.why` says why. What waits for its turn lies in temporary files.
+
+    Metadata and cameras are kept as far as all files have the same. What one file leaves open, axes or unit, another
+    one may say. Copied files state no errors and no options: nobody has measured the whole.
+
+    Args:
+        files: as of `csplat.open`, two or more.
+        output: a path, which the file takes when it is complete, replacing an older one; or an open binary file.
+        options: of the encoder, where scenes are coded again; by default the preset "balanced" and extra columns.
+        storage: as of `csplat.open`, of all files.
+
+    Examples:
+        >>> import csplat
+        >>> _ = csplat.extract("scene.csplat", (-1, -1, -1, 1, 1, 1), "part.csplat")
+        >>> merged = csplat.merge(["part.csplat", "part.csplat"], "twice.csplat")
+        >>> merged.why, merged.splat_count == len(csplat.decode("twice.csplat"))
+        ('', True)
+
+    Raises:
+        InputError: fewer than two files; their axes, units or ways to be shown contradict each other.
+        FormatError, UnsupportedError, LimitError, StoreError, OSError: as of `csplat.open`, and of what is read.
+    """
+    if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
+        raise InputError("merge joins two files or more: wanted a list of them")
+    with ExitStack() as stack:
+        scenes = [stack.enter_context(opened(file, storage=storage)) for file in files]
+        names = [scene.name or f"file {place}" for place, scene in enumerate(scenes, 1)]
+        for words, field in _FACTS:
+            _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
+        windows = [scene.window() for scene in scenes]
+        fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
+        why, ids = _difference(fields, names), []
+        spool = Spool(stack.enter_context(TemporaryFile()))
+        books = Books(spool)
+        if not why:
+            ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
+            if len(books.tables) > _BOOKS_MAX:
+                why = f"they have {len(books.tables):,} codebooks together, and a file at most {_BOOKS_MAX:,}"
+        if why:
+            return _coded_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
+        tiles = [
+            tile
+            for one, scene, new in zip(windows, scenes, ids, strict=True)
+            for tile in renumbered(one, scene.header, new, spool, len(scenes))
+        ]
+        together = replace(
+            fields[0],
+            axes=next((one.axes for one in fields if any(one.axes)), fields[0].axes),
+            unit_metres=next((one.unit_metres for one in fields if one.unit_metres), 0.0),
+            codebooks=books.tables,
+            chunks=[*_agreed_chunks(scenes), *books.chunks],
+        )
+        return _written(together, tiles, output)
+
+
+def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str]) -> None:
+    """Refuse scenes that cannot stand beside each other.
+
+    Raises:
+        InputError: two files say different things.
+    """
+    said = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
+    for value, name in said[1:]:
+        if value != said[0][0]:
+            raise InputError(
+                f"scenes that differ in {words} cannot be one: {_text(said[0][0])} in {said[0][1]},"
+                f" {_text(value)} in {name}"
+            )
+
+
+def _text(value: Any) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+
+
+def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
+    """Why tiles of one file would mean something else in the other; nothing where they would not."""
+    first, name = fields[0], names[0]
+    for other, its in zip(fields[1:], names[1:], strict=True):
+        if other.sh_degree != first.sh_degree:
+            return f"{its} has SH of degree {other.sh_degree}, {name} of {first.sh_degree}"
+        if other.origin != first.origin:
+            return f"{its} and {name} have different origins"
+        for one, two in zip(first.attributes, other.attributes, strict=True):
+            if one != two:
+                return f"{its} and {name} have different steps of {_spec.ATTRIBUTE_NAMES[one.attribute]}"
+        if other.extras != first.extras:
+            return f"{its} and {name} have different extra columns"
+    return ""
+
+
+def _agreed_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
+    """Metadata and cameras, as far as all files have the same."""
+    chunks = []
+    if metadata := _agreed([scene.metadata or {} for scene in scenes]):
+        chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, Coding())))
+    cameras = [scene.cameras for scene in scenes]
+    if cameras[0] is not None and all(one == cameras[0] for one in cameras):
+        chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(cameras[0], Coding())))
+    return chunks
+
+
+def _agreed(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    first, *others = values
+    return {key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)}
+
+
+def _written(scene: SceneFields, tiles: Sequence[FileTile], output: str | os.PathLike[str] | BinaryWriter) -> Merged:
+    size = 0
+    with opened_for_writing(output) as stream:
+        for part in parts(scene, tiles):
+            stream.write(part)
+            size += len(part)
+    return Merged(sum(tile.splat_count for tile in tiles), len(tiles), size)
+
+
+def _coded_again(
+    scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
+) -> Merged:
+    """Decode tile by tile and encode anew, in memory where that is enough for it."""
+    facts = _facts(scenes)
+    whole = Scene(sum(map(len, scenes)), facts, partial(_blocks, scenes, facts))
+    dropped = {column.name for scene in scenes for column in scene.header.extras} - facts.extra.keys()
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        path = Path(folder) / "merged.csplat"
+        encode_scene(whole, path, options, folder=Path(folder) / "work")
+        with path.open("rb") as coded, opened_for_writing(output) as stream:
+            shutil.copyfileobj(coded, stream)
+        return Merged(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
+
+
+def _facts(scenes: Sequence[SplatFile]) -> SplatModel:
+    """What the scenes are together, without splats: about one origin, with the columns that all have."""
+    headers = [scene.header for scene in scenes]
+    origins = np.array([header.origin for header in headers])
+    x, y, z = map(float, (origins.min(axis=0) + origins.max(axis=0)) / 2.0)  # float32 is finest about it
+    axes = (header.coordinate_system for header in headers if header.coordinate_system != UNSPECIFIED)
+    bands = (max(header.sh_degree for header in headers) + 1) ** 2 - 1
+    cameras = [scene.cameras for scene in scenes]
+    return SplatModel(
+        means=np.zeros((0, 3), np.float32),
+        quats=np.zeros((0, 4), np.float32),
+        scales=np.zeros((0, 3), np.float32),
+        opacities=np.zeros(0, np.float32),
+        sh0=np.zeros((0, 3), np.float32),
+        shN=np.zeros((0, bands, 3), np.float32),
+        origin=(x, y, z),
+        means_double=np.zeros((0, 3), np.float64) if (origins != origins[0]).any() else None,
+        coordinate_system=next(axes, UNSPECIFIED),
+        unit_metres=next((header.unit_metres for header in headers if header.unit_metres), None),
+        antialiased=headers[0].antialiased,
+        flat=headers[0].flat,
+        cameras=cameras[0] if all(one == cameras[0] for one in cameras) else None,
+        metadata=_agreed([scene.metadata or {} for scene in scenes]),
+        extra={
+            column.name: np.zeros(0, column.dtype)
+            for column in headers[0].extras
+            if column.dtype is not None and all(column in header.extras for header in headers)
+        },
+    )
+
+
+def _blocks(scenes: Sequence[SplatFile], facts: SplatModel) -> Iterator[SplatModel]:
+    for scene in scenes:
+        for tile in scene.tiles():
+            shN = np.zeros((len(tile.means), *facts.shN.shape[1:]), np.float32)
+            shN[:, : tile.shN.shape[1]] = tile.shN
+            means, doubles = tile.means, None
+            if facts.means_double is not None:
+                doubles = tile.means.astype(np.float64) + scene.header.origin
+                means = (doubles - facts.origin).astype(np.float32)
+            yield replace(
+                facts, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities, sh0=tile.sh0,
+                shN=shN, extra={name: tile.extra[name] for name in facts.extra}, means_double=doubles,
+            )  # fmt: skip

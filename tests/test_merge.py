@@ -1,0 +1,231 @@
+"""Several files as one."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_conformance
+from csplat import EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
+from csplat.decoder import read_metadata, read_options, read_stated_errors
+from csplat.decoder.references import codebook_references
+from csplat_conformance.validator import validate
+from csplat_tools.cli.app import app
+
+VECTORS = Path(csplat_conformance.__file__).parent / "vectors" / "valid"
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+STEPS = {
+    "position_step": 0.001, "scale_step": 0.05, "opacity_levels": 63, "quat_levels": 127, "sh0_step": 0.02,
+    "sh_step": 0.02, "chroma_shift": 1, "means_coding": "axis",
+}  # fmt: skip
+
+
+def merge(*files, **named):
+    """What became of the files, and the bytes."""
+    stream = io.BytesIO()
+    done = csplat.merge(files, stream, **named)
+    assert done.size == len(stream.getvalue())
+    return done, stream.getvalue()
+
+
+def assert_joined(parts, whole):
+    """The splats of some files, one after the other, bit for bit."""
+    for name in ARRAYS:
+        expected = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(expected.view(np.uint32), getattr(whole, name).view(np.uint32))
+    for name in whole.extra:
+        np.testing.assert_array_equal(np.concatenate([part.extra[name] for part in parts]), whole.extra[name])
+
+
+@pytest.fixture(scope="module")
+def sample(sample_path):
+    return read_ply(sample_path)
+
+
+@pytest.fixture(scope="module")
+def halves(sample):
+    """Two files with the same steps, and codebooks of their own: of SH, and of shapes."""
+    order = np.argsort(sample.means[:, 0])
+    options = EncodeOptions(
+        preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
+        shape_escape_fraction=0.05, tile_splats=1500, keep_extra=True, **STEPS,
+    )  # fmt: skip
+    ids = np.arange(len(sample), dtype=np.uint32)
+    model = replace(sample, extra={"id": ids})
+    return [encode(model.select(half), options) for half in np.array_split(order, 2)]
+
+
+# tiles that are copied
+
+
+def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(halves):
+    done, data = merge(*halves)
+    assert ("", 8929) == (done.why, done.splat_count)
+    assert () == validate(data).violations
+    assert_joined([decode(one) for one in halves], decode(data))
+    header = read_header(data)
+    kinds = [book.kind for one in halves for book in read_header(one).codebooks]
+    assert len(set(kinds)) == 2
+    assert sorted(kinds) == sorted(book.kind for book in header.codebooks)
+    assert done.tile_count == len(header.tiles) == sum(len(read_header(one).tiles) for one in halves)
+    assert data == merge(*halves)[1]
+
+
+def test_what_nobody_has_proved_of_the_whole_is_left_out(halves):
+    _, data = merge(*halves)
+    assert read_stated_errors(halves[0]) is not None
+    assert read_stated_errors(data) is None
+    assert read_options(data) is None
+
+
+def test_parts_of_a_file_share_their_codebooks_again(sample):
+    whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=1000))
+    middle = float(np.median(sample.means[:, 0]))
+    parts = []
+    for box in ((-1e3, -1e3, -1e3, middle, 1e3, 1e3), (middle, -1e3, -1e3, 1e3, 1e3, 1e3)):
+        stream = io.BytesIO()
+        csplat.extract(whole, box, stream)
+        parts.append(stream.getvalue())
+    done, data = merge(*parts)
+    assert not done.why
+    assert read_header(whole).codebooks == read_header(data).codebooks != ()
+    assert read_metadata(whole) == read_metadata(data)
+    assert decode(whole).cameras == decode(data).cameras
+    assert_joined([decode(part) for part in parts], decode(data))
+
+
+@pytest.mark.parametrize(
+    "name", ["rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "empty"]
+)
+def test_a_vector_beside_itself_is_there_twice(name):
+    path = VECTORS / f"{name}.csplat"
+    done, data = merge(path, path.read_bytes())
+    assert not done.why
+    assert () == validate(data).violations
+    assert_joined([decode(path)] * 2, decode(data))
+
+
+@pytest.mark.parametrize("path", sorted(VECTORS.glob("*.csplat")), ids=lambda path: path.stem)
+def test_references_to_codebooks_are_found_without_decoding(path):
+    data = path.read_bytes()
+    header = read_header(data)
+    found = set()
+    for tile in header.tiles:
+        here = set()
+        for layer in tile.layers.values():
+            if layer.layer <= 3:
+                for at, id in codebook_references(memoryview(data), header, layer):
+                    assert id == int.from_bytes(data[at : at + 2], "little")
+                    here.add(id)
+        assert here <= set(tile.tables)
+        found |= here
+    # A stream that is stepped over wrongly does not end where its chunk does: E_STREAM.
+    if "codebook" in path.stem and header.codebooks:
+        assert found
+
+
+def test_what_one_file_leaves_open_another_one_may_say(make_model):
+    options = EncodeOptions(preset="fast", **STEPS)
+    models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
+    models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
+    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, 1, 0]})
+    done, data = merge(*(encode(model, options) for model in models))
+    assert not done.why
+    header = read_header(data)
+    assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
+    assert {"licence": "CC0-1.0"} == read_metadata(data)
+
+
+def test_what_is_copied_is_checked(halves):
+    record = read_header(halves[1]).tiles[1].layers[0]
+    damaged = bytearray(halves[1])
+    damaged[record.offset + record.size - 1] ^= 1
+    with pytest.raises(FormatError, match="E_CRC"):
+        merge(halves[0], bytes(damaged))
+
+
+# scenes that are coded again
+
+
+@pytest.mark.parametrize(
+    ("degree", "fields", "options", "says"),
+    [
+        (1, {}, {"scale_step": 0.1}, "different steps of scales"),
+        (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
+        (1, {"origin": (100.0, 0.0, 0.0)}, {}, "different origins"),
+        (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
+    ],
+)
+def test_files_that_cannot_be_copied_are_coded_again_and_it_is_said_why(make_model, degree, fields, options, says):
+    first, second = make_model(40, 1), make_model(50, degree, **fields)
+    files = [
+        encode(first, EncodeOptions(preset="fast", keep_extra=True, **STEPS)),
+        encode(second, EncodeOptions(preset="fast", keep_extra=True, **{**STEPS, **options})),
+    ]
+    done, data = merge(*files, options=EncodeOptions(preset="small", position_step=1e-4))
+    assert says in done.why
+    assert () == validate(data).violations
+    model = decode(data)
+    assert 90 == len(model) == done.splat_count
+    assert (degree, ("id",) if "extra" in fields else ()) == (model.sh_degree, done.dropped)
+    sources = [decode(one) for one in files]
+    wanted = np.concatenate([one.means.astype(np.float64) + one.origin for one in sources])
+    found = model.means.astype(np.float64) + model.origin
+    distance = np.linalg.norm(wanted[:, None] - found, axis=2)
+    assert distance.min(axis=1).max() < 1e-3
+    assert distance.min(axis=0).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be one: RDF in .*a, RUB in .*b"),
+        (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "a unit in metres cannot be one: 1.0 in .*a, 0.01 in .*b"),
+        (({"antialiased": True}, {}), "antialiasing cannot be one: yes in .*a, no in .*b"),
+        (({}, {"flat": True}), "flatness cannot be one: no in .*a, yes in .*b"),
+    ],
+)
+def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fields, says):
+    for name, its in zip("ab", fields, strict=True):
+        (tmp_path / name).write_bytes(encode(make_model(20, 0, **its), EncodeOptions(preset="fast", **STEPS)))
+    with pytest.raises(InputError, match=says):
+        csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
+    assert not (tmp_path / "out.csplat").exists()
+
+
+@pytest.mark.parametrize("files", ["scene.csplat", [], ["scene.csplat"], b"x"])
+def test_fewer_than_two_files_are_refused(files, tmp_path):
+    with pytest.raises(InputError, match="two files or more"):
+        csplat.merge(files, tmp_path / "out.csplat")
+
+
+def test_more_codebooks_than_a_file_can_have_are_coded_again(halves, monkeypatch):
+    monkeypatch.setattr("csplat.merging._BOOKS_MAX", 3)
+    done, data = merge(*halves, options=EncodeOptions(preset="fast"))
+    assert "they have 4 codebooks together, and a file at most 3" == done.why
+    assert 8929 == len(decode(data))
+
+
+# the command
+
+
+def test_the_command_says_what_it_did(halves, make_model, tmp_path):
+    for name, data in zip("abc", [*halves, encode(make_model(40, 3))], strict=True):
+        (tmp_path / f"{name}.csplat").write_bytes(data)
+    a, b, c, out = (str(tmp_path / f"{name}.csplat") for name in ("a", "b", "c", "out"))
+    done = CliRunner().invoke(app, ["merge", a, b, "-o", out])
+    assert 0 == done.exit_code, done.stderr
+    assert "8,929 splats in 6 tiles, copied: " in done.stderr
+    assert merge(*halves)[1] == (tmp_path / "out.csplat").read_bytes()
+    assert 1 == CliRunner().invoke(app, ["merge", a, b, "-o", out]).exit_code  # it is there
+    refused = CliRunner().invoke(app, ["merge", a, b, "-o", a, "--force"])
+    assert 1 == refused.exit_code
+    assert "is the input" in refused.stderr
+    again = CliRunner().invoke(app, ["merge", a, c, "-o", out, "--force", "--preset", "fast", "--json"])
+    assert 0 == again.exit_code, again.stderr
+    assert "decoded and coded again (fast): " in again.stderr
+    assert '"copied": false' in again.stdout

@@ -1,0 +1,66 @@
+"""`csplat merge`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from csplat.encoder import EncodeOptions
+from csplat.errors import InputError, counted
+from csplat.merging import merge as merged
+from csplat_tools.cli.encoder_options import Preset
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
+from csplat_tools.files.console import format_bytes
+from csplat_tools.files.streams import STANDARD_STREAM, check_name, csplat_file, whole_output
+
+__all__ = ["merge"]
+
+
+@command()
+def merge(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="A.csplat B.csplat ...", help="Files in the order of their splats; URLs, or one -."),
+    ],
+    out: Output,
+    target: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write, or -.")],
+    preset: Preset = "balanced",
+) -> None:
+    """Join files into one.
+
+    Tiles are copied bit for bit where the files agree on steps, SH degree, origin and extra columns, as parts of one
+    scene do. Else the scenes are decoded and coded again together, with --preset; a line says so, and why. Files whose
+    axes or units contradict each other are refused. What the files say alike of the scene is kept; errors that they
+    state are left out.
+
+    Examples:
+      csplat merge north.csplat south.csplat -o city.csplat
+    """
+    if sources.count(STANDARD_STREAM) > 1:
+        raise InputError("two files cannot both come from standard input")
+    out.check(target, inputs=sources)
+    check_name(target, ".csplat", "-o", sources[0])
+    with whole_output(target) as stream:
+        done = merged(
+            [csplat_file(source) for source in sources],
+            stream,
+            options=EncodeOptions(preset=preset, keep_extra=True),
+        )
+    if done.why:
+        out.remark(f"decoded and coded again ({preset}): {done.why}")
+    if done.dropped:
+        out.remark(f"not all files have them, left out: {', '.join(done.dropped)}")
+    how = "coded again" if done.why else "copied"
+    out.remark(f"{done.splat_count:,} splats in {counted(done.tile_count, 'tile')}, {how}: {format_bytes(done.size)}")
+    out.publish(
+        {
+            "splats": done.splat_count,
+            "tiles": done.tile_count,
+            "bytes": done.size,
+            "copied": not done.why,
+            "why": done.why,
+            "dropped": list(done.dropped),
+        }
+    )
