@@ -77,7 +77,7 @@ build_and_install_wheel() {
     local pip=("$DEV/python" -m pip --python "$WHEEL/python" install --quiet --disable-pip-version-check --no-compile)
     local wheel
     wheel=$(echo out/dist/csplat-*.whl)
-    "${pip[@]}" "${wheel}[render,film,torch-tests,remote-tests,browser-tests]" pytest hypothesis jsonschema
+    "${pip[@]}" "${wheel}[render,film,scale,torch-tests,remote-tests,browser-tests]" pytest hypothesis jsonschema
     "${pip[@]}" --force-reinstall --no-deps "$wheel"
     "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
 }

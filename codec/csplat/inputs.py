@@ -54,7 +54,9 @@ class LetGo:
 
     def __init__(self, view: memoryview) -> None:
         known = hasattr(mmap, "madvise") and hasattr(mmaps, "MADV_DONTNEED")
-        self._file = view.obj if known and isinstance(view.obj, mmap) else None
+        file = view.obj if known and isinstance(view.obj, mmap) else None
+        # What somebody may have written there is nowhere else.
+        self._file = file if file is not None and memoryview(file).readonly else None
         self._read_bytes = 0
 
     def after(self, size_bytes: int) -> None:

@@ -40,8 +40,8 @@ def reversed_transforms(pack):
     return run
 
 
-def payload_crc(_crc):
-    return lambda _head, payload: zlib.crc32(payload)
+def payload_crc(_chunk_crc):
+    return lambda _kind, payload: zlib.crc32(payload)
 
 
 # Chance ---------------------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ MISTAKES = {
         "a chunk's CRC is that of its payload",
         BROKEN,
         ("L1", "CHK-1"),
-        stage=replaced(container, "_crc", payload_crc),
+        stage=replaced(container, "chunk_crc", payload_crc),
     ),
     # chance
     "seed_by_chance": Mistake(
