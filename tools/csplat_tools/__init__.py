@@ -17,6 +17,7 @@ from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
 if TYPE_CHECKING:
+    from csplat_tools.batches.running import Batch, batch
     from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
     from csplat_tools.inspect.compare import Comparison, compare
     from csplat_tools.optimise.reaching import encode_to
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "VERSIONS",
+    "Batch",
     "Comparison",
     "DataOptions",
     "LoadedModel",
@@ -38,6 +40,7 @@ __all__ = [
     "Tradeoff",
     "ViewSet",
     "Wanted",
+    "batch",
     "compare",
     "encode_to",
     "find_view_set",
@@ -50,6 +53,7 @@ __all__ = [
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 
 _MODULE_OF = {
+    "Batch": "csplat_tools.batches.running",
     "Comparison": "csplat_tools.inspect.compare",
     "DataOptions": "csplat_tools.views",
     "LoadedModel": "csplat_tools.files.scenes",
@@ -60,6 +64,7 @@ _MODULE_OF = {
     "Tradeoff": "csplat_tools.tradeoffs.running",
     "ViewSet": "csplat_tools.views",
     "Wanted": "csplat_tools.tradeoffs.options",
+    "batch": "csplat_tools.batches.running",
     "compare": "csplat_tools.inspect.compare",
     "encode_to": "csplat_tools.optimise.reaching",
     "find_view_set": "csplat_tools.views",

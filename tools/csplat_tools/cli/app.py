@@ -14,7 +14,7 @@ from csplat_tools import VERSIONS
 from csplat_tools.cli.console import WrongCommandLine, guarded, refuse_command_line
 from csplat_tools.files.console import say
 
-__all__ = ["app"]
+__all__ = ["app", "command_function"]
 
 #: Commands as `--help` lists them, and the modules of `csplat_tools.cli` that define them.
 _MODULES = {
@@ -38,7 +38,15 @@ _MODULES = {
     "export-html": "view",
     "export-element": "view",
     "conformance": "conformance",
+    "batch": "batch",
 }
+
+
+def command_function(name: str) -> Any:
+    """What defines a command: a function, or a typer of several; `None`: there is no such command."""
+    if name not in _MODULES:
+        return None
+    return getattr(import_module(f"csplat_tools.cli.{_MODULES[name]}"), name.replace("-", "_"))
 
 
 class _Commands(TyperGroup):
@@ -68,7 +76,7 @@ class _Commands(TyperGroup):
 
 def _imported(name: str) -> Any:
     """The command of a name, or the group of commands."""
-    found = getattr(import_module(f"csplat_tools.cli.{_MODULES[name]}"), name.replace("-", "_"))
+    found = command_function(name)
     alone = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):
         alone.add_typer(found, name=name)

@@ -93,7 +93,8 @@ def command(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
 
-    An argument `output` may be given as `-o`, too.
+    An argument `output` may be given as `-o`, too. What is made has an attribute `parsed`, which takes the same options
+    and checks them without doing anything.
 
     Args:
         one_of, needs: as in `Group`, for options of several groups or of none.
@@ -114,8 +115,7 @@ def command(
         options = {one.name: _spelling(one) for one in flat}
         defaults = {one.name: one.default for one in flat}
 
-        @functools.wraps(function)
-        def run(**given: Any) -> None:
+        def parsed(**given: Any) -> dict[str, Any]:
             given.pop(_HELP_ALL, None)
             _check({name for name in given if given[name] != defaults[name]}, options, exclusive, wanting)
             if settings:
@@ -127,16 +127,24 @@ def command(
             }
             for group in values.values():
                 group.parse()
+            return {**given, **values}
+
+        @functools.wraps(function)
+        def run(**given: Any) -> None:
+            values = parsed(**given)
             quiet = any(isinstance(group, Output) and group.quiet for group in values.values())
             with nullcontext() if serves else progress_bar(quiet=quiet):
-                function(**given, **values)
+                function(**values)
 
         flat.append(_help_all(functools.partial(_more_help, function, settings, options)))
         shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}
         told = [_saying_what_excludes_it(one, shown, exclusive) for one in flat]
-        run.__signature__ = inspect.Signature(told)  # type: ignore[attr-defined]  # functions take attributes
-        run.__annotations__ = {one.name: one.annotation for one in told} | {"return": None}
+        for each in (run, parsed):
+            taking: Any = each  # attributes, as all functions
+            taking.__signature__ = inspect.Signature(told)
+            taking.__annotations__ = {one.name: one.annotation for one in told} | {"return": None}
         run.__doc__ = _MORE.split(function.__doc__ or "")[0]
+        run.parsed = parsed  # type: ignore[attr-defined]  # likewise
         return guarded(run)
 
     return made

@@ -18,7 +18,12 @@ from csplat.scene import Scene
 from csplat_tools.files.console import Progress
 from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
 
-__all__ = ["LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "watched", "without_bands"]
+__all__ = [
+    "FOLDER_NAMES", "LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "watched", "without_bands",
+]  # fmt: skip
+
+#: Files that stand for all that lies beside them: SOG as a folder, and with levels.
+FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +97,7 @@ def load_model(scene: SceneLike) -> LoadedModel:
 
 def size_of(path: Path) -> int:
     """Bytes of a file, or of all files of a folder."""
-    if path.name.lower() in ("meta.json", "lod-meta.json"):  # of SOG: what it names lies beside it
+    if path.name.lower() in FOLDER_NAMES:
         path = path.parent
     if not path.is_dir():
         return path.stat().st_size

@@ -1,0 +1,60 @@
+"""A batch on a cluster of Dask: each scene is a task, done by a process beside the one of Dask's worker."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Generator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+from csplat.errors import missing
+from csplat_tools.batches.records import Record
+from csplat_tools.batches.scene import Job, do_job
+from csplat_tools.batches.workers import Worker
+
+__all__ = ["on_cluster"]
+
+_here = threading.local()  # the process of each thread of a Dask worker; it ends with that
+
+
+def on_cluster(jobs: Sequence[Job], dask: Any) -> Generator[tuple[Record, bool], None, None]:
+    """Do jobs on a cluster; give each as soon as it has ended, with whether anything was done.
+
+    Dask gives the scenes of a machine that it lost to others, some times.
+
+    Args:
+        jobs: scenes, under paths that all machines have.
+        dask: the address of a scheduler, or a client.
+
+    Raises:
+        InputError: Dask is not installed.
+        OSError: there is no scheduler.
+    """
+    try:
+        import distributed
+    except ModuleNotFoundError as error:
+        raise missing(error, "dask[distributed]", extra="scale") from None
+    dasks: Any = distributed  # it has no types
+    with dasks.Client(dask, set_as_default=False) if isinstance(dask, str) else nullcontext(dask) as client:
+        tasks = {client.submit(_do, job, pure=False): job for job in jobs}
+        try:
+            for future in dasks.as_completed(list(tasks)):
+                yield _result(future, tasks[future])
+        finally:
+            client.cancel(list(tasks))
+
+
+def _do(job: Job) -> tuple[Record, bool]:
+    if not hasattr(_here, "worker"):
+        _here.worker = Worker()
+    return do_job(job, _here.worker)
+
+
+def _result(future: Any, job: Job) -> tuple[Record, bool]:
+    try:
+        record, worked = future.result()
+    except Exception as error:  # noqa: BLE001  # whatever a cluster says of a task that it gave up
+        words = " ".join(str(error).split()) or type(error).__name__
+        return replace(job.record, code="E_CLUSTER", error=words), True
+    return record, worked

@@ -1,0 +1,178 @@
+"""Which scenes a batch has: those of a folder, or the lines of a manifest."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from csplat.errors import InputError
+from csplat.formats import formats
+from csplat_tools.files.scenes import FOLDER_NAMES
+
+__all__ = ["Task", "find_tasks", "is_url"]
+
+_MANIFESTS = (".jsonl", ".csv", ".txt")
+_COLUMNS = ("path", "output", "options")
+_ONE_LEVEL, _LEVELS = FOLDER_NAMES
+_OWN = ".csplat"
+#: What a command takes of a folder, where that is not everything: by name, whether it wants this project's own files.
+_WANTS_OWN = {"encode": False, "decode": True, "extract": True}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene, and where what is made of it goes.
+
+    Attributes:
+        source: its path, or a URL.
+        output: a path within the folder of outputs, with slashes; or a URL.
+        options: of its own, behind those of all.
+    """
+
+    source: str
+    output: str
+    options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A scene whose output may have no name yet; `within`: its path in the folder, where it is in it."""
+
+    task: Task
+    within: str
+
+
+def is_url(name: str) -> bool:
+    """Whether a name says how to get there: `s3://bucket/scene.ply`."""
+    return "://" in name
+
+
+def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", without: Path | None = None) -> list[Task]:
+    """The scenes of a folder, sorted, or of a manifest in its order.
+
+    Args:
+        scenes: a folder, searched with all that are in it for names that `csplat formats` lists; or a manifest: lines
+            of JSON (.jsonl), or of path, output and options with commas between them (.csv, .txt).
+        command: what is done with them: `encode` leaves .csplat files out, `decode` takes no others.
+        ending: of outputs that have no name.
+        match: which names of a folder, as shells have it.
+        without: a folder that is not searched: that of the outputs.
+
+    Raises:
+        InputError: it is neither; a line says nothing; there is no scene, or two have one output.
+        OSError: it cannot be read.
+    """
+    path = Path(scenes)
+    path.stat()
+    if path.is_dir():
+        found = [_Found(Task(str(path / name), ""), name) for name in _names(path, command, match, without)]
+    elif path.suffix.lower() in _MANIFESTS:
+        found = list(_listed(path))
+    else:
+        raise InputError(f"{scenes} is no folder, wanted one, or a manifest: {', '.join(_MANIFESTS)}")
+    if not found:
+        raise InputError(f"{scenes} has no scene for `csplat {command}`")
+    named = _named(found, path.resolve().name if path.is_dir() else path.stem, ending)
+    output, count = Counter(one.output for one in named).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{output} is the output of {count} scenes: give them names in a manifest")
+    return named
+
+
+def _names(folder: Path, command: str, match: str, without: Path | None) -> list[str]:
+    """Names of scenes within a folder, with slashes."""
+    endings = tuple(suffix for one in formats() if one.open is not None for suffix in one.suffixes)
+    names = []
+    for one in sorted(folder.rglob("*")):
+        name = one.name.lower()
+        known = name.endswith(tuple(end for end in endings if end.startswith("."))) or name in FOLDER_NAMES
+        own = _WANTS_OWN.get(command)
+        if not known or one.is_dir() or (own is not None and own != name.endswith(_OWN)):
+            continue
+        relative = one.relative_to(folder).as_posix()
+        hidden = any(part.startswith(".") for part in relative.split("/"))
+        ours = without is not None and one.resolve().is_relative_to(without.resolve())
+        if not hidden and not ours and (fnmatch(relative, match) or fnmatch(one.name, match)):
+            names.append(relative)
+    return [name for name in names if not _is_part(name, names)]
+
+
+def _is_part(name: str, names: Sequence[str]) -> bool:
+    """Whether a file belongs to a scene whose levels are folders beneath it."""
+    path = PurePosixPath(name)
+    return path.name == _ONE_LEVEL and any(str(above / _LEVELS) in names for above in path.parents)
+
+
+def _listed(manifest: Path) -> Iterator[_Found]:
+    """The lines of a manifest. Paths are relative to its folder."""
+    text = manifest.read_text(encoding="utf-8-sig")
+    lines = _json_lines(manifest, text) if manifest.suffix.lower() == ".jsonl" else _table_lines(text)
+    for number, fields in lines:
+        where = f"{manifest.name}, line {number}"
+        source, output, options = (fields.get(name) or "" for name in _COLUMNS)
+        if not isinstance(source, str) or not source or not isinstance(output, str):
+            raise InputError(f"{where}: wanted a path, and perhaps an output and options")
+        if not is_url(output) and (PurePosixPath(output).is_absolute() or ".." in PurePosixPath(output).parts):
+            raise InputError(f"{where}: the output {output} leads out of the folder of outputs")
+        try:
+            words = shlex.split(options) if isinstance(options, str) else [str(word) for word in options]
+        except (ValueError, TypeError):
+            raise InputError(f"{where}: the options are {options!r}, wanted words as of a command line") from None
+        placed = source if is_url(source) else str(manifest.parent / source)
+        yield _Found(Task(placed, output, tuple(words)), _within(source))
+
+
+def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            fields = json.loads(line)
+        except ValueError:
+            fields = None
+        if not isinstance(fields, dict):
+            raise InputError(f"{manifest.name}, line {number}: wanted an object of JSON with a path")
+        yield number, fields
+
+
+def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    rows = csv.reader(text.splitlines(), skipinitialspace=True)
+    for row in rows:
+        cells = [cell.strip() for cell in row]
+        if any(cells) and not cells[0].startswith("#") and tuple(cells) != _COLUMNS[: len(cells)]:
+            yield rows.line_num, dict(zip(_COLUMNS, cells, strict=False))
+
+
+def _within(source: str) -> str:
+    """A path of a manifest as one within the folder of outputs; its last part where it leads elsewhere."""
+    path = PurePosixPath(source.partition("?")[0])
+    return path.name if is_url(source) or path.is_absolute() or ".." in path.parts else str(path)
+
+
+def _named(found: Sequence[_Found], root: str, ending: str) -> list[Task]:
+    """Give outputs names: the source's with another ending, or behind its own where two would get the same name."""
+    short = [one.task.output or _output(one.within, root, ending, whole=False) for one in found]
+    counts = Counter(short)
+    return [
+        replace(
+            one.task,
+            output=name if one.task.output or counts[name] == 1 else _output(one.within, root, ending, whole=True),
+        )
+        for one, name in zip(found, short, strict=True)
+    ]
+
+
+def _output(within: str, root: str, ending: str, *, whole: bool) -> str:
+    path = PurePosixPath(within)
+    if path.name in FOLDER_NAMES:
+        return f"{path.parent if path.parent.name else root}{ending}"
+    endings = [end for one in formats() for end in one.suffixes if path.name.lower().endswith(end)]
+    stem = path.name if whole or not endings else path.name[: -len(max(endings, key=len))]
+    return str(path.with_name(stem + ending))

@@ -1,0 +1,131 @@
+"""What is known of a scene before anything is done with it: what it holds, and what work on it is expected to take."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from csplat.decoder import read_header
+from csplat.errors import CsplatError
+from csplat.formats import format_of, open_scene
+from csplat_tools.files.scenes import FOLDER_NAMES, size_of
+
+__all__ = ["Expected", "Look", "content_hash", "expect", "look"]
+
+_OWN = "csplat"
+_FILE_SPLAT_BYTES = 16.0  # where the number of splats is not known: about as .splat, SPZ and SOG have it or more
+#: Seconds and bytes that a scene takes, and those that each splat takes, on a core; by command. Bytes of the process.
+_COSTS = {
+    "encode": (0.1, 45e-6, 150e6, 1500.0),
+    "decode": (0.05, 3e-6, 150e6, 700.0),
+    "convert": (0.05, 10e-6, 250e6, 300.0),
+    "extract": (0.02, 0.1e-6, 120e6, 20.0),
+}
+_OTHER_BYTES = (500e6, 3000.0)  # of commands that render: a guess on the safe side
+
+
+@dataclass(frozen=True)
+class Look:
+    """A scene's file.
+
+    Attributes:
+        sha256: of its content; of a folder, of its files and their names.
+        size_bytes: of all of it.
+        splats: N; `None` where the file does not say.
+        format: the name of its format; "" where it has none.
+    """
+
+    sha256: str
+    size_bytes: int
+    splats: int | None
+    format: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON-compatible values, which `Look(**...)` takes."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a scene is expected to take.
+
+    Attributes:
+        seconds: on one core; `None` where nothing is known of the command.
+        memory_bytes: of the process at most.
+    """
+
+    seconds: float | None
+    memory_bytes: int
+
+
+def look(path: Path) -> Look:
+    """Read a scene's head, and hash it; what is wrong with it the command says.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    splats, name = None, ""
+    try:
+        name = format_of(path).name
+        if name == _OWN:
+            splats = read_header(path).splat_count
+        else:
+            with open_scene(path) as scene:
+                splats = scene.count
+    except (CsplatError, ValueError, MemoryError):
+        pass  # of such a file nothing is foretold
+    return Look(content_hash(path), size_of(path), splats, name)
+
+
+def expect(command: str, known: Look) -> Expected:
+    """What a command takes that does what it does without options."""
+    splats = known.splats if known.splats is not None else known.size_bytes / _FILE_SPLAT_BYTES
+    if command not in _COSTS:
+        each, by_splat = _OTHER_BYTES
+        return Expected(None, round(each + by_splat * splats))
+    seconds, seconds_by_splat, each, by_splat = _COSTS[command]
+    return Expected(seconds + seconds_by_splat * splats, round(each + by_splat * splats))
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 of a file; of a scene of several files, or of a folder, of their names and contents.
+
+    Raises:
+        OSError: one cannot be read.
+    """
+    files = _files(path)
+    if files == [path]:
+        return _hashed(path)
+    base = path if path.is_dir() else path.parent
+    lines = [f"{_hashed(one)} {one.relative_to(base).as_posix()}\n" for one in files]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a scene, or of a folder of results."""
+    folder = path.parent if path.name.lower() in FOLDER_NAMES else path
+    if folder.is_dir():
+        return sorted(one for one in folder.rglob("*") if one.is_file())
+    return [path, *_beside(path)] if path.suffix.lower() == ".gltf" else [path]
+
+
+def _beside(path: Path) -> Iterator[Path]:
+    """Files that a glTF names; what is none names none."""
+    try:
+        buffers = json.loads(path.read_bytes()).get("buffers", [])
+        names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
+    except (ValueError, TypeError, AttributeError):
+        return
+    for name in names:
+        if (path.parent / name).is_file() and (path.parent / name).resolve().is_relative_to(path.parent.resolve()):
+            yield path.parent / name
+
+
+def _hashed(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

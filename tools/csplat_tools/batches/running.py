@@ -1,0 +1,309 @@
+"""A batch: scene after scene on the processes of this machine, or on a cluster; none takes the others down with it."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from csplat.errors import InputError
+from csplat_tools.batches.budget import Budget, available_bytes
+from csplat_tools.batches.finding import Task, find_tasks, is_url
+from csplat_tools.batches.page import write_page
+from csplat_tools.batches.records import Record, open_journal, read_journal
+from csplat_tools.batches.scene import Job, Planned, do_job, plan_job
+from csplat_tools.batches.workers import Worker, WorkerLostError
+from csplat_tools.files.scenes import size_of
+
+__all__ = ["Batch", "CommandLineError", "Step", "batch", "plan"]
+
+_GIVEN = ("threads", "memory")  # options that are given to a command that has them
+_FREE_SHARE = 0.9  # of the memory that is free: what a batch takes of which no number is said
+T = TypeVar("T")
+
+
+class CommandLineError(InputError):
+    """The command of a batch, or its options, are none."""
+
+    code = "E_USAGE"
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a batch has come.
+
+    Attributes:
+        iteration, iterations: scenes that ended, and all.
+        failed: of these.
+        share: of the work that is done, by the sizes of the sources, 0 to 1; what was done before is none.
+        record: of the scene that ended now.
+    """
+
+    iteration: int
+    iterations: int
+    failed: int
+    share: float
+    record: Record
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What became of a batch.
+
+    Attributes:
+        folder: of the outputs.
+        records: of all scenes, in their order.
+        done_before: outputs that an earlier run had made, of the same files with the same command.
+    """
+
+    folder: Path
+    records: tuple[Record, ...]
+    done_before: frozenset[str]
+
+    @property
+    def failures(self) -> list[Record]:
+        """The scenes that failed."""
+        return [one for one in self.records if one.state == "failed"]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return totals and records as JSON-compatible values."""
+        return {
+            "scenes": len(self.records),
+            "done": len(self.records) - len(self.failures) - len(self.done_before),
+            "done_before": len(self.done_before),
+            "failed": len(self.failures),
+            "records": [one.as_json() for one in self.records],
+        }
+
+
+def batch(
+    scenes: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    command: Sequence[str] = ("encode",),
+    *,
+    ending: str | None = None,
+    match: str = "*",
+    workers: int | None = None,
+    memory_bytes: int | None = None,
+    dask: Any = None,
+    force: bool = False,
+    thumbnails: bool = True,
+    progress: Callable[[Step], object] | None = None,
+) -> Batch:
+    """Do the same with many scenes: what `csplat batch` calls.
+
+    What is done already is not done again: where the content of a source, the command with its options and the version
+    of the program are those of `batch.jsonl`, and the output is there as it was left. Scenes that failed are tried
+    again.
+
+    Args:
+        scenes: a folder, with all that are in it; or a manifest, see `find_tasks`.
+        folder: of the outputs; made if need be. `batch.jsonl` and `index.html` are written there, too.
+        command: that takes a scene and an output, with its options.
+        ending: of the outputs; `None`: that of the command.
+        match: which names of a folder, as `*.ply`.
+        workers: processes at a time; `None`: one per core.
+        memory_bytes: what they may hold together, by what scenes are expected to want; a scene that wants more alone
+            fails, or is given so much where the command has `--memory`. `None`: most of what is free, and a scene that
+            wants more alone is tried alone.
+        dask: of a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines see the same
+            files; `workers` and `memory_bytes` are the cluster's affair.
+        force: outputs that no batch has written may be replaced.
+        thumbnails: draw a small picture of each, where the extra `render` is installed.
+        progress: is told of each scene that ended.
+
+    Returns:
+        A record for each scene; those that failed are among them.
+
+    Examples:
+        >>> import csplat_tools
+        >>> found = csplat_tools.batch("scenes", "encoded", ["encode", "--preset", "small"])  # doctest: +SKIP
+        >>> [(one.path, one.error) for one in found.failures]  # doctest: +SKIP
+
+    Raises:
+        InputError: there is no scene, or a manifest says nothing, or another batch is at work in the folder.
+        OSError: the folder cannot be written.
+    """
+    target = Path(folder)
+    tasks, options = _prepared(scenes, target, command, ending, match)
+    target.mkdir(parents=True, exist_ok=True)
+    count = min(workers or _cores(), len(tasks))
+    threads = max(1, _cores() // count) if "threads" in options and dask is None else None
+    with open_journal(target) as journal:
+        jobs = [
+            replace(one, force=force, threads=threads, thumbnail=thumbnails)
+            for one in _jobs(tasks, command, target, journal.records, journal.pending)
+        ]
+        journal.begin([one.task.output for one in jobs if _may_begin(one)])
+        before = set()
+        with closing(_ended(jobs, count, memory_bytes, dask, has_option="memory" in options)) as ended:
+            for step, worked in _steps(ended, jobs):
+                if worked:
+                    journal.add(step.record)
+                else:
+                    before.add(step.record.output)
+                    journal.records[step.record.output] = step.record
+                if progress is not None:
+                    progress(step)
+        journal.end()
+        result = Batch(target, tuple(journal.records[one.output] for one in tasks), frozenset(before))
+        write_page(result.records, target)
+    return result
+
+
+def plan(
+    scenes: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    command: Sequence[str] = ("encode",),
+    *,
+    ending: str | None = None,
+    match: str = "*",
+    workers: int | None = None,
+) -> list[Planned]:
+    """What `batch` would do with each scene, how long that takes and how much memory; nothing is written.
+
+    Raises:
+        InputError, OSError: as of `batch`.
+    """
+    target = Path(folder)
+    tasks, _ = _prepared(scenes, target, command, ending, match)
+    jobs = _jobs(tasks, command, target, *read_journal(target))
+    with closing(_spread(jobs, min(workers or _cores(), len(jobs)), plan_job)) as planned:
+        found = {one.job.task.output: one for one in planned}
+    return [found[one.output] for one in tasks]
+
+
+def _prepared(
+    scenes: str | os.PathLike[str], folder: Path, command: Sequence[str], ending: str | None, match: str
+) -> tuple[list[Task], frozenset[str]]:
+    """Scenes, once their command lines are known to be right, and the options that the command has.
+
+    Raises:
+        CommandLineError: one is wrong.
+    """
+    worker = Worker()
+    try:
+        said = _checked(worker, command)
+        wanted = said["ending"] if ending is None else ending
+        if ending is None and not wanted:
+            raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
+        tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
+        for options in {one.options for one in tasks if one.options}:
+            _checked(worker, (*command, *options))
+    finally:
+        worker.close()
+    return tasks, frozenset(said["options"]) & set(_GIVEN)
+
+
+def _checked(worker: Worker, words: Sequence[str]) -> Mapping[str, Any]:
+    if not words:
+        raise CommandLineError("wanted a command behind --, as encode")
+    try:
+        said = worker.ask("check", words=list(words))
+    except WorkerLostError as error:
+        raise InputError(f"no process could be started: {error}") from None
+    if said["wrong"]:
+        raise CommandLineError(said["wrong"])
+    return said
+
+
+def _jobs(
+    tasks: Sequence[Task], command: Sequence[str], folder: Path, records: Mapping[str, Record], pending: set[str]
+) -> list[Job]:
+    place = str(folder.resolve())
+    return [Job(one, tuple(command), place, records.get(one.output), one.output in pending) for one in tasks]
+
+
+def _may_begin(job: Job) -> bool:
+    """Whether a file that is found in the output's place from now on is this run's."""
+    output = job.task.output
+    known = job.pending or (job.earlier is not None and job.earlier.output_sha256)
+    return not is_url(output) and bool(known or not (Path(job.folder) / output).exists())
+
+
+def _ended(
+    jobs: Sequence[Job], count: int, memory_bytes: int | None, dask: Any, *, has_option: bool
+) -> Generator[tuple[Record, bool], None, None]:
+    """Do all, and give each as soon as it has ended, with whether anything was done."""
+    if dask is not None:
+        from csplat_tools.batches.cluster import on_cluster
+
+        yield from on_cluster(jobs, dask)
+        return
+    budget = Budget(memory_bytes, available_bytes(_FREE_SHARE), has_option=has_option)
+    yield from _spread(jobs, count, lambda job, worker: do_job(job, worker, budget.gate), budget.stop)
+
+
+def _spread(
+    jobs: Sequence[Job], count: int, do: Callable[[Job, Worker], T], stop: Callable[[], object] = lambda: None
+) -> Generator[T, None, None]:
+    """Do jobs on so many processes, the largest first; who closes this before the end ends them.
+
+    Args:
+        jobs: scenes.
+        count: processes.
+        do: what a thread does with a scene and the process that it has.
+        stop: is called when it ends.
+    """
+    todo: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+    ended: queue.SimpleQueue[T | Exception] = queue.SimpleQueue()
+    for job in (*sorted(jobs, key=_size_of, reverse=True), *[None] * count):
+        todo.put(job)
+    workers = [Worker() for _ in range(count)]
+    stopped = threading.Event()
+
+    def work(worker: Worker) -> None:
+        while (job := todo.get()) is not None and not stopped.is_set():
+            try:
+                ended.put(do(job, worker))
+            except Exception as error:  # noqa: BLE001  # a defect, which the thread that waits is to raise
+                ended.put(error)
+
+    with ThreadPoolExecutor(count) as pool:
+        try:
+            for worker in workers:
+                pool.submit(work, worker)
+            for _ in jobs:
+                one = ended.get()
+                if isinstance(one, Exception):
+                    raise one
+                yield one
+        finally:
+            stopped.set()
+            stop()
+            ends = [threading.Thread(target=one.close) for one in workers]
+            for thread in ends:
+                thread.start()
+            for thread in ends:
+                thread.join()
+
+
+def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[Job]) -> Iterator[tuple[Step, bool]]:
+    """How far it has come with each."""
+    sizes = {one.task.output: 1.0 + _size_of(one) for one in jobs}
+    whole, done, failed = sum(sizes.values()), 0.0, 0
+    for number, (record, worked) in enumerate(ended, 1):
+        if worked:
+            done += sizes[record.output]
+        else:
+            whole -= sizes[record.output]
+        failed += record.state == "failed"
+        yield Step(number, len(jobs), failed, done / whole if whole > 0.0 else 1.0, record), worked
+
+
+def _size_of(job: Job) -> int:
+    """Bytes of a source, as far as they are known for nothing."""
+    with suppress(OSError):
+        return 0 if is_url(job.task.source) else size_of(Path(job.task.source))
+    return 0
+
+
+def _cores() -> int:
+    """Of this machine, those that this program may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

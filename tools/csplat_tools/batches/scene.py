@@ -1,0 +1,244 @@
+"""What is done with one scene, here or on a machine of a cluster: look, leave as it is or run the command, say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from csplat import __version__
+from csplat.errors import CsplatError, missing
+from csplat_tools.batches.finding import Task, is_url
+from csplat_tools.batches.looking import Look, content_hash, expect
+from csplat_tools.batches.records import Record
+from csplat_tools.batches.workers import Worker, WorkerLostError, remove_left
+from csplat_tools.files.scenes import size_of
+
+__all__ = ["Job", "Planned", "do_job"]
+
+THUMBNAILS = "thumbnails"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene that is to be done.
+
+    Attributes:
+        task: the scene.
+        command: with the options of all, as words.
+        folder: of the outputs, absolute.
+        earlier: what became of it before.
+        pending: the output may be there by a run that did not end by itself.
+        force: whatever is there may be replaced.
+        threads: of the command; `None`: it has no such option.
+        thumbnail: whether a picture is wanted.
+    """
+
+    task: Task
+    command: tuple[str, ...]
+    folder: str
+    earlier: Record | None = None
+    pending: bool = False
+    force: bool = False
+    threads: int | None = None
+    thumbnail: bool = False
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command with all options."""
+        return (*self.command, *self.task.options)
+
+    @property
+    def record(self) -> Record:
+        """Of a failure; what is known is added."""
+        before = "" if self.earlier is None else self.earlier.output_sha256
+        return Record(self.task.source, self.task.output, self.words, __version__, "failed", output_sha256=before)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What would be done.
+
+    Attributes:
+        job: with whom.
+        look: the scene's file; `None`: it cannot be read.
+        is_done: nothing would.
+        seconds: that are expected on a core; `None`: nothing is known of the command.
+        memory_bytes: that are expected.
+    """
+
+    job: Job
+    look: Look | None
+    is_done: bool
+    seconds: float | None
+    memory_bytes: int
+
+
+#: Gives a scene its memory, in which the command runs: asked for bytes, it gives options for the command.
+Gate = Callable[[int], AbstractContextManager[tuple[str, ...]]]
+
+
+def plan_job(job: Job, worker: Worker) -> Planned:
+    """Look at a scene and say what would be done; nothing is."""
+    try:
+        with _here(job.task.source) as source:
+            found = _looked(worker, source)
+            assert isinstance(found, Look)
+    except CsplatError:
+        return Planned(job, None, False, 0.0, 0)
+    expected = expect(job.command[0], found)
+    return Planned(job, found, _is_done(job, found), expected.seconds, expected.memory_bytes)
+
+
+def do_job(job: Job, worker: Worker, gate: Gate | None = None) -> tuple[Record, bool]:
+    """Do a scene, if it is not done.
+
+    Args:
+        job: the scene.
+        worker: the process that does it.
+        gate: waits for memory; `None`: there is enough.
+
+    Returns:
+        What became of it, and whether anything was done.
+    """
+    record = job.record
+    try:
+        with _here(job.task.source) as source:
+            found = _looked(worker, source)
+            record = replace(record, sha256=found.sha256, source_bytes=found.size_bytes, splats=found.splats)
+            if _is_done(job, found):
+                assert job.earlier is not None
+                return replace(job.earlier, path=job.task.source), False
+            with (gate or _no_gate)(expect(job.command[0], found).memory_bytes) as options, _placed(job) as output:
+                return _ran(job, record, worker, source, output, options), True
+    except CsplatError as error:
+        return replace(record, code=error.code, error=" ".join(str(error).split())), True
+    except OSError as error:
+        return replace(record, code="E_OS", error=" ".join(str(error).split())), True
+
+
+class SceneError(CsplatError):
+    """Nothing can be done with a scene: a file cannot be fetched, read or replaced."""
+
+    def __init__(self, message: str, code: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def _ran(job: Job, record: Record, worker: Worker, source: Path, output: Path, options: tuple[str, ...]) -> Record:
+    """Run the command, and note what it says."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
+        raise SceneError(f"{job.task.output} is there already, and not by this batch: --force replaces it", "E_INPUT")
+    threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
+    words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options)
+    picture = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
+    try:
+        said = worker.ask(
+            "run", words=[*words, "--json", "--quiet", "--force"],
+            thumbnail=picture if job.thumbnail and not is_url(job.task.output) else "",
+            scenes=[str(output), str(source)],
+        )  # fmt: skip
+    except WorkerLostError:
+        if worker.pid is not None:
+            remove_left(output, worker.pid)
+        raise
+    record = replace(
+        record, seconds=round(said["seconds"], 3), memory_bytes=said["memory_bytes"], remarks=tuple(said["remarks"])
+    )
+    if said["status"]:
+        shown = said["error"].replace(str(source), job.task.source).replace(str(output), job.task.output)
+        return replace(record, code=said["code"], error=shown)
+    return replace(
+        record, state="done", output_bytes=size_of(output), output_sha256=content_hash(output),
+        splats=_count(said["result"], record.splats),
+    )  # fmt: skip
+
+
+def _count(result: Any, before: int | None) -> int | None:
+    count = result.get("splats") if isinstance(result, dict) else None
+    return count if isinstance(count, int) else before
+
+
+def _looked(worker: Worker, source: Path) -> Look:
+    found = worker.ask("look", path=str(source))
+    if "error" in found:
+        raise SceneError(found["error"], found["code"])
+    return Look(**found)
+
+
+def _is_done(job: Job, found: Look) -> bool:
+    """Whether what the command would make is there, unchanged."""
+    earlier = job.earlier
+    if earlier is None or earlier.state != "done" or earlier.key != (found.sha256, job.words, __version__):
+        return False
+    if is_url(job.task.output):
+        return True  # what lies there cannot be looked at for nothing
+    return _is_ours(replace(job, pending=False), Path(job.folder) / job.task.output)
+
+
+def _is_ours(job: Job, output: Path) -> bool:
+    """Whether a batch left what is there."""
+    if job.pending:
+        return True
+    known = job.earlier.output_sha256 if job.earlier is not None else ""
+    if not known or not output.exists():
+        return False
+    if job.earlier is not None and job.earlier.output_bytes not in (None, size_of(output)):
+        return False
+    return content_hash(output) == known
+
+
+@contextmanager
+def _here(source: str) -> Iterator[Path]:
+    """A scene on this machine.
+
+    Raises:
+        SceneError: it cannot be fetched.
+    """
+    if not is_url(source):
+        yield Path(source)
+        return
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
+        with _fetching(source):
+            import fsspec
+
+            with fsspec.open(source, "rb") as stream, local.open("wb") as copy:
+                while part := stream.read(1 << 20):
+                    copy.write(part)
+        yield local
+
+
+@contextmanager
+def _placed(job: Job) -> Iterator[Path]:
+    """Where the command writes; what goes elsewhere is sent there at the end."""
+    if not is_url(job.task.output):
+        yield Path(job.folder) / job.task.output
+        return
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        local = Path(folder) / PurePosixPath(job.task.output).name
+        yield local
+        if local.exists():
+            with _fetching(job.task.output):
+                import fsspec
+
+                files, root = fsspec.core.url_to_fs(job.task.output)
+                files.put(str(local), root)
+
+
+@contextmanager
+def _fetching(url: str) -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise missing(error, extra="remote") from None
+    except Exception as error:  # noqa: BLE001  # each kind of store raises its own
+        raise SceneError(f"{url}: " + " ".join((str(error) or type(error).__name__).split()), "E_REMOTE") from None
+
+
+def _no_gate(memory_bytes: int) -> AbstractContextManager[tuple[str, ...]]:  # noqa: ARG001  # as gates have it
+    return nullcontext(())

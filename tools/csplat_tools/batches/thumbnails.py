@@ -1,0 +1,92 @@
+"""A small picture of a scene."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from csplat.errors import CsplatError
+from csplat.formats import format_of, open_scene
+from csplat.model import SplatModel
+from csplat.scene import joined
+from csplat.training import TrainedOn
+from csplat_tools.files.extras import need_pictures, prepare_renderer
+from csplat_tools.files.pictures import to_bytes
+from csplat_tools.files.streams import write_bytes
+
+__all__ = ["THUMBNAIL_SIZE", "prepare_thumbnails", "write_thumbnail"]
+
+#: Width and height, pixels.
+THUMBNAIL_SIZE = (128, 96)
+
+_FINER = 2  # drawn so many times as large, and averaged
+_JPEG_QUALITY = 85
+_SPLATS_MAX = 300_000  # of larger scenes every second, third, ... splat is drawn, and wider
+
+
+@cache
+def prepare_thumbnails() -> bool:
+    """Load the renderer; compile it, which takes up to a minute, where that was not done before.
+
+    Returns:
+        Whether pictures can be drawn here: not without the extra `render`.
+    """
+    try:
+        need_pictures()
+        prepare_renderer(quiet=True)
+    except CsplatError:
+        return False
+    return True
+
+
+def write_thumbnail(path: Path, scenes: Sequence[Path]) -> bool:
+    """Draw the first of files that is a scene, as a JPEG.
+
+    Returns:
+        Whether there is a picture: it is a decoration, and nothing fails for want of one.
+    """
+    for scene in scenes:
+        try:
+            if scene.is_file():
+                format_of(scene)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_bytes(str(path), _jpeg(_thinned(scene)))
+                return True
+        except (CsplatError, OSError, MemoryError, ValueError, ArithmeticError):
+            continue
+    return False
+
+
+def _jpeg(model: SplatModel) -> bytes:
+    from PIL import Image
+
+    from csplat_render import render
+    from csplat_render.paths import orbit_cameras
+
+    width, height = THUMBNAIL_SIZE
+    camera = orbit_cameras(model, 1, _FINER * width, _FINER * height)[0]
+    said = TrainedOn.of(model.metadata)
+    picture = to_bytes(render(model, camera, background=said.background if said else (0.0, 0.0, 0.0), mode="fast").rgb)
+    buffer = io.BytesIO()
+    Image.fromarray(picture).resize(THUMBNAIL_SIZE, Image.Resampling.BOX).save(
+        buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True
+    )
+    return buffer.getvalue()
+
+
+def _thinned(path: Path) -> SplatModel:
+    """A scene, or as many of its splats as a small picture wants, so large that they cover as much."""
+    with open_scene(path) as scene:
+        step = max(1, -(-scene.count // _SPLATS_MAX))
+        facts = replace(scene.facts, extra={}) if scene.facts.extra else scene.facts
+        blocks = []
+        for place, block in scene.numbered():
+            first = -place.start % step
+            kept = block.select(slice(first, None, step))
+            blocks.append(replace(kept, extra={}, scales=kept.scales + np.float32(0.5 * np.log(step))))
+        return joined(facts, blocks)

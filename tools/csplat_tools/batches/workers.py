@@ -1,0 +1,104 @@
+"""Processes that run commands one after the other, each of which may end without taking anything else along."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+from csplat.errors import CsplatError
+
+__all__ = ["Worker", "WorkerLostError", "remove_left"]
+
+_PROGRAM = "csplat_tools.cli.serving"  # started by its name: it stands on a floor above
+_PATIENCE = 10.0  # seconds that a process has to tidy up
+
+
+class WorkerLostError(CsplatError):
+    """A process ended before it answered. `str()` says how, in a few words."""
+
+    code = "E_WORKER"
+
+
+class Worker:
+    """A process that is started when it is first asked, and again when it was lost. Owns it.
+
+    One thread asks; `close` may be called by another.
+    """
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        self._said = TemporaryFile()  # noqa: SIM115  # as long as this object
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def ask(self, what: str, **values: Any) -> dict[str, Any]:
+        """Ask what `csplat_tools.cli.serving.answer` answers.
+
+        Raises:
+            WorkerLostError: it ended, or was closed. What it had begun to write is left behind, see `pid`.
+        """
+        process = self._started()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(json.dumps({"ask": what, **values}) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except (BrokenPipeError, ValueError):
+            line = ""
+        if not line.endswith("\n"):
+            raise WorkerLostError(self._lost(process))
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, or of the one that was lost last; it is in names of temporary files."""
+        return None if self._process is None else self._process.pid
+
+    def close(self) -> None:
+        """End the process: it has some seconds to remove what it had begun to write. Nothing can be asked any more."""
+        with self._lock:
+            self._closed, process = True, self._process
+        if process is None or process.poll() is not None:
+            return
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _started(self) -> subprocess.Popen[str]:
+        with self._lock:
+            if self._closed:
+                raise WorkerLostError("closed")
+            if self._process is None or self._process.poll() is not None:
+                self._process = subprocess.Popen(  # noqa: S603  # this interpreter
+                    [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said,
+                    encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for who started it
+                )  # fmt: skip
+            return self._process
+
+    def _lost(self, process: subprocess.Popen[str]) -> str:
+        """How a process ended, and what it said last."""
+        status = process.wait()
+        if status >= 0:
+            self._said.seek(0)
+            said = self._said.read().decode(errors="replace").strip().splitlines()
+            return f"its process ended with status {status}" + (f": {said[-1]}" if said else "")
+        name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
+        return f"its process was ended by {name}" + ("; was memory short?" if name == "SIGKILL" else "")
+
+
+def remove_left(output: Path, pid: int) -> None:
+    """Remove what a process that was lost had begun to write in the place of an output; see `atomic_writer`."""
+    for left in output.parent.glob(f".*.{pid}.*.tmp"):
+        if left.name.startswith(f".{output.name}."):
+            left.unlink(missing_ok=True)

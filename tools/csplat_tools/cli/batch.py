@@ -1,0 +1,157 @@
+"""`csplat batch`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from csplat.errors import counted
+from csplat_tools.batches.page import PAGE
+from csplat_tools.batches.records import JOURNAL
+from csplat_tools.batches.running import Batch, CommandLineError, Step, plan
+from csplat_tools.batches.running import batch as run_batch
+from csplat_tools.batches.scene import Planned
+from csplat_tools.cli.console import FAILED
+from csplat_tools.cli.groups import Output
+from csplat_tools.cli.options import command
+from csplat_tools.files.console import format_about, format_bytes, format_seconds, format_table, note, step_progress
+
+__all__ = ["batch"]
+
+_SHOWN_MAX = 50  # failures that are told on standard error; the page has all
+
+
+@command(one_of=(("dask", "workers"), ("dask", "memory"), ("dask", "dry_run")))
+def batch(
+    scenes: Annotated[
+        str, typer.Argument(metavar="SCENES", help="A folder, or a manifest: .jsonl, or .csv of path, output, options.")
+    ],
+    folder: Annotated[str, typer.Argument(metavar="OUT", help="The folder of outputs.")],
+    out: Output,
+    line: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[-- COMMAND OPTIONS]", help="Which takes IN and OUT: encode by default."),
+    ] = None,
+    ending: Annotated[
+        str | None, typer.Option(metavar=".spz", help="Of outputs, where the command does not say it.")
+    ] = None,
+    match: Annotated[str, typer.Option(metavar="'*.ply'", help="Which files of a folder.")] = "*",
+    workers: Annotated[int | None, typer.Option(metavar="N", min=1, help="Scenes at a time; one per core.")] = None,
+    memory: Annotated[
+        str | None, typer.Option(metavar="8GB", help="Of all scenes at a time; else most of what is free.")
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Work on a Dask cluster that sees these files: tcp://host:8786."),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be done, time and memory.")] = False,
+    thumbnails: Annotated[
+        bool, typer.Option("--thumbnails/--no-thumbnails", help="Small pictures on the page (extra render).")
+    ] = True,
+) -> None:
+    """Do the same with many scenes: encode, decode, convert, ...
+
+    Each line of OUT/batch.jsonl says what became of a scene, OUT/index.html
+    shows all. What is done already is not done again, whatever ended the last
+    run: the same content, command and version, and an output as it was left.
+    Scenes that fail are listed, tried again in the next run, and make the
+    status 1; the others are done all the same.
+
+    Examples:
+      csplat batch scenes encoded
+      csplat batch scenes encoded -- encode --preset small
+      csplat batch encoded plys -- decode --sh-degree 1
+      csplat batch scenes web --ending .sog --match '*.ply' -- convert
+      csplat batch list.jsonl encoded --workers 4 --memory 16GB
+      csplat batch scenes encoded --dry-run
+    """
+    words = tuple(line or ("encode",))
+    try:
+        if dry_run:
+            planned = plan(scenes, folder, words, ending=ending, match=match, workers=workers)
+            out.publish(_planned_json(planned), _planned_text(planned))
+            return
+        with step_progress("batch", _words(), quiet=out.quiet) as progress:
+            done = run_batch(
+                scenes, folder, words, ending=ending, match=match, workers=workers, memory_bytes=_bytes(memory),
+                dask=dask, force=out.force, thumbnails=thumbnails, progress=progress,
+            )  # fmt: skip
+    except CommandLineError as error:
+        raise typer.BadParameter(str(error)) from None
+    out.publish(done.as_json(), _text(done))
+    _tell_failures(done)
+    if done.failures:
+        sys.exit(FAILED)
+
+
+def _bytes(text: str | None) -> int | None:
+    if text is None:
+        return None
+    from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
+
+    return parse_size_bytes(text)
+
+
+def _words() -> Callable[[Step], str]:
+    """What says in a line how far it has come, from now on."""
+    begun = time.monotonic()
+
+    def words(step: Step) -> str:
+        failed = f", {step.failed} failed" if step.failed else ""
+        left = (time.monotonic() - begun) * (1.0 / step.share - 1.0) if step.share > 0.0 else 0.0
+        return f"{step.iteration} of {step.iterations}{failed}" + (
+            f", about {format_seconds(left)} left" if left else ""
+        )
+
+    return words
+
+
+def _text(done: Batch) -> str:
+    before, failed = len(done.done_before), len(done.failures)
+    made = len(done.records) - before - failed
+    scenes = counted(len(done.records), "scene")
+    return f"{scenes}: {made} done, {before} done before, {failed} failed; {done.folder / PAGE}"
+
+
+def _tell_failures(done: Batch) -> None:
+    for one in done.failures[:_SHOWN_MAX]:
+        note(f"failed: {one.path}: {one.error}" + (f" ({one.code})" if one.code not in one.error else ""))
+    if len(done.failures) > _SHOWN_MAX:
+        note(f"and {len(done.failures) - _SHOWN_MAX} more: {done.folder / JOURNAL}")
+
+
+def _planned_json(planned: list[Planned]) -> list[dict[str, object]]:
+    return [
+        {
+            "path": one.job.task.source,
+            "output": one.job.task.output,
+            "command": list(one.job.words),
+            "done": one.is_done,
+            "splats": None if one.look is None else one.look.splats,
+            "source_bytes": None if one.look is None else one.look.size_bytes,
+            "seconds": one.seconds,
+            "memory_bytes": one.memory_bytes,
+        }
+        for one in planned
+    ]
+
+
+def _planned_text(planned: list[Planned]) -> str:
+    """A table, and what all of it takes on a core."""
+    rows = []
+    for one in planned:
+        seen = one.look
+        splats = "?" if seen is None or seen.splats is None else f"{seen.splats:,}"
+        size = "cannot be read" if seen is None else format_bytes(seen.size_bytes)
+        seconds = "?" if one.seconds is None else format_seconds(one.seconds)
+        work = ("nothing: done", "") if one.is_done else (seconds, format_bytes(one.memory_bytes))
+        rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
+    left = [one for one in planned if not one.is_done]
+    known = [one.seconds for one in left if one.seconds is not None]
+    took = f"about {format_about(sum(known))} on one core" if len(known) == len(left) else "nobody knows how long"
+    table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
+    return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"

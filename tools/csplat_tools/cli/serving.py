@@ -1,0 +1,185 @@
+"""`python -m csplat_tools.cli.serving`: commands one after the other in one process, which `csplat batch` starts.
+
+A request is a line of JSON on standard input, its answer one on standard output. When the input ends so does the
+process, also in the middle of a command: who asked is gone.
+"""
+
+from __future__ import annotations
+
+import _thread
+import errno
+import io
+import json
+import os
+import queue
+import re
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from csplat_tools.batches.looking import look
+from csplat_tools.batches.thumbnails import prepare_thumbnails, write_thumbnail
+from csplat_tools.cli.app import app, command_function
+from csplat_tools.cli.console import FAILED, WrongCommandLine
+
+__all__ = ["answer", "main"]
+
+_ERROR = "error: "
+_CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
+_REMARKS_MAX = 20
+_OWN = ("force", "report", "as_json", "quiet", "output_option")  # options that batch gives
+_FILES = ("page", "source_index", "checkpoint", "resume")  # that name a file, which all scenes would share
+
+
+def main() -> None:
+    """Answer requests until there are none."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print is no answer
+    requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    busy = threading.Event()
+
+    def listen() -> None:
+        for line in sys.stdin:
+            requests.put(line)
+        requests.put(None)
+        if busy.is_set():
+            _thread.interrupt_main()
+
+    threading.Thread(target=listen, daemon=True).start()
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        while (line := requests.get()) is not None:
+            busy.set()
+            said = answer(json.loads(line))
+            busy.clear()
+            answers.write(json.dumps(said) + "\n")
+            answers.flush()
+
+
+def answer(request: dict[str, Any]) -> dict[str, Any]:
+    """Do what is asked for: `check` or `run` a command line, or `look` at a scene."""
+    asked: dict[str, Callable[..., dict[str, Any]]] = {
+        "check": _check,
+        "look": _look,
+        "run": _run,
+    }
+    return asked[request["ask"]](**{name: value for name, value in request.items() if name != "ask"})
+
+
+def _check(words: Sequence[str]) -> dict[str, Any]:
+    """Parse a command, its options, and files that need not exist.
+
+    Returns:
+        `wrong`: what is wrong, in a line, or "". Else `ending`: of its outputs, "" where that is free; `options`: what
+        it has, by name.
+    """
+    name, *rest = words
+    function = command_function(name)
+    if function is None or not hasattr(function, "parsed"):
+        return {"wrong": f"{name} is no command that makes one file of another; `csplat --help` lists them"}
+    alone = typer.Typer(add_completion=False)
+    alone.command(name)(function.parsed)
+    command = typer.main.get_command(alone)
+    arguments = {one.name: one for one in command.params if one.param_type_name == "argument"}
+    if list(arguments) != ["source", "output"]:
+        return {"wrong": f"csplat {name} does not take IN and OUT alone"}
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            context = command.make_context(f"csplat {name}", ["IN", "OUT", *rest])
+            given = [one for one in context.params if _is_given(context, one)]
+            command.invoke(context)
+    except WrongCommandLine as error:
+        return {"wrong": f"csplat {name}: " + " ".join(error.format_message().split())}  # type: ignore[attr-defined]
+    except (typer.Exit, SystemExit):
+        return {"wrong": f"csplat {name}: what is no option for work, as --help, says nothing here"}
+    taken = [one for one in given if one in (*_OWN, *_FILES)]
+    if taken:
+        option = "--" + {"as_json": "json", "output_option": "output"}.get(taken[0], taken[0]).replace("_", "-")
+        return {"wrong": f"csplat {name}: {option} is not for all scenes of a batch"}
+    ending = Path(arguments["output"].metavar or "").suffix
+    return {"wrong": "", "ending": ending, "options": [one.name for one in command.params]}
+
+
+def _is_given(context: Any, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _look(path: str) -> dict[str, Any]:
+    try:
+        return look(Path(path)).as_json()
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        return {"error": f"{path}: {reason}", "code": _os_code(error)}
+
+
+def _os_code(error: OSError) -> str:
+    return errno.errorcode.get(error.errno or 0, "EIO")
+
+
+def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) -> dict[str, Any]:
+    """Run a command line, and draw the first of scenes that can be read."""
+    out, err = io.StringIO(), io.StringIO()
+    _forget_peak()
+    begun = time.perf_counter()
+    status = FAILED
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            app(list(words), prog_name="csplat")
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else FAILED if end.code else 0
+        except Exception as error:  # noqa: BLE001  # a defect: it is one scene's, and has to be reported
+            err.write(traceback.format_exc() + f"{_ERROR}a defect of csplat: {error!r} (E_DEFECT)\n")
+    seconds = time.perf_counter() - begun
+    if status == 130:  # not ours: who interrupted this process wants it to end
+        raise KeyboardInterrupt
+    lines = [line for line in err.getvalue().splitlines() if line.strip()]
+    told = [line for line in lines if line.startswith(_ERROR)]
+    error_line = told[-1].removeprefix(_ERROR) if told else ""
+    if status and not error_line:
+        error_line = lines[-1] if lines else f"status {status}"
+    if status == 0 and thumbnail and prepare_thumbnails():
+        write_thumbnail(Path(thumbnail), [Path(one) for one in scenes])
+    found = _CODE.search(error_line)
+    code = next(filter(None, found.groups())) if found else "E_FAILED"
+    return {
+        "status": status,
+        "error": error_line.removesuffix(f" ({code})"),
+        "code": code if status else "",
+        "remarks": [line for line in lines if line not in told][-_REMARKS_MAX:],
+        "result": _json(out.getvalue()),
+        "seconds": seconds,
+        "memory_bytes": _peak(),
+    }
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
+
+
+def _forget_peak() -> None:
+    """Let the system measure this process's largest memory anew; where it cannot, that of all scenes so far counts."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak() -> int | None:
+    """The most memory that this process held, bytes."""
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return None
+
+
+if __name__ == "__main__":
+    main()
