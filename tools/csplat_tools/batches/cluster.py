@@ -7,6 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
+from uuid import uuid4
 
 from csplat.errors import missing
 from csplat_tools.batches.records import Record
@@ -37,7 +38,8 @@ def on_cluster(jobs: Sequence[Job], dask: Any) -> Generator[tuple[Record, bool],
         raise missing(error, "dask[distributed]", extra="scale") from None
     dasks: Any = distributed  # it has no types
     with dasks.Client(dask, set_as_default=False) if isinstance(dask, str) else nullcontext(dask) as client:
-        tasks = {client.submit(_do, job, pure=False): job for job in jobs}
+        run = uuid4().hex  # Dask knows tasks by name, and one of an earlier batch is another one
+        tasks = {client.submit(_do, job, key=f"{job.task.output}-{run}"): job for job in jobs}
         try:
             for future in dasks.as_completed(list(tasks)):
                 yield _result(future, tasks[future])

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import os
-import queue
-import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from csplat.errors import InputError
 from csplat_tools.batches.budget import Budget, available_bytes
 from csplat_tools.batches.finding import Task, find_tasks, is_url
 from csplat_tools.batches.page import write_page
-from csplat_tools.batches.records import Record, open_journal, read_journal
+from csplat_tools.batches.records import Journal, Record, open_journal, read_journal
 from csplat_tools.batches.scene import Job, Planned, do_job, plan_job
+from csplat_tools.batches.spreading import source_bytes, spread
 from csplat_tools.batches.workers import Worker, WorkerLostError
-from csplat_tools.files.scenes import size_of
 
 __all__ = ["Batch", "CommandLineError", "Step", "batch", "plan"]
 
 _GIVEN = ("threads", "memory")  # options that are given to a command that has them
 _FREE_SHARE = 0.9  # of the memory that is free: what a batch takes of which no number is said
-T = TypeVar("T")
 
 
 class CommandLineError(InputError):
@@ -131,29 +128,29 @@ def batch(
         OSError: the folder cannot be written.
     """
     target = Path(folder)
-    tasks, options = _prepared(scenes, target, command, ending, match)
-    target.mkdir(parents=True, exist_ok=True)
-    count = min(workers or _cores(), len(tasks))
-    threads = max(1, _cores() // count) if "threads" in options and dask is None else None
-    with open_journal(target) as journal:
-        jobs = [
-            replace(one, force=force, threads=threads, thumbnail=thumbnails)
-            for one in _jobs(tasks, command, target, journal.records, journal.pending)
-        ]
-        journal.begin([one.task.output for one in jobs if _may_begin(one)])
-        before = set()
-        with closing(_ended(jobs, count, memory_bytes, dask, has_option="memory" in options)) as ended:
-            for step, worked in _steps(ended, jobs):
-                if worked:
-                    journal.add(step.record)
-                else:
-                    before.add(step.record.output)
-                    journal.records[step.record.output] = step.record
-                if progress is not None:
-                    progress(step)
-        journal.end()
-        result = Batch(target, tuple(journal.records[one.output] for one in tasks), frozenset(before))
-        write_page(result.records, target)
+    with closing(Worker()) as first:
+        tasks, options = _prepared(first, scenes, target, command, ending, match)
+        count = min(workers or _cores(), len(tasks))
+        threads = max(1, _cores() // count) if "threads" in options and dask is None else None
+        target.mkdir(parents=True, exist_ok=True)
+        with open_journal(target) as journal:
+            jobs = [
+                replace(one, force=force, threads=threads, thumbnail=thumbnails)
+                for one in _jobs(tasks, command, target, journal.records, journal.pending)
+            ]
+            journal.begin([one.task.output for one in jobs if _may_begin(one)])
+            if dask is None:
+                budget = Budget(memory_bytes, available_bytes(_FREE_SHARE), has_option="memory" in options)
+                work = partial(do_job, gate=budget.gate)
+                ended = spread(jobs, [first, *(Worker() for _ in range(count - 1))], work, budget.stop)
+            else:
+                from csplat_tools.batches.cluster import on_cluster
+
+                ended = on_cluster(jobs, dask)
+            before = _noted(ended, jobs, journal, progress)
+            journal.end()
+            result = Batch(target, tuple(journal.records[one.output] for one in tasks), before)
+            write_page(result.records, target)
     return result
 
 
@@ -172,32 +169,35 @@ def plan(
         InputError, OSError: as of `batch`.
     """
     target = Path(folder)
-    tasks, _ = _prepared(scenes, target, command, ending, match)
-    jobs = _jobs(tasks, command, target, *read_journal(target))
-    with closing(_spread(jobs, min(workers or _cores(), len(jobs)), plan_job)) as planned:
-        found = {one.job.task.output: one for one in planned}
+    with closing(Worker()) as first:
+        tasks, _ = _prepared(first, scenes, target, command, ending, match)
+        jobs = _jobs(tasks, command, target, *read_journal(target))
+        others = [Worker() for _ in range(min(workers or _cores(), len(jobs)) - 1)]
+        with closing(spread(jobs, [first, *others], plan_job)) as planned:
+            found = {one.job.task.output: one for one in planned}
     return [found[one.output] for one in tasks]
 
 
 def _prepared(
-    scenes: str | os.PathLike[str], folder: Path, command: Sequence[str], ending: str | None, match: str
+    worker: Worker,
+    scenes: str | os.PathLike[str],
+    folder: Path,
+    command: Sequence[str],
+    ending: str | None,
+    match: str,
 ) -> tuple[list[Task], frozenset[str]]:
     """Scenes, once their command lines are known to be right, and the options that the command has.
 
     Raises:
         CommandLineError: one is wrong.
     """
-    worker = Worker()
-    try:
-        said = _checked(worker, command)
-        wanted = said["ending"] if ending is None else ending
-        if ending is None and not wanted:
-            raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
-        tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
-        for options in {one.options for one in tasks if one.options}:
-            _checked(worker, (*command, *options))
-    finally:
-        worker.close()
+    said = _checked(worker, command)
+    wanted = said["ending"] if ending is None else ending
+    if ending is None and not wanted:
+        raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
+    tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
+    for options in {one.options for one in tasks if one.options}:
+        _checked(worker, (*command, *options))
     return tasks, frozenset(said["options"]) & set(_GIVEN)
 
 
@@ -227,66 +227,29 @@ def _may_begin(job: Job) -> bool:
     return not is_url(output) and bool(known or not (Path(job.folder) / output).exists())
 
 
-def _ended(
-    jobs: Sequence[Job], count: int, memory_bytes: int | None, dask: Any, *, has_option: bool
-) -> Generator[tuple[Record, bool], None, None]:
-    """Do all, and give each as soon as it has ended, with whether anything was done."""
-    if dask is not None:
-        from csplat_tools.batches.cluster import on_cluster
-
-        yield from on_cluster(jobs, dask)
-        return
-    budget = Budget(memory_bytes, available_bytes(_FREE_SHARE), has_option=has_option)
-    yield from _spread(jobs, count, lambda job, worker: do_job(job, worker, budget.gate), budget.stop)
-
-
-def _spread(
-    jobs: Sequence[Job], count: int, do: Callable[[Job, Worker], T], stop: Callable[[], object] = lambda: None
-) -> Generator[T, None, None]:
-    """Do jobs on so many processes, the largest first; who closes this before the end ends them.
-
-    Args:
-        jobs: scenes.
-        count: processes.
-        do: what a thread does with a scene and the process that it has.
-        stop: is called when it ends.
-    """
-    todo: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-    ended: queue.SimpleQueue[T | Exception] = queue.SimpleQueue()
-    for job in (*sorted(jobs, key=_size_of, reverse=True), *[None] * count):
-        todo.put(job)
-    workers = [Worker() for _ in range(count)]
-    stopped = threading.Event()
-
-    def work(worker: Worker) -> None:
-        while (job := todo.get()) is not None and not stopped.is_set():
-            try:
-                ended.put(do(job, worker))
-            except Exception as error:  # noqa: BLE001  # a defect, which the thread that waits is to raise
-                ended.put(error)
-
-    with ThreadPoolExecutor(count) as pool:
-        try:
-            for worker in workers:
-                pool.submit(work, worker)
-            for _ in jobs:
-                one = ended.get()
-                if isinstance(one, Exception):
-                    raise one
-                yield one
-        finally:
-            stopped.set()
-            stop()
-            ends = [threading.Thread(target=one.close) for one in workers]
-            for thread in ends:
-                thread.start()
-            for thread in ends:
-                thread.join()
+def _noted(
+    ended: Generator[tuple[Record, bool], None, None],
+    jobs: Sequence[Job],
+    journal: Journal,
+    progress: Callable[[Step], object] | None,
+) -> frozenset[str]:
+    """Write a line for each scene as it ends; of those that were done before, give the outputs."""
+    before = set()
+    with closing(ended):
+        for step, worked in _steps(ended, jobs):
+            if worked:
+                journal.add(step.record)
+            else:
+                before.add(step.record.output)
+                journal.records[step.record.output] = step.record
+            if progress is not None:
+                progress(step)
+    return frozenset(before)
 
 
 def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[Job]) -> Iterator[tuple[Step, bool]]:
     """How far it has come with each."""
-    sizes = {one.task.output: 1.0 + _size_of(one) for one in jobs}
+    sizes = {one.task.output: 1.0 + source_bytes(one) for one in jobs}
     whole, done, failed = sum(sizes.values()), 0.0, 0
     for number, (record, worked) in enumerate(ended, 1):
         if worked:
@@ -295,13 +258,6 @@ def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[Job]) -> Iterato
             whole -= sizes[record.output]
         failed += record.state == "failed"
         yield Step(number, len(jobs), failed, done / whole if whole > 0.0 else 1.0, record), worked
-
-
-def _size_of(job: Job) -> int:
-    """Bytes of a source, as far as they are known for nothing."""
-    with suppress(OSError):
-        return 0 if is_url(job.task.source) else size_of(Path(job.task.source))
-    return 0
 
 
 def _cores() -> int:

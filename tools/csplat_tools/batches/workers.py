@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -17,6 +18,8 @@ __all__ = ["Worker", "WorkerLostError", "remove_left"]
 
 _PROGRAM = "csplat_tools.cli.serving"  # started by its name: it stands on a floor above
 _PATIENCE = 10.0  # seconds that a process has to tidy up
+
+Process = subprocess.Popen[str]
 
 
 class WorkerLostError(CsplatError):
@@ -32,7 +35,7 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Process | None = None
         self._said = TemporaryFile()  # noqa: SIM115  # as long as this object
         self._lock = threading.Lock()
         self._closed = False
@@ -65,36 +68,50 @@ class Worker:
     def close(self) -> None:
         """End the process: it has some seconds to remove what it had begun to write. Nothing can be asked any more."""
         with self._lock:
-            self._closed, process = True, self._process
-        if process is None or process.poll() is not None:
-            return
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            self._closed = True
+            _end(self._process)
+            self._said.close()
 
-    def _started(self) -> subprocess.Popen[str]:
+    def _started(self) -> Process:
         with self._lock:
             if self._closed:
                 raise WorkerLostError("closed")
             if self._process is None or self._process.poll() is not None:
+                _end(self._process)
                 self._process = subprocess.Popen(  # noqa: S603  # this interpreter
                     [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said,
                     encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for who started it
                 )  # fmt: skip
             return self._process
 
-    def _lost(self, process: subprocess.Popen[str]) -> str:
+    def _lost(self, process: Process) -> str:
         """How a process ended, and what it said last."""
         status = process.wait()
-        if status >= 0:
+        with self._lock:
+            if self._closed:
+                return "closed"
             self._said.seek(0)
-            said = self._said.read().decode(errors="replace").strip().splitlines()
-            return f"its process ended with status {status}" + (f": {said[-1]}" if said else "")
+            said = self._said.read().decode(errors="replace").strip().splitlines()[-1:]
+        if status >= 0:
+            return ": ".join([f"its process ended with status {status}", *said])
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
         return f"its process was ended by {name}" + ("; was memory short?" if name == "SIGKILL" else "")
+
+
+def _end(process: Process | None) -> None:
+    """End a process, and close what leads to it."""
+    if process is None:
+        return
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(_PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):  # what could not be sent to it
+                pipe.close()
 
 
 def remove_left(output: Path, pid: int) -> None:

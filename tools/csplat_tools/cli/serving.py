@@ -6,13 +6,13 @@ process, also in the middle of a command: who asked is gone.
 
 from __future__ import annotations
 
-import _thread
 import errno
 import io
 import json
 import os
 import queue
 import re
+import signal
 import sys
 import threading
 import time
@@ -43,14 +43,14 @@ def main() -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print is no answer
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    busy = threading.Event()
+    busy, main_thread = threading.Event(), threading.get_ident()
 
     def listen() -> None:
         for line in sys.stdin:
             requests.put(line)
         requests.put(None)
-        if busy.is_set():
-            _thread.interrupt_main()
+        if busy.is_set():  # what the command waits for is interrupted, too
+            signal.pthread_kill(main_thread, signal.SIGINT)
 
     threading.Thread(target=listen, daemon=True).start()
     with suppress(KeyboardInterrupt, BrokenPipeError):

@@ -1,0 +1,364 @@
+"""`csplat batch`: which scenes, what is done twice, what ends in the middle, and what is told of it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_tools
+from csplat.errors import InputError, LimitError
+from csplat_tools.batches import running
+from csplat_tools.batches.budget import Budget
+from csplat_tools.batches.finding import find_tasks
+from csplat_tools.batches.looking import Look, content_hash, expect, look
+from csplat_tools.batches.page import make_page
+from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
+from csplat_tools.batches.workers import Worker, WorkerLostError
+from csplat_tools.cli.app import app
+from csplat_tools.cli.serving import answer
+
+FAST = ("encode", "--preset", "fast")
+
+
+@pytest.fixture
+def scenes(tmp_path, make_model):
+    """A folder of two scenes, one in a folder beneath, and a text that is named as one."""
+    folder = tmp_path / "scenes"
+    (folder / "sub").mkdir(parents=True)
+    csplat.write_ply(folder / "a.ply", make_model(40, 1))
+    csplat.write(folder / "sub" / "b.spz", make_model(30, 0))
+    (folder / "text.splat").write_text("no scene")
+    return folder
+
+
+class InThisProcess:
+    """Answers as a worker does, without a process. Counts what it ran."""
+
+    ran = 0
+    pid = None
+
+    def ask(self, what, **values):
+        InThisProcess.ran += what == "run"
+        return answer({"ask": what, **json.loads(json.dumps(values))})
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """No processes are started: one scene at a time, in this one."""
+    monkeypatch.setattr(running, "Worker", InThisProcess)
+    monkeypatch.setattr(InThisProcess, "ran", 0)
+    return InThisProcess
+
+
+def run(scenes, out, command=FAST, **how):
+    return csplat_tools.batch(scenes, out, command, workers=1, thumbnails=False, **how)
+
+
+def names(tasks):
+    return [one.output for one in tasks]
+
+
+# which scenes
+
+
+def test_a_folder_is_searched_and_keeps_its_paths(scenes):
+    assert ["a.csplat", "sub/b.csplat", "text.csplat"] == names(find_tasks(str(scenes), "encode", ".csplat"))
+    assert ["a.csplat"] == names(find_tasks(str(scenes), "encode", ".csplat", match="*.ply"))
+
+
+def test_scenes_of_one_name_keep_their_endings(scenes):
+    (scenes / "a.splat").write_bytes(b"")
+    assert {"a.ply.csplat", "a.splat.csplat"} <= set(names(find_tasks(str(scenes), "encode", ".csplat")))
+
+
+def test_a_folder_that_is_a_scene_gives_it_its_name(scenes):
+    (scenes / "statue").mkdir()
+    (scenes / "statue" / "meta.json").write_text("{}")
+    assert "statue.csplat" in names(find_tasks(str(scenes), "encode", ".csplat"))
+
+
+def test_encode_leaves_its_own_files_out_and_decode_takes_no_others(scenes):
+    (scenes / "c.csplat").write_bytes(b"")
+    assert "c.csplat" not in names(find_tasks(str(scenes), "encode", ".csplat"))
+    assert ["c.ply"] == names(find_tasks(str(scenes), "decode", ".ply"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "list.jsonl",
+            '{"path": "a.ply", "options": "--preset fast"}\n\n{"path": "sub/b.spz", "output": "x/y.csplat"}\n',
+        ),
+        ("list.csv", "path,output,options\na.ply,,--preset fast\nsub/b.spz,x/y.csplat\n"),
+        ("list.txt", "# two\na.ply, , --preset fast\nsub/b.spz, x/y.csplat\n"),
+    ],
+)
+def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text):
+    (scenes / name).write_text(text)
+    tasks = find_tasks(str(scenes / name), "encode", ".csplat")
+    assert ["a.csplat", "x/y.csplat"] == names(tasks)
+    assert [("--preset", "fast"), ()] == [one.options for one in tasks]
+    assert [str(scenes / "a.ply"), str(scenes / "sub/b.spz")] == [one.source for one in tasks]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "line 1: wanted an object"),
+        ('{"output": "a"}', "line 1: wanted a path"),
+        ('{"path": "a", "output": "../a"}', "leads out"),
+        ('{"path": "a", "options": "\\"--x"}', "options"),
+        ('{"path": "a.ply", "output": "c"}\n{"path": "b.ply", "output": "c"}', "the output of 2 scenes"),
+        ("", "no scene"),
+    ],
+)
+def test_a_manifest_that_says_nothing_is_refused(tmp_path, text, says):
+    (tmp_path / "list.jsonl").write_text(text)
+    with pytest.raises(InputError, match=says):
+        find_tasks(str(tmp_path / "list.jsonl"), "encode", ".csplat")
+
+
+# what is done, and not done again
+
+
+@pytest.mark.usefixtures("here")
+def test_scenes_are_done_as_the_command_does_them_and_failures_are_listed(scenes, tmp_path):
+    out = tmp_path / "out"
+    done = run(scenes, out)
+    assert ["text.splat"] == [Path(one.path).name for one in done.failures]
+    assert "E_INPUT" == done.failures[0].code
+    alone = tmp_path / "alone.csplat"
+    assert 0 == CliRunner().invoke(app, [*FAST, str(scenes / "sub" / "b.spz"), str(alone), "--quiet"]).exit_code
+    assert alone.read_bytes() == (out / "sub" / "b.csplat").read_bytes()
+    lines = [json.loads(line) for line in (out / JOURNAL).read_text().splitlines()]
+    assert [("a.csplat", "done", 40), ("sub/b.csplat", "done", 30), ("text.csplat", "failed", None)] == sorted(
+        (one["output"], one["state"], one["splats"]) for one in lines
+    )
+    assert all(one["output_bytes"] == (out / one["output"]).stat().st_size for one in lines if one["state"] == "done")
+    page = (out / "index.html").read_text()
+    assert "2 of 3" in page
+    assert "E_INPUT" in page
+
+
+def test_nothing_is_done_twice_but_what_failed_or_changed(scenes, tmp_path, here, make_model):
+    out = tmp_path / "out"
+    run(scenes, out)
+    here.ran = 0
+    again = run(scenes, out)
+    assert (1, {"a.csplat", "sub/b.csplat"}) == (here.ran, set(again.done_before))  # the text is tried again
+    csplat.write_ply(scenes / "text.splat", make_model(5, 0))  # the content says what it is
+    csplat.write_ply(scenes / "a.ply", make_model(41, 1))
+    (out / "sub" / "b.csplat").unlink()
+    again = run(scenes, out)
+    assert (4, (), [41, 30, 5]) == (here.ran, tuple(again.done_before), [one.splats for one in again.records])
+    assert not run(scenes, out, ("encode", "--preset", "balanced")).done_before
+
+
+@pytest.mark.usefixtures("here")
+def test_what_is_there_and_not_of_a_batch_stays(scenes, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a.csplat").write_bytes(b"precious")
+    assert "--force replaces it" in run(scenes, out).failures[0].error
+    assert b"precious" == (out / "a.csplat").read_bytes()
+    assert 1 == len(run(scenes, out, force=True).failures)
+    (out / "a.csplat").write_bytes(b"precious")  # a file of a batch that somebody changed is theirs
+    assert 2 == len(run(scenes, out).failures)
+    assert b"precious" == (out / "a.csplat").read_bytes()
+
+
+@pytest.mark.usefixtures("here")
+def test_options_are_refused_before_any_work(scenes, tmp_path):
+    def refused(*words):
+        result = CliRunner().invoke(app, ["batch", str(scenes), str(tmp_path / "out"), "--", *words])
+        assert (2, 1) == (result.exit_code, result.stderr.count("\n")), result.stderr
+        return result.stderr
+
+    assert "not one of" in refused("encode", "--preset", "tiny")
+    assert "give one of them" in refused("encode", "--target-psnr", "40", "--target-size", "1MB")
+    assert "--report is not for all" in refused("encode", "--report", "a.json")
+    assert "--ending" in refused("convert")
+    assert "IN and OUT" in refused("info")
+    assert "no command" in refused("nonsense")
+    assert "--help" in refused("encode", "--help")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_writes_nothing(scenes, tmp_path, here):
+    words = ["batch", str(scenes), str(tmp_path / "out"), "--dry-run", "--json", "--workers", "1", "--", *FAST]
+    result = CliRunner().invoke(app, words)
+    assert 0 == result.exit_code
+    planned = json.loads(result.stdout)
+    assert [(False, 40), (False, 30), (False, None)] == [(one["done"], one["splats"]) for one in planned]
+    assert (0, False) == (here.ran, (tmp_path / "out").exists())
+
+
+@pytest.mark.usefixtures("here")
+def test_other_commands_take_their_turn(scenes, tmp_path):
+    run(scenes, tmp_path / "out", match="*.ply")
+    done = run(tmp_path / "out", tmp_path / "plys", ("decode", "--sh-degree", "0"))
+    assert [("done", 40)] == [(one.state, one.splats) for one in done.records]
+    assert 0 == csplat.read(tmp_path / "plys" / "a.ply").sh_degree
+    done = run(scenes, tmp_path / "splats", ("convert",), ending=".splat", match="*.ply")
+    assert ["a.splat"] == [one.output for one in done.records]
+
+
+@pytest.mark.usefixtures("here")
+def test_a_scene_under_a_url_goes_to_a_url(scenes, tmp_path):
+    fsspec = pytest.importorskip("fsspec", reason="URLs want the extra [remote]")
+    store = fsspec.filesystem("memory")
+    store.pipe("/in/a.ply", (scenes / "a.ply").read_bytes())
+    rows = [("memory://in/a.ply", "memory://out/a.csplat"), ("memory://in/a.ply", ""), ("memory://in/absent.ply", "")]
+    (tmp_path / "list.csv").write_text("".join(f"{path},{output}\n" for path, output in rows))
+    done = run(tmp_path / "list.csv", tmp_path / "out")
+    assert ["done", "done", "failed"] == [one.state for one in done.records]
+    assert "E_REMOTE" == done.records[2].code
+    assert store.cat("/out/a.csplat") == (tmp_path / "out" / "a.csplat").read_bytes()
+
+
+# the journal
+
+
+def test_a_half_line_is_no_line_and_the_next_one_is_whole(tmp_path):
+    record = Record("a.ply", "a.csplat", FAST, "1", "done", sha256="0")
+    with open_journal(tmp_path) as journal:
+        journal.begin(["a.csplat", "b.csplat"])
+        journal.add(record)
+    with (tmp_path / JOURNAL).open("a") as stream:
+        stream.write('{"path": "b.ply", "output": "b.cs')
+    with open_journal(tmp_path) as journal:
+        assert ({"a.csplat": record}, {"b.csplat"}) == (journal.records, journal.pending)
+        journal.add(replace(record, output="c.csplat"))
+    assert ["a.csplat", "c.csplat"] == list(read_journal(tmp_path)[0])
+
+
+def test_one_batch_at_a_time_writes_to_a_folder(tmp_path):
+    with open_journal(tmp_path), pytest.raises(InputError, match="another batch"), open_journal(tmp_path):
+        pass
+
+
+# memory, and what is known beforehand
+
+
+def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
+    budget, order = Budget(100), []
+    with budget.gate(60):
+        thread = threading.Thread(target=lambda: [order.append("in") for _ in [budget.gate(50).__enter__()]])
+        thread.start()
+        with budget.gate(40):  # does not wait for the one that does not fit
+            order.append("first")
+    thread.join()
+    assert ["first", "in"] == order
+    with pytest.raises(LimitError, match="wanted 101, allowed 100"), budget.gate(101):
+        pass
+    with Budget(100, has_option=True).gate(101) as options:
+        assert ("--memory", "100") == options
+    with Budget(None, 100).gate(101) as options:  # nobody said so: it is tried alone
+        assert () == options
+
+
+@pytest.mark.usefixtures("here")
+def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
+    assert {"E_LIMIT"} == {one.code for one in run(scenes, tmp_path / "out", memory_bytes=10**6).failures}
+
+
+def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
+    found = look(scenes / "sub" / "b.spz")
+    assert (30, "spz") == (found.splats, found.format)
+    assert look(scenes / "text.splat").splats is None
+    folder = scenes / "statue"
+    folder.mkdir()
+    (folder / "meta.json").write_text("{}")
+    before = content_hash(folder / "meta.json")
+    (folder / "quats.webp").write_bytes(b"1")
+    assert before != content_hash(folder / "meta.json")
+    assert expect("encode", Look("", 0, 10**6, "")).memory_bytes > expect("encode", Look("", 0, 10, "")).memory_bytes
+
+
+def test_the_page_escapes_what_scenes_are_called(tmp_path):
+    record = Record("<b>.ply", "<b>.csplat", FAST, "1", "done", source_bytes=10, output_bytes=1, splats=1)
+    failed = replace(record, state="failed", error="<i>", code="E_INPUT")
+    page = make_page([record, failed], tmp_path)
+    assert "<b>" not in page
+    assert "<i>" not in page
+
+
+# processes that end
+
+
+def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
+    os.mkfifo(tmp_path / "stuck.ply")
+    worker = Worker()
+    try:
+        threading.Thread(target=lambda: _killed_at(tmp_path / "stuck.ply", lambda: worker.pid)).start()
+        with pytest.raises(WorkerLostError, match="SIGKILL"):
+            worker.ask("look", path=str(tmp_path / "stuck.ply"))
+        assert 40 == worker.ask("look", path=str(scenes / "a.ply"))["splats"]
+    finally:
+        worker.close()
+    with pytest.raises(WorkerLostError):
+        worker.ask("look", path=str(scenes / "a.ply"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.usefixtures("here")
+def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_path, make_model, number):
+    stuck, out = scenes / "stuck.ply", tmp_path / "out"
+    os.mkfifo(stuck)  # of no size: it comes last
+    command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
+    batch = subprocess.Popen([*command, "--no-thumbnails", "--", *FAST], stderr=subprocess.PIPE, text=True)
+    with stuck.open("wb"):  # waits for the process that reads it
+        batch.send_signal(number)
+        batch.wait()
+    assert (130 if number == signal.SIGINT else -number) == batch.returncode
+    assert "Traceback" not in batch.communicate()[1]
+    noted = [name for name, one in read_journal(out)[0].items() if one.state == "done"]
+    stuck.unlink()
+    csplat.write_ply(stuck, make_model(7, 0))
+    done = run(scenes, out)
+    assert set(noted) <= set(done.done_before)
+    assert ["text.csplat"] == [one.output for one in done.failures]
+    assert not list(out.rglob(".*"))
+
+
+def test_a_cluster_gives_what_a_lost_machine_had_to_another(scenes, tmp_path, make_model):
+    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
+    stuck, whole = scenes / "stuck.ply", tmp_path / "whole.ply"
+    os.mkfifo(stuck)
+    csplat.write_ply(whole, make_model(7, 0))
+    how = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    with distributed.LocalCluster(**how) as cluster, distributed.Client(cluster) as client:
+        numbers = client.run(os.getpid)
+
+        def kill():
+            with stuck.open("wb"):
+                [at] = [at for at, keys in client.processing().items() if any("stuck" in str(key) for key in keys)]
+                whole.rename(stuck)
+                os.kill(numbers[at], signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        done = csplat_tools.batch(scenes, tmp_path / "out", FAST, thumbnails=False, dask=client)
+        killer.join()
+        assert numbers != client.run(os.getpid)
+    assert [("a.csplat", 40), ("stuck.csplat", 7), ("sub/b.csplat", 30), ("text.csplat", None)] == sorted(
+        (one.output, one.splats) for one in done.records
+    )
+    assert ["text.csplat"] == [one.output for one in done.failures]
+
+
+def _killed_at(pipe, pid):
+    with pipe.open("wb"):
+        os.kill(pid(), signal.SIGKILL)

@@ -1,0 +1,73 @@
+"""Scenes on the processes of this machine."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+from csplat_tools.batches.finding import is_url
+from csplat_tools.batches.scene import Job
+from csplat_tools.batches.workers import Worker
+from csplat_tools.files.scenes import size_of
+
+__all__ = ["source_bytes", "spread"]
+
+T = TypeVar("T")
+
+
+def spread(
+    jobs: Sequence[Job],
+    workers: Sequence[Worker],
+    do: Callable[[Job, Worker], T],
+    stop: Callable[[], object] = lambda: None,
+) -> Generator[T, None, None]:
+    """Do jobs, the largest first, and give what comes of each; the processes end with it, also where it is closed.
+
+    Args:
+        jobs: scenes.
+        workers: as many are at work at a time.
+        do: what a thread does with a scene and the process that it has.
+        stop: is called when it ends.
+    """
+    todo: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+    ended: queue.SimpleQueue[T | Exception] = queue.SimpleQueue()
+    for job in (*sorted(jobs, key=source_bytes, reverse=True), *[None] * len(workers)):
+        todo.put(job)
+    stopped = threading.Event()
+
+    def work(worker: Worker) -> None:
+        while (job := todo.get()) is not None and not stopped.is_set():
+            try:
+                ended.put(do(job, worker))
+            except Exception as error:  # noqa: BLE001  # a defect, which the thread that waits is to raise
+                ended.put(error)
+
+    with ThreadPoolExecutor(len(workers)) as pool:
+        try:
+            for worker in workers:
+                pool.submit(work, worker)
+            for _ in jobs:
+                one = ended.get()
+                if isinstance(one, Exception):
+                    raise one
+                yield one
+        finally:
+            stopped.set()
+            stop()
+            ends = [threading.Thread(target=one.close) for one in workers]
+            for thread in ends:
+                thread.start()
+            for thread in ends:
+                thread.join()
+
+
+def source_bytes(job: Job) -> int:
+    """Bytes of a source, as far as they are known for nothing."""
+    with suppress(OSError):
+        return 0 if is_url(job.task.source) else size_of(Path(job.task.source))
+    return 0
