@@ -112,6 +112,7 @@ class Journal:
         left = memoryview(line + b"\n")
         while left:  # a full disk takes a part, and then none
             left = left[os.write(self._file, left) :]
+        os.fsync(self._file)  # an output that is there after a power cut has to be known
 
 
 @contextmanager

@@ -13,8 +13,8 @@ from typing import Any
 from csplat.errors import InputError
 from csplat_tools.batches.budget import Budget, available_bytes
 from csplat_tools.batches.finding import Task, find_tasks, is_url
-from csplat_tools.batches.page import write_page
-from csplat_tools.batches.records import Journal, Record, open_journal, read_journal
+from csplat_tools.batches.page import PAGE, write_page
+from csplat_tools.batches.records import JOURNAL, Journal, Record, open_journal, read_journal
 from csplat_tools.batches.scene import Job, Planned, do_job, plan_job
 from csplat_tools.batches.spreading import source_bytes, spread
 from csplat_tools.batches.workers import Worker, WorkerLostError
@@ -196,6 +196,9 @@ def _prepared(
     if ending is None and not wanted:
         raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
     tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
+    taken = {JOURNAL, PAGE} & {one.output for one in tasks}
+    if taken:
+        raise InputError(f"{taken.pop()} is written by the batch itself: name that output in a manifest")
     for options in {one.options for one in tasks if one.options}:
         _checked(worker, (*command, *options))
     return tasks, frozenset(said["options"]) & set(_GIVEN)

@@ -151,6 +151,7 @@ def _ran(job: Job, record: Record, worker: Worker, source: Path, output: Path, o
     )
     if said["status"]:
         shown = said["error"].replace(str(source), job.task.source).replace(str(output), job.task.output)
+        shown = shown.removeprefix(f"{job.task.source}: ")
         return replace(record, code=said["code"], error=shown)
     return replace(
         record, state="done", output_bytes=size_of(output), output_sha256=content_hash(output),

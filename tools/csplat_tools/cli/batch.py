@@ -70,6 +70,7 @@ def batch(
       csplat batch scenes encoded --dry-run
     """
     words = tuple(line or ("encode",))
+    out.check(inputs=(scenes,))
     try:
         if dry_run:
             planned = plan(scenes, folder, words, ending=ending, match=match, workers=workers)
