@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from interrupts import heed_interrupts
 from typer.testing import CliRunner
 
 import csplat
@@ -318,7 +319,12 @@ def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_
     stuck, out = scenes / "stuck.ply", tmp_path / "out"
     os.mkfifo(stuck)  # of no size: it comes last
     command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
-    batch = subprocess.Popen([*command, "--no-thumbnails", "--", *FAST], stderr=subprocess.PIPE, text=True)
+    batch = subprocess.Popen(
+        [*command, "--no-thumbnails", "--", *FAST],
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
+    )
     with stuck.open("wb"):  # waits for the process that reads it
         batch.send_signal(number)
         batch.wait()

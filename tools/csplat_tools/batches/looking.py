@@ -19,12 +19,13 @@ __all__ = ["Expected", "Look", "content_hash", "expect", "look"]
 
 _OWN = "csplat"
 _FILE_SPLAT_BYTES = 16.0  # where the number of splats is not known: about as .splat, SPZ and SOG have it or more
-#: Seconds and bytes that a scene takes, and those that each splat takes, on a core; by command. Bytes of the process.
+#: Seconds and bytes that a scene takes, and those that each splat takes; by command. Measured at SH degree 3 with 120,000
+#: to 1.1 million splats on two cores; bytes a fifth above, and 130 MB of the renderer, which draws the small picture.
 _COSTS = {
-    "encode": (0.1, 45e-6, 150e6, 1500.0),
-    "decode": (0.05, 3e-6, 150e6, 700.0),
-    "convert": (0.05, 10e-6, 250e6, 300.0),
-    "extract": (0.02, 0.1e-6, 120e6, 20.0),
+    "encode": (0.1, 40e-6, 280e6, 750.0),
+    "decode": (0.05, 2.5e-6, 220e6, 300.0),
+    "convert": (0.05, 9e-6, 300e6, 150.0),
+    "extract": (0.02, 0.1e-6, 200e6, 30.0),
 }
 _OTHER_BYTES = (500e6, 3000.0)  # of commands that render: a guess on the safe side
 
@@ -55,7 +56,7 @@ class Expected:
     """What a scene is expected to take.
 
     Attributes:
-        seconds: on one core; `None` where nothing is known of the command.
+        seconds: on two cores, with SH degree 3; `None` where nothing is known of the command.
         memory_bytes: of the process at most.
     """
 

@@ -66,7 +66,7 @@ class Planned:
         job: with whom.
         look: the scene's file; `None`: it cannot be read.
         is_done: nothing would.
-        seconds: that are expected on a core; `None`: nothing is known of the command.
+        seconds: that are expected; `None`: nothing is known of the command.
         memory_bytes: that are expected.
     """
 

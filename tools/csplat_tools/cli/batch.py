@@ -142,7 +142,7 @@ def _planned_json(planned: list[Planned]) -> list[dict[str, object]]:
 
 
 def _planned_text(planned: list[Planned]) -> str:
-    """A table, and what all of it takes on a core."""
+    """A table, and what all of it takes."""
     rows = []
     for one in planned:
         seen = one.look
@@ -153,6 +153,6 @@ def _planned_text(planned: list[Planned]) -> str:
         rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
     left = [one for one in planned if not one.is_done]
     known = [one.seconds for one in left if one.seconds is not None]
-    took = f"about {format_about(sum(known))} on one core" if len(known) == len(left) else "nobody knows how long"
+    took = f"{format_about(sum(known))}, one after the other" if len(known) == len(left) else "nobody knows how long"
     table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
     return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"

@@ -42,6 +42,7 @@ def main() -> None:
     """Answer requests until there are none."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print is no answer
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     busy, main_thread = threading.Event(), threading.get_ident()
 

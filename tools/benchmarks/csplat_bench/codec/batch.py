@@ -80,7 +80,7 @@ def _measured(folder: Path, count: int, broken: int, splats: int, workers: int) 
         ("interrupted at half", "interrupted", lambda process, _: process.send_signal(signal.SIGINT)),
         ("killed at half", "killed", lambda process, _: process.kill()),
         (
-            "a process of it killed at half",
+            "a worker killed at half",
             "lost",
             lambda process, _: os.kill(_children(process.pid)[0], signal.SIGKILL),
         ),
@@ -150,7 +150,10 @@ def _batch(scenes: Path, out: Path, words: Sequence[str], end: End | None) -> tu
     before = _done(out)
     begun = time.perf_counter()
     command = [*_PROGRAM, "batch", str(scenes), str(out), *words, "--json", "--quiet"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        preexec_fn=_heed_interrupts,  # noqa: PLW1509  # it sets one signal
+    )  # fmt: skip
     if end is not None:
         end(process, out)
     text, _ = process.communicate()
@@ -159,6 +162,11 @@ def _batch(scenes: Path, out: Path, words: Sequence[str], end: End | None) -> tu
         return seconds, len(_done(out) - before), len(before), "-", "-"
     said = json.loads(text)
     return seconds, said["done"], said["done_before"], said["failed"], max(0, len(before) - said["done_before"])
+
+
+def _heed_interrupts() -> None:
+    """What a shell starts in the background ignores them, and so does what that starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _at(count: int, end: End) -> End:
