@@ -356,7 +356,7 @@ def test_a_cluster_gives_what_a_lost_machine_had_to_another(scenes, tmp_path, ma
 
         killer = threading.Thread(target=kill)
         killer.start()
-        done = csplat_tools.batch(scenes, tmp_path / "out", FAST, thumbnails=False, dask=client)
+        done = csplat_tools.batch(scenes, tmp_path / "out", FAST, thumbnails=False, dask=cluster.scheduler_address)
         killer.join()
         assert numbers != client.run(os.getpid)
     assert [("a.csplat", 40), ("stuck.csplat", 7), ("sub/b.csplat", 30), ("text.csplat", None)] == sorted(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from asyncio import CancelledError
 from collections.abc import Generator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -41,7 +42,7 @@ def on_cluster(jobs: Sequence[Job], dask: Any) -> Generator[tuple[Record, bool],
         run = uuid4().hex  # Dask knows tasks by name, and one of an earlier batch is another one
         tasks = {client.submit(_do, job, key=f"{job.task.output}-{run}"): job for job in jobs}
         try:
-            for future in dasks.as_completed(list(tasks)):
+            for future in dasks.as_completed(list(tasks), loop=client.loop):
                 yield _result(future, tasks[future])
         finally:
             client.cancel(list(tasks))
@@ -56,7 +57,7 @@ def _do(job: Job) -> tuple[Record, bool]:
 def _result(future: Any, job: Job) -> tuple[Record, bool]:
     try:
         record, worked = future.result()
-    except Exception as error:  # noqa: BLE001  # whatever a cluster says of a task that it gave up
+    except (Exception, CancelledError) as error:  # noqa: BLE001  # whatever a cluster says of a task that it gave up
         words = " ".join(str(error).split()) or type(error).__name__
         return replace(job.record, code="E_CLUSTER", error=words), True
     return record, worked

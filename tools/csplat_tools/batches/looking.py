@@ -19,8 +19,8 @@ __all__ = ["Expected", "Look", "content_hash", "expect", "look"]
 
 _OWN = "csplat"
 _FILE_SPLAT_BYTES = 16.0  # where the number of splats is not known: about as .splat, SPZ and SOG have it or more
-#: Seconds and bytes that a scene takes, and those that each splat takes; by command. Measured at SH degree 3 with 120,000
-#: to 1.1 million splats on two cores; bytes a fifth above, and 130 MB of the renderer, which draws the small picture.
+#: Seconds and bytes that a scene takes, and those that each splat takes; by command. Measured at SH degree 3 on two
+#: cores, 120,000 to 1.1 million splats; bytes are a fifth more, with 130 MB of the renderer that draws small pictures.
 _COSTS = {
     "encode": (0.1, 40e-6, 280e6, 750.0),
     "decode": (0.05, 2.5e-6, 220e6, 300.0),
