@@ -160,8 +160,12 @@ def _take_name(temporary: Path, target: Path) -> None:
         temporary.unlink()
 
 
-def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
+def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -> NDArray[Any]:
     """Read one array from a .npy file.
+
+    Args:
+        path: of the file.
+        most_bytes: larger files are mapped into memory; `None`: none are.
 
     Raises:
         InputError: it is not one.
@@ -170,6 +174,8 @@ def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
     try:
+        if most_bytes is not None and Path(path).stat().st_size > most_bytes:
+            return np.lib.format.open_memmap(path, mode="r")
         with Path(path).open("rb") as stream:
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     except (

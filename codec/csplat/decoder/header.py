@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from csplat import _spec
@@ -49,6 +50,16 @@ class Tile:
     max_scale: float
     layers: dict[int, _spec.LayerRecord]
     tables: tuple[int, ...]
+
+    def corners(self, step: float) -> tuple[list[float], list[float]]:
+        """Corners of the box around its centres (spec 4.3.5), scene units.
+
+        Args:
+            step: of the record of the means.
+        """
+        scaled = math.ldexp(step, self.exponent)
+        low = [corner * scaled for corner in self.corner]
+        return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ __all__ = ["Job", "model_of", "prepare", "read_side_chunks", "read_texts", "thre
 
 _THREADS_MAX = 8  # more do not help: memory is the limit
 
-_Texts = tuple[dict[str, Any], list[dict[str, Any]] | None]
+_Texts = tuple[Mapping[str, Any], Sequence[Mapping[str, Any]] | None]
 
 
 @dataclass(frozen=True)

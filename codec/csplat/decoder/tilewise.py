@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,18 +58,35 @@ class Opened:
     """A file whose chunks are checked but for those of the tiles, which are decoded when they are asked for.
 
     Attributes:
-        header: header and index.
         facts: the scene without its splats.
         options: what the encoder was asked (`None`: not stated).
         stated_errors: errors that the file states (`None`: likewise).
-        models: decodes all tiles in their order, whenever it is called: a model each, which says what `facts` does.
+        job: the file.
+        threads: as of `decode`.
     """
 
-    header: SceneHeader
     facts: SplatModel
     options: dict[str, Any] | None
     stated_errors: StatedErrors | None
-    models: Callable[[], Iterator[SplatModel]]
+    job: Job
+    threads: int | None
+
+    @property
+    def header(self) -> SceneHeader:
+        """Header and index."""
+        return self.job.header
+
+    def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
+        """Decode tiles one after the other: a model each, which says what `facts` does.
+
+        Args:
+            tiles: places of the tiles wanted, in the order wanted; all if left out.
+        """
+        header = self.header
+        chosen = header.tiles if tiles is None else [header.tiles[place] for place in tiles]
+        texts = self.facts.metadata, self.facts.cameras
+        for _, arrays in _iterate(replace(self.job, tiles=chosen), self.threads):
+            yield model_of(header, arrays, texts)
 
 
 def iter_tiles(
@@ -118,13 +135,8 @@ def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None 
     job = _prepared(data, limits, None, None)
     header = job.header
     options, stated = read_side_chunks(job)
-    texts = read_texts(job)
-
-    def models() -> Iterator[SplatModel]:
-        for _, arrays in _iterate(job, threads):
-            yield model_of(header, arrays, texts)
-
-    return Opened(header, model_of(header, Arrays.empty(0, job.degree, header), texts), options, stated, models)
+    empty = model_of(header, Arrays.empty(0, job.degree, header), read_texts(job))
+    return Opened(empty, options, stated, job, threads)
 
 
 def _prepared(data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None) -> Job:

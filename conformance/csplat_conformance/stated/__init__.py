@@ -9,10 +9,12 @@
 
 from __future__ import annotations
 
+from csplat_conformance.stated.by_disk import fits_memory, prove_by_disk
 from csplat_conformance.stated.matching import lattice_radii, match
 from csplat_conformance.stated.pairs import check_source_index, measure_pairs, wrong_extras
-from csplat_conformance.stated.proof import MeasureProof, Proof, Worst, prove
+from csplat_conformance.stated.proof import prove
 from csplat_conformance.stated.source import Source
+from csplat_conformance.stated.verdict import MeasureProof, Proof, Worst
 
 __all__ = [
     "MeasureProof",
@@ -20,9 +22,11 @@ __all__ = [
     "Source",
     "Worst",
     "check_source_index",
+    "fits_memory",
     "lattice_radii",
     "match",
     "measure_pairs",
     "prove",
+    "prove_by_disk",
     "wrong_extras",
 ]

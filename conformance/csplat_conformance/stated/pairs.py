@@ -7,6 +7,7 @@ float64, in blocks that stay in the cache; sums do not depend on the number of t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,13 +18,14 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat_conformance.stated.source import Source
 
-__all__ = ["Measured", "check_source_index", "differences", "measure_names", "measure_pairs", "wrong_extras"]
+__all__ = ["Measured", "check_source_index", "differences", "measure_names", "measure_pairs", "merged", "wrong_extras"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # integers that name splats
 
 _NORMALS = frozenset(("nx", "ny", "nz"))
+_INDEX_BLOCK = 1 << 20  # numbers
 _BLOCK = 4096  # splats: 45 float64 SH coefficients of each are 1.5 MB
 
 
@@ -41,12 +43,12 @@ class Measured(NamedTuple):
     worst: int
 
 
-def measure_names(source: Source, decoded: SplatModel) -> list[str]:
+def measure_names(source: Source | SplatModel, decoded: SplatModel) -> list[str]:
     """Name the measures of a source and what came of it, in the order of the registry."""
     return ["means", "covariance", "opacities", "sh0", *(f"sh{band}" for band in _bands(source, decoded))]
 
 
-def _bands(source: Source, decoded: SplatModel) -> range:
+def _bands(source: Source | SplatModel, decoded: SplatModel) -> range:
     """Bands that one of the two has and the registry too."""
     return range(1, min(MAX_SH_DEGREE, max(source.sh_degree, decoded.sh_degree)) + 1)
 
@@ -79,6 +81,24 @@ def measure_pairs(
     with ThreadPoolExecutor(threads) as pool:
         blocks = list(pool.map(measure_block, range(0, len(decoded), _BLOCK)))
     return {name: _together([block[name] for block in blocks], len(decoded)) for name in measure_names(source, decoded)}
+
+
+def merged(parts: Sequence[tuple[int, int, dict[str, Measured]]]) -> dict[str, Measured]:
+    """Put the errors of parts of a scene together.
+
+    Args:
+        parts: at least one: its first splat, how many splats it has, its errors.
+    """
+    return {
+        name: _together(
+            [
+                (one[name].max, one[name].rms * one[name].rms * count, start + one[name].worst)
+                for start, count, one in parts
+            ],
+            sum(count for _, count, _ in parts),
+        )
+        for name in parts[0][2]
+    }
 
 
 def _together(blocks: list[tuple[float, float, int]], count: int) -> Measured:
@@ -131,18 +151,23 @@ def check_source_index(index: Rows, source_count: int, decoded_count: int, *, on
     if index.shape != (decoded_count,) or index.dtype.kind not in "iu":
         found = f"{index.dtype} of shape {list(index.shape)}"
         raise InputError(f"the source index is {found}, wanted integers of shape [{decoded_count}]")
-    outside = (index < 0) | (index >= source_count)
-    if outside.any():
-        first = int(outside.argmax())
-        what = f"splat {first} splat {index[first]} of the source, which has {source_count}, from 0 on"
-        raise InputError(f"the source index calls {what}")
-    if not once:
-        return
-    values, counts = np.unique(index, return_counts=True)
-    if len(values) != decoded_count:
-        twice = values[counts.argmax()]
-        first, second = np.flatnonzero(index == twice)[:2]
-        raise InputError(f"the source index calls splats {first} and {second} both splat {twice} of the source")
+    seen = np.zeros(source_count if once else 0, bool)
+    for start in range(0, decoded_count, _INDEX_BLOCK):  # it may be larger than memory
+        part = index[start : start + _INDEX_BLOCK]
+        outside = (part < 0) | (part >= source_count)
+        if outside.any():
+            first = int(outside.argmax())
+            what = f"splat {start + first} splat {part[first]} of the source, which has {source_count}, from 0 on"
+            raise InputError(f"the source index calls {what}")
+        if once:
+            values = np.sort(part)
+            again = np.concatenate([values[1:][values[1:] == values[:-1]], part[seen[part]]])
+            if len(again):
+                first, second = np.flatnonzero(index == again[0])[:2]
+                raise InputError(
+                    f"the source index calls splats {first} and {second} both splat {again[0]} of the source"
+                )
+            seen[part] = True
 
 
 def _reduce(values: F64, start: int) -> tuple[float, float, int]:

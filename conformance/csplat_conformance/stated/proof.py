@@ -6,10 +6,9 @@ source within the stated maxima; rms and counts are then not proved.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from csplat.model import SplatModel
 from csplat_conformance.room import may_be_stated, room
 from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED, Progress, lattice_radii, match
 from csplat_conformance.stated.pairs import (
+    Measured,
     check_source_index,
     differences,
     measure_names,
@@ -26,112 +26,15 @@ from csplat_conformance.stated.pairs import (
     wrong_extras,
 )
 from csplat_conformance.stated.source import Source
+from csplat_conformance.stated.verdict import MeasureProof, Proof, Worst
 
-__all__ = ["MeasureProof", "Proof", "Worst", "prove"]
+__all__ = ["Pairs", "Way", "contradictions", "farthest", "nearest", "prove", "prove_by", "tile_of"]
 
 I64 = NDArray[np.int64]
 
-_NOT_WITHOUT_INDEX = "rms and counts are not proved without a source index"
 _LOOKED_AT, _LOOKED_AT_LEAST = 100, 10  # splats without a partner whose nearest source splats are looked for
 _PASSES = 10**8  # distances that this may take
 _NEAREST = 8  # source splats that are compared with each of them
-
-
-@dataclass(frozen=True)
-class Worst:
-    """The splat that is farthest off.
-
-    Attributes:
-        splat: of the file.
-        tile: that holds it.
-        source_splat: what it stands for or, where nobody said which it is, is nearest to.
-        found: how far it is off, in the measure's unit.
-    """
-
-    splat: int
-    tile: int
-    source_splat: int
-    found: float
-
-
-@dataclass(frozen=True)
-class MeasureProof:
-    """One measure: what is stated, what was found, and whether it holds.
-
-    Attributes:
-        name: of the registry of stated errors.
-        stated_max, stated_rms: of the file; `None` where it does not state the measure.
-        measured_max, measured_rms: of the pairs; `None` without a source index.
-        holds: nothing contradicts the statement; `None` where there is none.
-        worst: the splat with the largest error. Without a source index it is there only where a splat has no partner
-            because of this measure.
-    """
-
-    name: str
-    stated_max: float | None
-    stated_rms: float | None
-    measured_max: float | None
-    measured_rms: float | None
-    holds: bool | None
-    worst: Worst | None
-
-
-@dataclass(frozen=True)
-class Proof:
-    """What became of the attempt.
-
-    Attributes:
-        measures: in the order of the registry.
-        failures: one line each; none when the file's statement holds.
-        clauses: of the spec, that they break.
-        unproved: measures of which nothing is stated: what was fitted anew, or everything.
-        rms_proved: whether rms and counts were proved too.
-    """
-
-    measures: tuple[MeasureProof, ...] = ()
-    failures: tuple[str, ...] = ()
-    clauses: tuple[str, ...] = ()
-    unproved: tuple[str, ...] = ()
-    rms_proved: bool = False
-
-    @property
-    def holds(self) -> bool:
-        """Whether everything that could be looked at holds."""
-        return not self.failures
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was not proved, a line each."""
-        notes = []
-        if self.measures and not self.rms_proved:
-            notes.append(_NOT_WITHOUT_INDEX)
-        if self.unproved:
-            notes.append(f"not proved: {', '.join(self.unproved)}: no error of them is stated, renders are their judge")
-        return tuple(notes)
-
-    def as_json(self) -> dict[str, Any]:
-        """Everything, JSON-compatible; what overflowed is `null`."""
-        return {
-            "rms_and_counts_proved": self.rms_proved and self.holds,
-            "failures": list(self.failures),
-            "not_proved": list(self.unproved),
-            "notes": list(self.notes),
-            "measures": {
-                one.name: {
-                    "stated_max": one.stated_max,
-                    "stated_rms": one.stated_rms,
-                    "measured_max": _finite(one.measured_max),
-                    "measured_rms": _finite(one.measured_rms),
-                    "holds": one.holds,
-                    "worst": None if one.worst is None else {**vars(one.worst), "found": _finite(one.worst.found)},
-                }
-                for one in self.measures
-            },
-        }
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
 
 
 def prove(
@@ -156,33 +59,88 @@ def prove(
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of the file.
     """
-    names = measure_names(source, decoded)
+    return prove_by(_InMemory(source, decoded, header, progress), header, stated, source_index)
+
+
+class Pairs(NamedTuple):
+    """What was found where it is known which splat stands for which.
+
+    Attributes:
+        measured: errors by measure.
+        extras: lines about extra columns.
+        reach: as of `room`.
+    """
+
+    measured: dict[str, Measured]
+    extras: list[str]
+    reach: float
+
+
+class Way(Protocol):
+    """How splats are compared with those of their source."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of the measures, in the order of the registry."""
+        ...
+
+    @property
+    def source_count(self) -> int:
+        """Splats of the source."""
+        ...
+
+    @property
+    def source_degree(self) -> int:
+        """Its SH degree."""
+        ...
+
+    def pairs(self, source_index: NDArray[Any]) -> Pairs:
+        """Measure pairs.
+
+        Raises:
+            InputError: `source_index` is not one index of a source splat for each splat of the file.
+        """
+        ...
+
+    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
+        """For each splat of the file `UNMATCHED`, `UNDECIDED`, or something else where it has a partner."""
+        ...
+
+    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
+        """By measure the splat that is farthest beyond its bound, of some that have no partner."""
+        ...
+
+
+def prove_by(
+    way: Way, header: SceneHeader, stated: StatedErrors | None, source_index: NDArray[Any] | None = None
+) -> Proof:
+    """Compare a file's stated errors with its source; as `prove`, wherever the splats are."""
     if stated is None:
-        return Proof(failures=("the file states no errors",), clauses=("SER-6",), unproved=tuple(names))
+        return Proof(failures=("the file states no errors",), clauses=("SER-6",), unproved=tuple(way.names))
     bounds = {record.measure: (record.max, record.rms) for record in stated.records}
-    silent = tuple(name for name in names if name not in bounds) if len(decoded) else ()
-    wrong = [("SER-5", line) for line in _different_scenes(source, stated)]
+    silent = tuple(name for name in way.names if name not in bounds) if header.splat_count else ()
+    wrong = [("SER-5", line) for line in _different_scenes(way, stated)]
     if not stated.refitted:
         wrong += [("SER-6", f"the file states no error of {name}") for name in silent]
     measures: list[MeasureProof] = []
     if not wrong and source_index is not None:
-        measures, wrong = _prove_pairs(source, decoded, header, bounds, source_index)
+        measures, wrong = _prove_pairs(way, header, bounds, source_index)
     elif not wrong and "means" in bounds:
-        measures, wrong = _prove_matches(source, decoded, header, bounds, progress)
+        measures, wrong = _prove_matches(way, bounds)
     elif not wrong:  # nothing says how far to look
-        silent = tuple(names) if len(decoded) else ()
-    measures.sort(key=lambda one: names.index(one.name))
+        silent = tuple(way.names) if header.splat_count else ()
+    measures.sort(key=lambda one: way.names.index(one.name))
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
     proved = source_index is not None and bool(measures)
     return Proof(tuple(measures), tuple(line for _, line in wrong), clauses, silent, rms_proved=proved)
 
 
-def _different_scenes(source: Source, stated: StatedErrors) -> Iterator[str]:
+def _different_scenes(way: Way, stated: StatedErrors) -> Iterator[str]:
     """What must be equal before splats are compared at all."""
-    if len(source) != stated.source_count:
-        yield f"the file stands for a source of {stated.source_count} splats, this one has {len(source)}"
-    if source.sh_degree != stated.source_sh_degree:
-        yield f"the file stands for a source of SH degree {stated.source_sh_degree}, this one has {source.sh_degree}"
+    if way.source_count != stated.source_count:
+        yield f"the file stands for a source of {stated.source_count} splats, this one has {way.source_count}"
+    if way.source_degree != stated.source_sh_degree:
+        yield f"the file stands for a source of SH degree {stated.source_sh_degree}, this one has {way.source_degree}"
 
 
 Bounds = dict[str, tuple[float, float]]
@@ -190,21 +148,19 @@ Wrong = list[tuple[str, str]]  # clause and line
 
 
 def _prove_pairs(
-    source: Source, decoded: SplatModel, header: SceneHeader, bounds: Bounds, source_index: NDArray[Any]
+    way: Way, header: SceneHeader, bounds: Bounds, source_index: NDArray[Any]
 ) -> tuple[list[MeasureProof], Wrong]:
-    check_source_index(source_index, len(source), len(decoded))
-    measured = measure_pairs(source, decoded, source_index)
-    failures = [("SRC-3", line) for line in wrong_extras(source, decoded, source_index)]
-    reach, measures = source.reach(decoded.origin), []
-    for name, found in measured.items():
+    found_pairs, measures = way.pairs(source_index), []
+    failures = [("SRC-3", line) for line in found_pairs.extras]
+    for name, found in found_pairs.measured.items():
         worst = None
-        if len(decoded):
+        if header.splat_count:
             splat = found.worst
-            worst = Worst(splat, _tile_of(header, splat), int(source_index[splat]), found.max)
+            worst = Worst(splat, tile_of(header, splat), int(source_index[splat]), found.max)
         if name not in bounds:
             measures.append(MeasureProof(name, None, None, found.max, found.rms, None, worst))
             continue
-        wrong = contradictions(name, found[:2], bounds[name], reach, worst)
+        wrong = contradictions(name, found[:2], bounds[name], found_pairs.reach, worst)
         failures += [("SER-5", line) for line in wrong]
         measures.append(MeasureProof(name, *bounds[name], found.max, found.rms, not wrong, worst))
     return measures, failures
@@ -233,7 +189,8 @@ def contradictions(
     return lines
 
 
-def _tile_of(header: SceneHeader, splat: int) -> int:
+def tile_of(header: SceneHeader, splat: int) -> int:
+    """Which tile holds a splat."""
     starts = [tile.start for tile in header.tiles]
     return int(np.searchsorted(starts, splat, "right")) - 1
 
@@ -241,20 +198,18 @@ def _tile_of(header: SceneHeader, splat: int) -> int:
 # Without a source index ----------------------------------------------------------------------------
 
 
-def _prove_matches(
-    source: Source, decoded: SplatModel, header: SceneHeader, bounds: Bounds, progress: Progress | None
-) -> tuple[list[MeasureProof], Wrong]:
+def _prove_matches(way: Way, bounds: Bounds) -> tuple[list[MeasureProof], Wrong]:
     largest = {name: pair[0] for name, pair in bounds.items()}
-    found = match(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
+    found = way.matches(largest)
     alone = np.flatnonzero(found == UNMATCHED)
     undecided = int(np.count_nonzero(found == UNDECIDED))
     lines = []
     if undecided:
         lines.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
     worst: dict[str, Worst] = {}
-    some = min(_LOOKED_AT, max(_LOOKED_AT_LEAST, _PASSES // max(1, len(source))))
+    some = min(_LOOKED_AT, max(_LOOKED_AT_LEAST, _PASSES // max(1, way.source_count)))
     if len(alone):
-        worst = _farthest(source, decoded, header, largest, alone[:some], progress)
+        worst = way.farthest(largest, alone[:some])
         many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
         lines.append(f"{many} no splat of the source within the stated maxima")
         lines += [
@@ -273,12 +228,51 @@ def _prove_matches(
     return measures, [("SER-5", line) for line in lines]
 
 
-def _farthest(
+@dataclass(frozen=True, eq=False)
+class _InMemory:
+    """All of both scenes at once."""
+
+    source: Source
+    decoded: SplatModel
+    header: SceneHeader
+    progress: Progress | None
+
+    @property
+    def names(self) -> list[str]:
+        return measure_names(self.source, self.decoded)
+
+    @property
+    def source_count(self) -> int:
+        return len(self.source)
+
+    @property
+    def source_degree(self) -> int:
+        return self.source.sh_degree
+
+    def pairs(self, source_index: NDArray[Any]) -> Pairs:
+        check_source_index(source_index, len(self.source), len(self.decoded))
+        return Pairs(
+            measure_pairs(self.source, self.decoded, source_index),
+            wrong_extras(self.source, self.decoded, source_index),
+            self.source.reach(self.decoded.origin),
+        )
+
+    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
+        radii = lattice_radii(self.decoded, self.header)
+        return match(self.source, self.decoded, bounds, radii, progress=self.progress)
+
+    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
+        reach = self.source.reach(self.decoded.origin)
+        return farthest(self.source, self.decoded, self.header, bounds, rows, reach, self.progress)
+
+
+def farthest(
     source: Source,
     decoded: SplatModel,
     header: SceneHeader,
-    bounds: dict[str, float],
+    bounds: Mapping[str, float],
     rows: I64,
+    reach: float,
     progress: Progress | None,
 ) -> dict[str, Worst]:
     """Return by measure the splat that is farthest beyond its bound, of some that have no partner.
@@ -288,15 +282,12 @@ def _farthest(
     worst: dict[str, Worst] = {}
     if not len(source):
         return worst
-    reach, source = source.reach(decoded.origin), source.about(decoded.origin)
+    source = source.about(decoded.origin)
     means = source.means.astype(np.float64)
     for done, row in enumerate(rows.tolist()):
         if progress is not None:
             progress("looking for what is nearest", done / len(rows))
-        with np.errstate(over="ignore"):
-            distances = np.square(means - decoded.means[row]).sum(axis=1)
-        near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
-        near = near[np.argsort(distances[near], kind="stable")]
+        near = nearest(means, decoded.means[row])
         errors = differences(source, decoded, near, np.full(len(near), row))
         largest = {name: np.abs(errors[name]).max(axis=1) for name in bounds if name in errors}
         beyond = np.stack([largest[name] > bounds[name] + room(name, bounds[name], reach) for name in largest])
@@ -304,5 +295,14 @@ def _farthest(
         for name, is_beyond in zip(largest, beyond[:, best].tolist(), strict=True):
             error = float(largest[name][best])
             if is_beyond and (name not in worst or error > worst[name].found):
-                worst[name] = Worst(row, _tile_of(header, row), int(near[best]), error)
+                worst[name] = Worst(row, tile_of(header, row), int(near[best]), error)
     return worst
+
+
+def nearest(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
+    """Some of the points that are nearest to another one, the nearest first."""
+    with np.errstate(over="ignore"):
+        distances = np.square(means - point).sum(axis=1)
+    near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
+    chosen: I64 = near[np.argsort(distances[near], kind="stable")]
+    return chosen

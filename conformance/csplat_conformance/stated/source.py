@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,8 @@ from csplat.model import MAX_SH_DEGREE, SplatModel
 __all__ = ["Source"]
 
 F32 = NDArray[np.float32]
+
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,19 @@ class Source:
             return self
         means = self.means.astype(np.float64) + np.subtract(self.origin, origin)
         return replace(self, means=means, origin=origin)
+
+    def some(self, rows: NDArray[Any]) -> Source:
+        """Return some of the splats, in the order of `rows`."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        return replace(self, **arrays, extra={name: column[rows] for name, column in self.extra.items()})
+
+    @staticmethod
+    def joined(parts: Sequence[Source]) -> Source:
+        """Return parts of a source, one after the other; at least one."""
+        first = parts[0]
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _ARRAYS}
+        extra = {name: np.concatenate([one.extra[name] for one in parts]) for name in first.extra}
+        return replace(first, **arrays, extra=extra)
 
     def model(self, origin: tuple[float, float, float]) -> SplatModel:
         """Return it for renders beside a file of this origin: centres in float32 relative to it, degree 3 at most."""

@@ -17,7 +17,7 @@ from csplat_tools.inspect.verify import Verified, verify_file
 __all__ = ["verify"]
 
 
-@command(needs={"source_index": ("source",)})
+@command(needs={"source_index": ("source",), "memory": ("source",)})
 def verify(
     path: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
     out: Output,
@@ -31,6 +31,9 @@ def verify(
         int | None,
         typer.Option(metavar="N", min=1, help="Refuse a scene of more splats."),
     ] = None,
+    memory: Annotated[
+        str | None, typer.Option(metavar="2GB", help="What the proof may take; else half of what is free.")
+    ] = None,
 ) -> None:
     """Check a file against every clause of the format, and its stated errors.
 
@@ -38,7 +41,9 @@ def verify(
     field. The validator shares no code with the decoder. With --source, each
     splat of the file must have a splat of the PLY within the stated maxima.
     With --source-index it is known which one, and rms and counts are proved
-    as well.
+    as well. Scenes of any size: those that do not fit the memory are proved
+    by way of a file in the folder for temporary ones (TMPDIR), as large as
+    the PLY.
 
     Examples:
       csplat verify scene.csplat
@@ -46,9 +51,16 @@ def verify(
       csplat verify scene.csplat --source scene.ply --source-index scene.npy --json
     """
     out.check(inputs=(path, source, source_index))
+    memory_bytes = None
+    if memory is not None:
+        from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
+
+        memory_bytes = parse_size_bytes(memory)
     try:
         with out.bar() as progress:
-            verified = verify_file(path, source, source_index, max_splats=max_splats, progress=progress)
+            verified = verify_file(
+                path, source, source_index, max_splats=max_splats, memory_bytes=memory_bytes, progress=progress
+            )
     except CsplatError as error:
         out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise

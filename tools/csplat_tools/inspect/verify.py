@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from mmap import mmap
 from typing import Any
 
+from numpy.typing import NDArray
+
 from csplat import formats
-from csplat.decoder import decode_scene
+from csplat.decoder import decode, open_tiles
 from csplat.files import read_array
-from csplat_conformance.stated import Proof, Source, prove
+from csplat_conformance.stated import Proof, Source, fits_memory, prove, prove_by_disk
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
+from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import mapped_csplat, source_path
 
 __all__ = ["Verified", "verify_file"]
+
+_INDEX_BYTES = 1 << 27  # of a source index that is read as a whole
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,7 @@ def verify_file(
     source_index: str | None = None,
     *,
     max_splats: int | None = None,
+    memory_bytes: int | None = None,
     progress: Progress | None = None,
 ) -> Verified:
     """Look for every violation in a file; if there is none and a source is given, prove its stated errors.
@@ -66,21 +73,30 @@ def verify_file(
         path: the file, or `-`.
         source: the PLY that it was made from.
         source_index: the .npy file that the encoder wrote.
-        max_splats: refuse more (LIM-1). Left out: none are too many for validating, which takes a tile at a time;
-            for the proof the decoder's budget holds.
+        max_splats: refuse more (LIM-1); `None`: none are too many.
+        memory_bytes: what the proof may take; by way of the disk, if that is too little. `None`: half of what is free.
         progress: is told how far validating and matching have come.
 
     Raises:
-        CsplatError: source or index cannot be read; or the proof wants more memory than the budget allows.
+        CsplatError: source or index cannot be read; or the disk has no room for the proof.
         OSError: a file cannot be read.
     """
-    rows = None if source_index is None else read_array(source_index)
+    rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
     with mapped_csplat(path) as data:
         validation = validate(data, splats_max=max_splats, progress=progress)
         if source is None or not validation.conforms:
             return Verified(validation, None)
-        scene = decode_scene(data)
-    with source_path(source) as path_of_source:
-        model = formats.read(path_of_source, keep_extra=bool(scene.header.extras))
-    proof = prove(Source.of(model), scene.model, scene.header, scene.stated_errors, rows, progress=progress)
-    return Verified(validation, proof)
+        return Verified(validation, _proved(data, source, rows, memory_bytes, progress))
+
+
+def _proved(
+    data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
+) -> Proof:
+    opened = open_tiles(data)
+    header, stated = opened.header, opened.stated_errors
+    with source_path(source) as local:
+        if fits_memory(opened, stated.source_count if stated else 0, size_of(local), memory_bytes):
+            model = formats.read(local, keep_extra=bool(header.extras))
+            return prove(Source.of(model), decode(data), header, stated, rows, progress=progress)
+        with formats.open_scene(local) as scene:
+            return prove_by_disk(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)

@@ -1,0 +1,332 @@
+"""Prove stated errors where file and source do not fit the memory: by way of a file on the disk.
+
+Without a source index space is cut into cells of about as many splats, and the source's splats are sorted by them. The
+tiles near a cell are decoded and matched with it: first as near as the file's own lattice puts partners, and then, for
+the few that found none, as far as the stated maximum reaches. With a source index the source's splats are sorted by
+the tiles that they became.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from mmap import mmap
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder import Opened
+from csplat.inputs import LetGo
+from csplat.memory import default_bytes
+from csplat.model import SplatModel
+from csplat.scene import Scene, joined
+from csplat_conformance.room import room
+from csplat_conformance.stated.cells import Cells
+from csplat_conformance.stated.matching import STAGE, UNMATCHED, Progress, match, tile_radii
+from csplat_conformance.stated.pairs import check_source_index, measure_names, measure_pairs, merged, wrong_extras
+from csplat_conformance.stated.proof import Pairs, farthest, nearest, prove_by, tile_of
+from csplat_conformance.stated.source import Source
+from csplat_conformance.stated.spool import Rows, Spool, opened_spool
+from csplat_conformance.stated.verdict import Proof, Worst
+
+__all__ = ["fits_memory", "prove_by_disk"]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_FOUND = 0
+_FOLDS = 2.2  # of the arrays of both scenes: what comparing them in memory takes
+_SPLAT_BYTES = 80  # of the source, beside its arrays: keys, order, centres in doubles
+_PART_FOLDS = 5  # of a part's arrays: records, source, tiles and their selection
+_BASE_BYTES = 200_000_000  # program, tiles that are being decoded, splats that wait for being written
+_PART = (1 << 14, 1 << 20)  # splats that are compared at a time: more are hardly faster, for caches are small
+_INDEX_BLOCK = 1 << 20  # numbers of a source index
+
+
+def fits_memory(opened: Opened, source_count: int, source_bytes: int, memory_bytes: int | None) -> bool:
+    """Whether a file and its source can be compared in memory.
+
+    Args:
+        opened: the file.
+        source_count: splats of the source.
+        source_bytes: size of its file.
+        memory_bytes: bound; `None`: half of what is free.
+    """
+    splat_bytes = _splat_bytes(opened)
+    source = max(source_count * (_FOLDS * splat_bytes + _SPLAT_BYTES), source_bytes)
+    wanted = source + opened.header.splat_count * _FOLDS * splat_bytes
+    return wanted <= (default_bytes() if memory_bytes is None else memory_bytes)
+
+
+def _splat_bytes(opened: Opened) -> int:
+    facts = opened.facts
+    return 4 * (11 + 3 * (facts.sh_degree + 1) ** 2) + sum(column.itemsize for column in facts.extra.values())
+
+
+def prove_by_disk(
+    scene: Scene,
+    opened: Opened,
+    source_index: NDArray[Any] | None = None,
+    *,
+    memory_bytes: int | None = None,
+    progress: Progress | None = None,
+) -> Proof:
+    """Compare a file's stated errors with its source, as `prove` does, and find the same.
+
+    The disk takes as much as the source's arrays do, in the folder for temporary files (TMPDIR), in a file of no name:
+    it goes when the program ends, however that is.
+
+    Args:
+        scene: the source.
+        opened: the file.
+        source_index: as of `prove`; it may be mapped.
+        memory_bytes: bound, about; `None`: half of what is free. A few bytes of each splat come to it.
+        progress: is told how far comparing has come.
+
+    Raises:
+        InputError: as of `prove`; the source is not whole; or the disk has no room.
+        OSError: the disk cannot be written or read.
+    """
+    with closing(_ByDisk(scene, opened, memory_bytes, progress)) as way:
+        return prove_by(way, opened.header, opened.stated_errors, source_index)
+
+
+@dataclass(eq=False)
+class _ByDisk:
+    """A `Way`: both scenes a part at a time. Owns the file on the disk."""
+
+    scene: Scene
+    opened: Opened
+    memory_bytes: int | None
+    progress: Progress | None
+    _spool: Spool | None = field(default=None, init=False)
+    _rows: Rows | None = field(default=None, init=False)
+    _reach: float = field(default=0.0, init=False)
+
+    def close(self) -> None:
+        """Give the disk back."""
+        if self._spool is not None:
+            self._spool.stream.close()
+
+    @property
+    def names(self) -> list[str]:
+        """Of the measures."""
+        return measure_names(self.scene.facts, self.opened.facts)
+
+    @property
+    def source_count(self) -> int:
+        """Splats of the source."""
+        return self.scene.count
+
+    @property
+    def source_degree(self) -> int:
+        """SH degree of the source."""
+        return self.scene.facts.sh_degree
+
+    @property
+    def _most(self) -> int:
+        """Splats of a part."""
+        memory = default_bytes() if self.memory_bytes is None else self.memory_bytes
+        some = (memory - _BASE_BYTES) // (_PART_FOLDS * (_splat_bytes(self.opened) + _SPLAT_BYTES))
+        return max(_PART[0], min(_PART[1], some))
+
+    def _tell(self, stage: str, done: float) -> None:
+        if self.progress is not None:
+            self.progress(stage, done)
+
+    def _sources(self) -> Iterator[tuple[int, Source]]:
+        """The source a block at a time, each with the number of its first splat."""
+        start = 0
+        for model in self.scene.blocks():
+            self._tell("reading the source", start / max(1, self.scene.count))
+            block = Source.of(model)
+            self._reach = max(self._reach, block.reach(self.opened.facts.origin))
+            yield start, block
+            start += len(model)
+
+    def _add(self, block: Source, rows: NDArray[Any], keys: I64, numbers: I64, names: tuple[str, ...] = ()) -> None:
+        if self._spool is None or self._rows is None:
+            self._rows = Rows.of(block, names)
+            self._spool = opened_spool(self._rows.dtype, self.scene.count)
+        self._spool.add(keys, self._rows.packed(block, rows, numbers))
+
+    # Without a source index ------------------------------------------------------------------------
+
+    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
+        """As of `Way`: [N] int8."""
+        header, origin = self.opened.header, self.opened.facts.origin
+        cells = Cells.of(header, self.scene.count, self._most)
+        for start, block in self._sources():
+            everything = np.arange(len(block))
+            self._add(block, everything, cells.place(block.about(origin).means), start + everything)
+        found = np.full(header.splat_count, UNMATCHED, np.int8)
+        if self._spool is None:
+            return found
+        self._spool.flush()
+        done, everywhere = 0, 2 * self.scene.count
+        for far in (False, True):
+            if far and not (found == UNMATCHED).any():
+                break
+            for source, _ in self._parts():
+                self._tell(STAGE, done / everywhere)
+                done += len(source)
+                self._match(source, bounds, found, far=far)
+        self._tell(STAGE, 1.0)
+        return found
+
+    def _parts(self) -> Iterator[tuple[Source, I64]]:
+        """The source a part at a time: those of a cell, and their numbers."""
+        assert self._spool is not None, "the source is sorted"
+        assert self._rows is not None, "likewise"
+        for key in self._spool.counts():
+            for records in self._spool.read(key, self._most):
+                yield self._rows.source(records), records["number"].copy()
+
+    def _match(self, source: Source, bounds: Mapping[str, float], found: NDArray[np.int8], *, far: bool) -> None:
+        """Match a part of the source with the splats of the file that may have a partner in it."""
+        columns = source.about(self.opened.facts.origin).means.T
+        low, high = (np.array([end(column) for column in columns], np.float64) for end in (np.min, np.max))
+        most = (bounds["means"] + room("means", bounds["means"], self._reach)) * (1.0 + 1e-6)
+        for model, radii, splats in self._near(low, high, most, found, far=far):
+            partners = match(source, model, bounds, radii, reach=self._reach)
+            found[splats] = np.where(partners >= 0, _FOUND, partners)
+
+    def _near(
+        self, low: F64, high: F64, most: float, found: NDArray[np.int8], *, far: bool
+    ) -> Iterator[tuple[SplatModel, F64, I64]]:
+        """Splats without a partner that may lie within their radius of a box, some at a time; radii and numbers."""
+        header = self.opened.header
+        step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+        boxes = np.array([tile.corners(step) for tile in header.tiles]).reshape(-1, 2, 3)
+        # A centre was rounded to float32; a radius is a cell's, and as much again for that.
+        widths = (
+            np.array([np.ldexp(step, tile.exponent) for tile in header.tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
+        )
+        margins = np.full(len(widths), most)[:, None] if far else np.minimum(widths, most)[:, None]
+        touching = ((boxes[:, 0] - margins <= high) & (boxes[:, 1] + margins >= low)).all(axis=1)
+        chosen = [
+            tile
+            for tile in np.flatnonzero(touching).tolist()
+            if (found[self._splats(tile)] == UNMATCHED).any()
+        ]  # fmt: skip
+        models, radii, splats, count = [], [], [], 0
+        for tile, model in zip(chosen, self.opened.models(chosen), strict=True):
+            own = tile_radii(model.means, header, header.tiles[tile])
+            margin = most if far else np.minimum(own, most)
+            rows = self._splats(tile)
+            inside = found[rows] == UNMATCHED
+            for axis in range(3):
+                column = model.means[:, axis]
+                inside &= (column >= low[axis] - margin) & (column <= high[axis] + margin)
+            if not inside.any():
+                continue
+            models.append(model.select(inside))
+            radii.append(own[inside])
+            splats.append(rows.start + np.flatnonzero(inside))
+            count += len(models[-1])
+            if count >= self._most:
+                yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
+                models, radii, splats, count = [], [], [], 0
+        if models:
+            yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
+
+    def _splats(self, tile: int) -> slice:
+        record = self.opened.header.tiles[tile]
+        return slice(record.start, record.start + record.splat_count)
+
+    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
+        """As of `Way`: what is near is gathered from all parts, and compared as in memory."""
+        if self._spool is None or not len(rows):
+            return {}
+        header = self.opened.header
+        decoded = self._picked(rows)
+        sources, numbers = [], []
+        for source, known in self._parts():
+            means = source.about(self.opened.facts.origin).means.astype(np.float64)
+            near = np.unique(np.concatenate([nearest(means, point) for point in decoded.means]))
+            sources.append(source.some(near))
+            numbers.append(known[near])
+        order = np.argsort(np.concatenate(numbers))
+        number = np.concatenate(numbers)[order]
+        some = Source.joined(sources).some(order)
+        found = farthest(some, decoded, header, bounds, np.arange(len(rows)), self._reach, self.progress)
+        return {
+            name: replace(
+                one,
+                splat=int(rows[one.splat]),
+                tile=tile_of(header, int(rows[one.splat])),
+                source_splat=int(number[one.source_splat]),
+            )
+            for name, one in found.items()
+        }
+
+    def _picked(self, rows: I64) -> SplatModel:
+        """Some splats of the file, by their numbers in order."""
+        tiles = np.array([tile_of(self.opened.header, row) for row in rows.tolist()])
+        chosen = np.unique(tiles)
+        models = [
+            model.select(rows[tiles == tile] - self._splats(tile).start)
+            for tile, model in zip(chosen.tolist(), self.opened.models(chosen.tolist()), strict=True)
+        ]
+        return joined(models[0], models)
+
+    # With a source index ---------------------------------------------------------------------------
+
+    def pairs(self, source_index: NDArray[Any]) -> Pairs:
+        """As of `Way`; `source_index` may be mapped. Memory for a number of four or eight bytes a source splat."""
+        count = self.opened.header.splat_count
+        check_source_index(source_index, self.scene.count, count)
+        groups = self._groups()
+        firsts = np.array([self._splats(group[0]).start for group in groups], np.int64)
+        became = _inverse(source_index, self.scene.count)
+        names = tuple(name for name in self.opened.facts.extra if name in self.scene.facts.extra)
+        for start, block in self._sources():
+            splats = became[start : start + len(block)].astype(np.int64)
+            kept = np.flatnonzero(splats < count)
+            keys = np.searchsorted(firsts, splats[kept], "right") - 1
+            self._add(block, kept, keys, splats[kept], names)
+        del became
+        if self._spool is None or self._rows is None:
+            empty = Source.of(self.scene.facts)
+            return Pairs(measure_pairs(empty, self.opened.facts, np.empty(0, np.int64)), [], self._reach)
+        self._spool.flush()
+        parts, lines = [], {}
+        for key, group in enumerate(groups):
+            self._tell("measuring splats", int(firsts[key]) / count)
+            models = list(self.opened.models(group))
+            decoded = joined(models[0], models)
+            (records,) = self._spool.read(key, len(decoded))
+            places = np.argsort(records["number"])
+            source = self._rows.source(records)
+            parts.append((int(firsts[key]), len(decoded), measure_pairs(source, decoded, places)))
+            lines.update(dict.fromkeys(wrong_extras(source, decoded, places)))
+        return Pairs(merged(parts), list(lines), self._reach)
+
+    def _groups(self) -> list[list[int]]:
+        """Tiles that are measured together."""
+        groups: list[list[int]] = []
+        count = 0
+        for tile in self.opened.header.tiles:
+            if not groups or count + tile.splat_count > self._most:
+                groups.append([])
+                count = 0
+            groups[-1].append(tile.index)
+            count += tile.splat_count
+        return groups
+
+
+def _inverse(source_index: NDArray[Any], source_count: int) -> NDArray[Any]:
+    """Which splat of the file each source splat became: the dtype's largest number where none did."""
+    dtype = np.uint32 if len(source_index) < 2**32 - 1 else np.uint64
+    became = np.full(source_count, np.iinfo(dtype).max, dtype)
+    base = source_index.base
+    let_go = LetGo(memoryview(base)) if isinstance(base, mmap) else None
+    for start in range(0, len(source_index), _INDEX_BLOCK):
+        part = source_index[start : start + _INDEX_BLOCK]
+        became[part] = np.arange(start, start + len(part), dtype=dtype)
+        if let_go is not None:
+            let_go.after(part.nbytes)
+    return became

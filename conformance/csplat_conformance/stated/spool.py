@@ -1,0 +1,162 @@
+"""Splats of a source on the disk, under numbers of the caller's: by where they lie, or by what they became."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BufferedRandom
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat_conformance.stated.source import Source
+
+__all__ = ["Rows", "Spool", "opened_spool"]
+
+I64 = NDArray[np.int64]
+Records = NDArray[Any]  # structured, a splat each
+
+_WAITING_BYTES = 1 << 25  # of splats that wait for being written: so parts of a file are not too small to be read
+_MB = 1e6
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Splats as records, and back.
+
+    Attributes:
+        dtype: of a record: the arrays of a `Source`, its extra columns, and an integer `number`.
+        origin: of the source.
+        names: of the extra columns.
+    """
+
+    dtype: np.dtype[Any]
+    origin: tuple[float, float, float]
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, source: Source, names: tuple[str, ...]) -> Rows:
+        """The layout of a source's splats, with these extra columns."""
+        columns = [(name, getattr(source, name)) for name in _ARRAYS]
+        columns += [(f"extra {name}", source.extra[name]) for name in names]
+        fields = [(name, array.dtype, array.shape[1:]) for name, array in columns]
+        return cls(np.dtype([*fields, ("number", np.int64)]), source.origin, names)
+
+    def packed(self, source: Source, rows: NDArray[Any], numbers: I64) -> Records:
+        """Make records of some splats of a source of this layout."""
+        records = np.empty(len(rows), self.dtype)
+        for name in _ARRAYS:
+            records[name] = getattr(source, name)[rows]
+        for name in self.names:
+            records[f"extra {name}"] = source.extra[name][rows]
+        records["number"] = numbers
+        return records
+
+    def source(self, records: Records) -> Source:
+        """The splats of some records."""
+        arrays = {name: np.ascontiguousarray(records[name]) for name in _ARRAYS}
+        extra = {name: np.ascontiguousarray(records[f"extra {name}"]) for name in self.names}
+        return Source(**arrays, origin=self.origin, extra=extra)
+
+
+@dataclass(eq=False)
+class Spool:
+    """Records in a file that nobody else sees, under keys. Owns what waits for being written.
+
+    Attributes:
+        stream: a file of no name.
+        dtype: of the records.
+    """
+
+    stream: BufferedRandom
+    dtype: np.dtype[Any]
+    _parts: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # by key: byte of the file, and records
+    _waiting: dict[int, list[Records]] = field(default_factory=dict)
+    _waiting_bytes: int = 0
+    _size: int = 0
+
+    def add(self, keys: I64, records: Records) -> None:
+        """Take records, those of a key in the order in which they come.
+
+        Args:
+            keys: [n] what each is to be found under.
+            records: [n].
+
+        Raises:
+            OSError: they cannot be written.
+        """
+        order = np.argsort(keys, kind="stable")
+        keys, records = keys[order], records[order]
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        for start, end in zip(starts, [*starts[1:], len(keys)], strict=True):
+            self._waiting.setdefault(int(keys[start]), []).append(records[start:end])
+        self._waiting_bytes += records.nbytes
+        if self._waiting_bytes > _WAITING_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.stream.seek(self._size)
+        for key, waiting in sorted(self._waiting.items()):
+            for records in waiting:
+                self.stream.write(records.view(np.uint8).data)
+            count = sum(map(len, waiting))
+            self._parts.setdefault(key, []).append((self._size, count))
+            self._size += count * self.dtype.itemsize
+        self.stream.flush()
+        self._waiting, self._waiting_bytes = {}, 0
+
+    def counts(self) -> dict[int, int]:
+        """How many records each key has, by key."""
+        return {key: sum(count for _, count in parts) for key, parts in sorted(self._parts.items())}
+
+    def read(self, key: int, most: int) -> Iterator[Records]:
+        """Read the records of a key, so many at a time at most.
+
+        Raises:
+            OSError: they cannot be read.
+        """
+        left = self.counts().get(key, 0)
+        block, filled = np.empty(min(most, left), self.dtype), 0
+        for at, count in self._parts.get(key, ()):
+            done = 0
+            while done < count:
+                step = min(count - done, len(block) - filled)
+                self.stream.seek(at + done * self.dtype.itemsize)
+                self.stream.readinto(block[filled : filled + step].view(np.uint8).data)
+                done, filled = done + step, filled + step
+                if filled == len(block):
+                    yield block
+                    filled = 0
+        if filled:
+            yield block[:filled]
+
+
+def opened_spool(dtype: np.dtype[Any], count: int) -> Spool:
+    """Open a spool in the folder for temporary files (TMPDIR).
+
+    Args:
+        dtype: of a record.
+        count: records that will lie in it, at most.
+
+    Raises:
+        InputError: the disk has no room for them.
+        OSError: it cannot be made.
+    """
+    folder, wanted = tempfile.gettempdir(), count * dtype.itemsize
+    free = shutil.disk_usage(folder).free
+    if free < wanted:
+        raise InputError(
+            f"{folder} has {free / _MB:,.0f} MB free, and {wanted / _MB:,.0f} are wanted while the source is compared:"
+            " TMPDIR names another folder"
+        )
+    return Spool(tempfile.TemporaryFile(), dtype)

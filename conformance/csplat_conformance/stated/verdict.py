@@ -1,0 +1,108 @@
+"""What became of the attempt to prove the errors that a file states."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["MeasureProof", "Proof", "Worst"]
+
+_NOT_WITHOUT_INDEX = "rms and counts are not proved without a source index"
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The splat that is farthest off.
+
+    Attributes:
+        splat: of the file.
+        tile: that holds it.
+        source_splat: what it stands for or, where nobody said which it is, is nearest to.
+        found: how far it is off, in the measure's unit.
+    """
+
+    splat: int
+    tile: int
+    source_splat: int
+    found: float
+
+
+@dataclass(frozen=True)
+class MeasureProof:
+    """One measure: what is stated, what was found, and whether it holds.
+
+    Attributes:
+        name: of the registry of stated errors.
+        stated_max, stated_rms: of the file; `None` where it does not state the measure.
+        measured_max, measured_rms: of the pairs; `None` without a source index.
+        holds: nothing contradicts the statement; `None` where there is none.
+        worst: the splat with the largest error. Without a source index it is there only where a splat has no partner
+            because of this measure.
+    """
+
+    name: str
+    stated_max: float | None
+    stated_rms: float | None
+    measured_max: float | None
+    measured_rms: float | None
+    holds: bool | None
+    worst: Worst | None
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What became of the attempt.
+
+    Attributes:
+        measures: in the order of the registry.
+        failures: one line each; none when the file's statement holds.
+        clauses: of the spec, that they break.
+        unproved: measures of which nothing is stated: what was fitted anew, or everything.
+        rms_proved: whether rms and counts were proved too.
+    """
+
+    measures: tuple[MeasureProof, ...] = ()
+    failures: tuple[str, ...] = ()
+    clauses: tuple[str, ...] = ()
+    unproved: tuple[str, ...] = ()
+    rms_proved: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything that could be looked at holds."""
+        return not self.failures
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was not proved, a line each."""
+        notes = []
+        if self.measures and not self.rms_proved:
+            notes.append(_NOT_WITHOUT_INDEX)
+        if self.unproved:
+            notes.append(f"not proved: {', '.join(self.unproved)}: no error of them is stated, renders are their judge")
+        return tuple(notes)
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, JSON-compatible; what overflowed is `null`."""
+        return {
+            "rms_and_counts_proved": self.rms_proved and self.holds,
+            "failures": list(self.failures),
+            "not_proved": list(self.unproved),
+            "notes": list(self.notes),
+            "measures": {
+                one.name: {
+                    "stated_max": one.stated_max,
+                    "stated_rms": one.stated_rms,
+                    "measured_max": _finite(one.measured_max),
+                    "measured_rms": _finite(one.measured_rms),
+                    "holds": one.holds,
+                    "worst": None if one.worst is None else {**vars(one.worst), "found": _finite(one.worst.found)},
+                }
+                for one in self.measures
+            },
+        }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
