@@ -272,7 +272,7 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
 
 @pytest.mark.usefixtures("here")
 def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
-    assert {"E_LIMIT"} == {one.code for one in run(scenes, tmp_path / "out", memory_bytes=10**6).failures}
+    assert {"E_INPUT"} == {one.code for one in run(scenes, tmp_path / "out", memory_bytes=10**6).failures}
 
 
 def test_a_look_knows_the_number_of_splats_and_the_content(scenes):

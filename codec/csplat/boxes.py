@@ -26,9 +26,7 @@ def tile_boxes(header: SceneHeader) -> F64:
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     boxes = np.empty((len(header.tiles), 2, 3), np.float64)
     for tile in header.tiles:
-        far = [corner + extent for corner, extent in zip(tile.corner, tile.extent, strict=True)]
-        boxes[tile.index] = tile.corner, far
-        boxes[tile.index] *= math.ldexp(step, tile.exponent)
+        boxes[tile.index] = tile.corners(step)
     return boxes
 
 
