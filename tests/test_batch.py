@@ -19,7 +19,7 @@ from csplat.errors import InputError, LimitError
 from csplat_tools.batches import running
 from csplat_tools.batches.budget import Budget
 from csplat_tools.batches.finding import find_tasks
-from csplat_tools.batches.looking import Look, content_hash, expect, look
+from csplat_tools.batches.looking import RENDERER_BYTES, Look, content_hash, expect, look
 from csplat_tools.batches.page import make_page
 from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
 from csplat_tools.batches.workers import Worker, WorkerLostError
@@ -225,7 +225,7 @@ def test_a_scene_under_a_url_goes_to_a_url(scenes, tmp_path):
     (tmp_path / "list.csv").write_text("".join(f"{path},{output}\n" for path, output in rows))
     done = run(tmp_path / "list.csv", tmp_path / "out")
     assert ["done", "done", "failed"] == [one.state for one in done.records]
-    assert "E_REMOTE" == done.records[2].code
+    assert "ENOENT" == done.records[2].code
     assert store.cat("/out/a.csplat") == (tmp_path / "out" / "a.csplat").read_bytes()
 
 
@@ -264,15 +264,18 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
     assert ["first", "in"] == order
     with pytest.raises(LimitError, match="wanted 101, allowed 100"), budget.gate(101):
         pass
-    with Budget(100, has_option=True).gate(101) as options:
-        assert ("--memory", "100") == options
+    with Budget(10**9, has_option=True).gate(10**9 + 1) as options:
+        assert ("--memory", str(10**9 - RENDERER_BYTES)) == options
     with Budget(None, 100).gate(101) as options:  # nobody said so: it is tried alone
         assert () == options
 
 
 @pytest.mark.usefixtures("here")
 def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
-    assert {"E_INPUT"} == {one.code for one in run(scenes, tmp_path / "out", memory_bytes=10**6).failures}
+    done = run(scenes, tmp_path / "out", ("convert",), ending=".ply", match="*.spz", memory_bytes=10**6)
+    assert ["E_LIMIT"] == [one.code for one in done.failures]
+    done = run(scenes, tmp_path / "out", match="*.ply", memory_bytes=10**6)  # encode is told to keep to what there is
+    assert ["E_INPUT"] == [one.code for one in done.failures]
 
 
 def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
@@ -285,7 +288,7 @@ def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
     before = content_hash(folder / "meta.json")
     (folder / "quats.webp").write_bytes(b"1")
     assert before != content_hash(folder / "meta.json")
-    assert expect("encode", Look("", 0, 10**6, "")).memory_bytes > expect("encode", Look("", 0, 10, "")).memory_bytes
+    assert expect("encode", Look("", 0, 10**6, "")).memory_bytes > expect("encode", found).memory_bytes
 
 
 def test_the_page_escapes_what_scenes_are_called(tmp_path):

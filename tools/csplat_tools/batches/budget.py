@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 
 from csplat.errors import LimitError
+from csplat_tools.batches.looking import RENDERER_BYTES
 
-__all__ = ["Budget", "available_bytes"]
-
-
-def available_bytes(share: float) -> int | None:
-    """So much of the memory that programs may have now; `None` where the system does not say."""
-    with suppress(OSError, ValueError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return round(int(line.split()[1]) * 1024 * share)
-    return None
+__all__ = ["Budget"]
 
 
 class Budget:
@@ -61,7 +52,7 @@ class Budget:
             self._changed.wait_for(lambda: self._stopped or taken <= self._left)
             self._left -= taken
         try:
-            yield ("--memory", str(self._total)) if too_much else ()
+            yield ("--memory", str(max(1, self._total - RENDERER_BYTES))) if too_much else ()
         finally:
             with self._changed:
                 self._left += taken

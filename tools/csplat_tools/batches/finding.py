@@ -14,9 +14,10 @@ from typing import Any
 
 from csplat.errors import InputError
 from csplat.formats import formats
+from csplat.remote import is_url
 from csplat_tools.files.scenes import FOLDER_NAMES
 
-__all__ = ["Task", "find_tasks", "is_url"]
+__all__ = ["Task", "find_tasks"]
 
 _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")
@@ -47,11 +48,6 @@ class _Found:
 
     task: Task
     within: str
-
-
-def is_url(name: str) -> bool:
-    """Whether a name says how to get there: `s3://bucket/scene.ply`."""
-    return "://" in name
 
 
 def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", without: Path | None = None) -> list[Task]:

@@ -10,24 +10,27 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from csplat.decoder import read_header
+from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError
-from csplat.formats import format_of, open_scene
+from csplat.formats import format_of
+from csplat_tools.files.by_disk import Scale, expected
 from csplat_tools.files.scenes import FOLDER_NAMES, size_of
 
-__all__ = ["Expected", "Look", "content_hash", "expect", "look"]
+__all__ = ["RENDERER_BYTES", "Expected", "Look", "content_hash", "expect", "look"]
 
-_OWN = "csplat"
 _FILE_SPLAT_BYTES = 16.0  # where the number of splats is not known: about as .splat, SPZ and SOG have it or more
-#: Seconds and bytes that a scene takes, and those that each splat takes; by command. Measured at SH degree 3 on two
-#: cores, 120,000 to 1.1 million splats; bytes are a fifth more, with 130 MB of the renderer that draws small pictures.
+_UNBOUNDED = 1 << 62
+#: Bytes of a process beside its command: the renderer draws the small picture.
+RENDERER_BYTES = 160_000_000
+#: Seconds and bytes that a scene takes, and those that each splat takes, by command; `encode` says it itself. Measured
+#: at SH degree 3 on two cores, 120,000 to 1.1 million splats; bytes are a fifth more.
 _COSTS = {
-    "encode": (0.1, 40e-6, 280e6, 750.0),
-    "decode": (0.05, 2.5e-6, 220e6, 300.0),
-    "convert": (0.05, 9e-6, 300e6, 150.0),
-    "extract": (0.02, 0.1e-6, 200e6, 30.0),
+    "encode": (0.1, 40e-6, 120e6, 750.0),
+    "decode": (0.05, 2.5e-6, 60e6, 300.0),
+    "convert": (0.05, 9e-6, 140e6, 150.0),
+    "extract": (0.02, 0.1e-6, 40e6, 30.0),
 }
-_OTHER_BYTES = (500e6, 3000.0)  # of commands that render: a guess on the safe side
+_OTHER_BYTES = (340e6, 3000.0)  # of commands that render: a guess on the safe side
 
 
 @dataclass(frozen=True)
@@ -39,12 +42,15 @@ class Look:
         size_bytes: of all of it.
         splats: N; `None` where the file does not say.
         format: the name of its format; "" where it has none.
+        encode_seconds, encode_bytes: what encoding it in memory takes; `None` where that is not known.
     """
 
     sha256: str
     size_bytes: int
     splats: int | None
     format: str
+    encode_seconds: float | None = None
+    encode_bytes: int | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON-compatible values, which `Look(**...)` takes."""
@@ -70,27 +76,25 @@ def look(path: Path) -> Look:
     Raises:
         OSError: it cannot be read.
     """
-    splats, name = None, ""
+    size, content = size_of(path), content_hash(path)
     try:
         name = format_of(path).name
-        if name == _OWN:
-            splats = read_header(path).splat_count
-        else:
-            with open_scene(path) as scene:
-                splats = scene.count
-    except (CsplatError, ValueError, MemoryError):
-        pass  # of such a file nothing is foretold
-    return Look(content_hash(path), size_of(path), splats, name)
+        found = expected(path, EncodeOptions(), Scale(memory_bytes=_UNBOUNDED))
+    except (CsplatError, ValueError, MemoryError):  # of such a file nothing is foretold
+        return Look(content, size, None, "")
+    return Look(content, size, found.count, name, found.seconds, found.needs.memory_bytes)
 
 
 def expect(command: str, known: Look) -> Expected:
     """What a command takes that does what it does without options."""
     splats = known.splats if known.splats is not None else known.size_bytes / _FILE_SPLAT_BYTES
+    if command == "encode" and known.encode_bytes is not None:
+        return Expected(known.encode_seconds, RENDERER_BYTES + known.encode_bytes)
     if command not in _COSTS:
         each, by_splat = _OTHER_BYTES
-        return Expected(None, round(each + by_splat * splats))
+        return Expected(None, round(RENDERER_BYTES + each + by_splat * splats))
     seconds, seconds_by_splat, each, by_splat = _COSTS[command]
-    return Expected(seconds + seconds_by_splat * splats, round(each + by_splat * splats))
+    return Expected(seconds + seconds_by_splat * splats, round(RENDERER_BYTES + each + by_splat * splats))
 
 
 def content_hash(path: Path) -> str:

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from csplat.errors import InputError
-from csplat_tools.batches.budget import Budget, available_bytes
-from csplat_tools.batches.finding import Task, find_tasks, is_url
+from csplat.memory import available_bytes
+from csplat.remote import is_url
+from csplat_tools.batches.budget import Budget
+from csplat_tools.batches.finding import Task, find_tasks
 from csplat_tools.batches.page import PAGE, write_page
 from csplat_tools.batches.records import JOURNAL, Journal, Record, open_journal, read_journal
 from csplat_tools.batches.scene import Job, Planned, do_job, plan_job
@@ -21,7 +23,7 @@ from csplat_tools.batches.workers import Worker, WorkerLostError
 
 __all__ = ["Batch", "CommandLineError", "Step", "batch", "plan"]
 
-_GIVEN = ("threads", "memory")  # options that are given to a command that has them
+_GIVEN = ("threads", "memory", "resume")  # options that are given to a command that has them
 _FREE_SHARE = 0.9  # of the memory that is free: what a batch takes of which no number is said
 
 
@@ -135,12 +137,14 @@ def batch(
         target.mkdir(parents=True, exist_ok=True)
         with open_journal(target) as journal:
             jobs = [
-                replace(one, force=force, threads=threads, thumbnail=thumbnails)
+                replace(
+                    one, force=force, threads=threads, resumes={"memory", "resume"} <= options, thumbnail=thumbnails
+                )
                 for one in _jobs(tasks, command, target, journal.records, journal.pending)
             ]
             journal.begin([one.task.output for one in jobs if _may_begin(one)])
             if dask is None:
-                budget = Budget(memory_bytes, available_bytes(_FREE_SHARE), has_option="memory" in options)
+                budget = Budget(memory_bytes, int(_FREE_SHARE * available_bytes()), has_option="memory" in options)
                 work = partial(do_job, gate=budget.gate)
                 ended = spread(jobs, [first, *(Worker() for _ in range(count - 1))], work, budget.stop)
             else:
@@ -201,7 +205,10 @@ def _prepared(
         raise InputError(f"{taken.pop()} is written by the batch itself: name that output in a manifest")
     for options in {one.options for one in tasks if one.options}:
         _checked(worker, (*command, *options))
-    return tasks, frozenset(said["options"]) & set(_GIVEN)
+    has = set(said["options"]) & set(_GIVEN)
+    if "memory" in has and worker.ask("check", words=[*command, "--memory", "1GB"])["wrong"]:
+        has -= {"memory", "resume"}  # not with these options
+    return tasks, frozenset(has)
 
 
 def _checked(worker: Worker, words: Sequence[str]) -> Mapping[str, Any]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from csplat import __version__
-from csplat.errors import CsplatError, missing
-from csplat_tools.batches.finding import Task, is_url
+from csplat.errors import CsplatError, StoreError, missing
+from csplat.remote import is_url, store_of
+from csplat_tools.batches.finding import Task
 from csplat_tools.batches.looking import Look, content_hash, expect
 from csplat_tools.batches.records import Record
 from csplat_tools.batches.workers import Worker, WorkerLostError, remove_left
@@ -20,6 +22,7 @@ from csplat_tools.files.scenes import size_of
 __all__ = ["Job", "Planned", "do_job"]
 
 THUMBNAILS = "thumbnails"
+_PART_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class Job:
         pending: the output may be there by a run that did not end by itself.
         force: whatever is there may be replaced.
         threads: of the command; `None`: it has no such option.
+        resumes: the command goes on with a folder OUT.work that is left, where it is told to, by `--resume`.
         thumbnail: whether a picture is wanted.
     """
 
@@ -44,6 +48,7 @@ class Job:
     pending: bool = False
     force: bool = False
     threads: int | None = None
+    resumes: bool = False
     thumbnail: bool = False
 
     @property
@@ -87,7 +92,7 @@ def plan_job(job: Job, worker: Worker) -> Planned:
         with _here(job.task.source) as source:
             found = _looked(worker, source)
             assert isinstance(found, Look)
-    except CsplatError:
+    except (CsplatError, OSError):
         return Planned(job, None, False, 0.0, 0)
     expected = expect(job.command[0], found)
     return Planned(job, found, _is_done(job, found), expected.seconds, expected.memory_bytes)
@@ -117,7 +122,9 @@ def do_job(job: Job, worker: Worker, gate: Gate | None = None) -> tuple[Record, 
     except CsplatError as error:
         return replace(record, code=error.code, error=" ".join(str(error).split())), True
     except OSError as error:
-        return replace(record, code="E_OS", error=" ".join(str(error).split())), True
+        return replace(
+            record, code=errno.errorcode.get(error.errno or 0, "E_OS"), error=" ".join(str(error).split())
+        ), True
 
 
 class SceneError(CsplatError):
@@ -134,7 +141,8 @@ def _ran(job: Job, record: Record, worker: Worker, source: Path, output: Path, o
     if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
         raise SceneError(f"{job.task.output} is there already, and not by this batch: --force replaces it", "E_INPUT")
     threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
-    words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options)
+    resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
+    words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
     picture = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
     try:
         said = worker.ask(
@@ -198,19 +206,16 @@ def _here(source: str) -> Iterator[Path]:
     """A scene on this machine.
 
     Raises:
-        SceneError: it cannot be fetched.
+        CsplatError, OSError: it cannot be fetched.
     """
     if not is_url(source):
         yield Path(source)
         return
     with TemporaryDirectory(prefix="csplat-") as folder:
         local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
-        with _fetching(source):
-            import fsspec
-
-            with fsspec.open(source, "rb") as stream, local.open("wb") as copy:
-                while part := stream.read(1 << 20):
-                    copy.write(part)
+        with closing(store_of(source)) as store, local.open("wb") as copy:
+            for start in range(0, store.size, _PART_BYTES):
+                copy.writelines(store.read([(start, min(start + _PART_BYTES, store.size))]))
         yield local
 
 
@@ -224,21 +229,20 @@ def _placed(job: Job) -> Iterator[Path]:
         local = Path(folder) / PurePosixPath(job.task.output).name
         yield local
         if local.exists():
-            with _fetching(job.task.output):
-                import fsspec
-
-                files, root = fsspec.core.url_to_fs(job.task.output)
-                files.put(str(local), root)
+            _send(local, job.task.output)
 
 
-@contextmanager
-def _fetching(url: str) -> Iterator[None]:
+def _send(local: Path, url: str) -> None:
     try:
-        yield
+        from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
         raise missing(error, extra="remote") from None
+    try:
+        files, place = url_to_fs(url)
+        files.put(str(local), place)
     except Exception as error:  # noqa: BLE001  # each kind of store raises its own
-        raise SceneError(f"{url}: " + " ".join((str(error) or type(error).__name__).split()), "E_REMOTE") from None
+        name = PurePosixPath(url.partition("?")[0]).name  # the rest may hold what is secret
+        raise StoreError(f"{name} could not be sent: {type(error).__name__}") from None
 
 
 def _no_gate(memory_bytes: int) -> AbstractContextManager[tuple[str, ...]]:  # noqa: ARG001  # as gates have it

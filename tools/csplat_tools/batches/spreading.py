@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-from csplat_tools.batches.finding import is_url
+from csplat.remote import is_url
 from csplat_tools.batches.scene import Job
 from csplat_tools.batches.workers import Worker
 from csplat_tools.files.scenes import size_of

@@ -35,7 +35,14 @@ _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
 _REMARKS_MAX = 20
 _OWN = ("force", "report", "as_json", "quiet", "output_option")  # options that batch gives
-_FILES = ("page", "source_index", "checkpoint", "resume")  # that name a file, which all scenes would share
+_FILES = (
+    "page",
+    "source_index",
+    "checkpoint",
+    "resume",
+    "work",
+    "dry_run",
+)  # that name what all would share, or do none
 
 
 def main() -> None:
