@@ -134,12 +134,11 @@ def batch(
         tasks, options = _prepared(first, scenes, target, command, ending, match)
         count = min(workers or _cores(), len(tasks))
         threads = max(1, _cores() // count) if "threads" in options and dask is None else None
+        resumes = "resume" in options
         target.mkdir(parents=True, exist_ok=True)
         with open_journal(target) as journal:
             jobs = [
-                replace(
-                    one, force=force, threads=threads, resumes={"memory", "resume"} <= options, thumbnail=thumbnails
-                )
+                replace(one, force=force, threads=threads, resumes=resumes, thumbnail=thumbnails)
                 for one in _jobs(tasks, command, target, journal.records, journal.pending)
             ]
             journal.begin([one.task.output for one in jobs if _may_begin(one)])
