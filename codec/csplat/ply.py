@@ -14,7 +14,9 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +32,8 @@ from csplat.ply_write import write_ply
 from csplat.scene import BLOCK, Scene
 
 __all__ = ["lint_ply", "open_ply", "read_ply", "write_ply"]
+
+_EMPTY = Finding("empty", 0, "the file holds no splats", "note")
 
 
 def read_ply(
@@ -92,7 +96,13 @@ def lint_ply(file: File) -> list[Finding]:
     """
     findings: list[Finding] = []
     with local_file(file) as path:
-        _load(path, findings, keep_extra=False, strict=False)
+        opened = _opened(path, findings, keep_extra=False, strict=False)
+        if opened is not None:
+            survey = _surveyed(path, opened, findings)
+            if len(opened.rows) == 0:
+                findings.append(_EMPTY)
+            for _ in _models(path, opened, survey, keep_extra=False):
+                pass  # a model refuses what no finding is about
     return findings
 
 
@@ -107,39 +117,64 @@ def open_ply(path: Path) -> Iterator[Scene]:
     opened = _opened(path, findings, keep_extra=True, strict=False)
     refuse(findings, strict=False)
     assert opened is not None, "without an error there are rows"
-    rows, columns = opened.rows, opened.columns
-    counts, total, positions, thinnest = Counts(), 0, [], math.inf
-    for block in blocks_of(path, rows, BLOCK):
-        arrays = gather([block], len(block), rows.dtype, columns, counts=counts)
+    survey = _surveyed(path, opened, findings)
+    refuse(findings, strict=False)
+    empty = gather([], 0, opened.rows.dtype, opened.columns, keep_extra=True)
+    placed = relative_to_origin(empty.means, opened.facts)
+    facts = _model(empty, placed if survey.placed is None else (placed[0], survey.placed[1], None), opened)
+    yield Scene(survey.kept, facts, partial(_models, path, opened, survey, keep_extra=True), findings)
+
+
+_Placed = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin, means in doubles
+
+
+class _Survey(NamedTuple):
+    """What belongs to all splats.
+
+    Attributes:
+        kept: how many there are without those that are dropped.
+        thinnest: the smallest scale.
+        placed: of positions in doubles all of them, in their places.
+    """
+
+    kept: int
+    thinnest: float
+    placed: _Placed | None
+
+
+def _surveyed(path: Path, opened: _Opened, findings: list[Finding]) -> _Survey:
+    """Go through all rows, appending what is noticed to `findings`."""
+    counts, total, positions, thinnest, columns = Counts(), 0, [], math.inf, opened.columns
+    for block in blocks_of(path, opened.rows, BLOCK):
+        arrays = gather([block], len(block), opened.rows.dtype, columns, counts=counts)
         total += len(arrays.means)
         thinnest = min(thinnest, float(arrays.scales[:, : len(columns.scales)].min(initial=math.inf)))
         if columns.double:
             positions.append(arrays.means)
-    findings += findings_of(counts, len(rows))
-    refuse(findings, strict=False)
-    everything = None
-    if columns.double:
-        everything = relative_to_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
-        findings.append(_doubles_finding(total, everything[1]))
+    findings += findings_of(counts, len(opened.rows))
+    if not columns.double:
+        return _Survey(total, thinnest, None)
+    placed = relative_to_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
+    findings.append(_doubles_finding(total, placed[1]))
+    return _Survey(total, thinnest, placed)
 
-    def blocks() -> Iterator[SplatModel]:
-        at = 0
-        for block in blocks_of(path, rows, BLOCK):
-            arrays = gather([block], len(block), rows.dtype, columns, keep_extra=True, thinnest=thinnest)
-            part = slice(at, at + len(arrays.means))
-            if everything is None:
-                placed = relative_to_origin(arrays.means, opened.facts)
-            else:
-                means, origin, doubles = everything
-                placed = means[part], origin, None if doubles is None else doubles[part]
-            at = part.stop
-            if len(arrays.means):
-                yield _model(arrays, placed, opened)
 
-    empty = gather([], 0, rows.dtype, columns, keep_extra=True)
-    placed = relative_to_origin(empty.means, opened.facts)
-    facts = _model(empty, placed if everything is None else (placed[0], everything[1], None), opened)
-    yield Scene(total, facts, blocks, findings)
+def _models(path: Path, opened: _Opened, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
+    """The splats that are kept, some at a time."""
+    at = 0
+    for block in blocks_of(path, opened.rows, BLOCK):
+        arrays = gather(
+            [block], len(block), opened.rows.dtype, opened.columns, keep_extra=keep_extra, thinnest=survey.thinnest
+        )
+        part = slice(at, at + len(arrays.means))
+        if survey.placed is None:
+            placed = relative_to_origin(arrays.means, opened.facts)
+        else:
+            means, origin, doubles = survey.placed
+            placed = means[part], origin, None if doubles is None else doubles[part]
+        at = part.stop
+        if len(arrays.means):
+            yield _model(arrays, placed, opened)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +207,7 @@ def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool
     arrays = gather(blocks_of(path, rows), len(rows), rows.dtype, columns, keep_extra=keep_extra, counts=counts)
     findings += findings_of(counts, len(rows))
     if len(rows) == 0:
-        findings.append(Finding("empty", 0, "the file holds no splats", "note"))
+        findings.append(_EMPTY)
     placed = relative_to_origin(arrays.means, opened.facts)
     if columns.double:
         findings.append(_doubles_finding(len(arrays.means), placed[1]))
@@ -184,7 +219,7 @@ def _doubles_finding(count: int, origin: tuple[float, float, float]) -> Finding:
     return Finding("double-means", count, text, "note")
 
 
-def _model(arrays: Arrays, placed: tuple[F32, tuple[float, float, float], F64 | None], opened: _Opened) -> SplatModel:
+def _model(arrays: Arrays, placed: _Placed, opened: _Opened) -> SplatModel:
     means, origin, doubles = placed
     facts = opened.facts
     return SplatModel(

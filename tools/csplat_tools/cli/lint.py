@@ -14,6 +14,7 @@ from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
+from csplat_tools.files.scenes import without_extra
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, source_path, write_model
 
 __all__ = ["lint"]
@@ -51,7 +52,8 @@ def lint(
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
-            write_model(fix, formats.read(path, keep_extra=keep_extra), absolute=False)
+            with formats.open_scene(path) as scene:
+                write_model(fix, scene if keep_extra else without_extra(scene), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:

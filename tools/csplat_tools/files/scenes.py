@@ -20,6 +20,7 @@ from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
 
 __all__ = [
     "FOLDER_NAMES", "LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "watched", "without_bands",
+    "without_extra",
 ]  # fmt: skip
 
 #: Files that stand for all that lies beside them: SOG as a folder, and with levels.
@@ -134,3 +135,14 @@ def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
         progress("writing", 0.0)  # or going through it once more, which begins anew
 
     return replace(scene, blocks=blocks)
+
+
+def without_extra(scene: Scene) -> Scene:
+    """Leave out the columns that splats do not have."""
+    if not scene.facts.extra:
+        return scene
+    return replace(
+        scene,
+        facts=replace(scene.facts, extra={}),
+        blocks=lambda: (replace(model, extra={}) for model in scene.blocks()),
+    )
