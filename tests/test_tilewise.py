@@ -14,6 +14,7 @@ from csplat.errors import CsplatError, LimitError
 from csplat.ply import write_ply
 from csplat_conformance.manifest import load
 from csplat_tools.cli.app import app
+from csplat_tools.files import scenes
 from csplat_tools.files.convert import decode_file
 
 VECTORS = load()
@@ -136,3 +137,11 @@ def test_progress_goes_from_nothing_to_all(many_tiles, tmp_path):
     shares = [done for stage, done in told if stage == "decoding"]
     assert shares == sorted(shares)
     assert (0.0, 1.0) == (shares[0], shares[-1])
+
+
+@pytest.mark.parametrize("suffix", [".csplat", ".ply"])
+def test_who_wants_all_splats_at_once_is_refused_before_the_memory_is_full(many_tiles, tmp_path, monkeypatch, suffix):
+    decode_file(str(many_tiles), str(tmp_path / "scene.ply"))
+    monkeypatch.setattr(scenes, "available_bytes", lambda: 4000)
+    with pytest.raises(LimitError, match="allowed 4000"):
+        scenes.load_model(many_tiles.with_suffix(suffix))

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from csplat import formats
-from csplat.decoder import SceneHeader, StatedErrors, decode_scene
+from csplat.decoder import Limits, SceneHeader, StatedErrors, decode_scene
+from csplat.errors import LimitError
 from csplat.inputs import File
 from csplat.lint import Finding
+from csplat.memory import available_bytes
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat_tools.files.console import Progress
@@ -81,6 +83,7 @@ def load_model(scene: SceneLike) -> LoadedModel:
 
     Raises:
         CsplatError: it is not valid, or no file.
+        LimitError: it does not fit the memory that is free.
         OSError: it cannot be read.
     """
     if isinstance(scene, LoadedModel):
@@ -88,11 +91,13 @@ def load_model(scene: SceneLike) -> LoadedModel:
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
-        size_bytes, name = size_of(local), local.name
+        size_bytes, name, free = size_of(local), local.name, available_bytes()
         if not is_csplat(local):
+            if size_bytes > free:
+                raise LimitError("memory for all splats at once", size_bytes, free)
             return LoadedModel(formats.read(local), size_bytes, name=name)
         with mapped_csplat(str(local)) as data:
-            decoded = decode_scene(data)
+            decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)))
     return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
 
 
