@@ -331,3 +331,9 @@ def test_real_defects_are_found(data_dir):
     }
     for name, findings in expected.items():
         assert findings == {one.id: one.count for one in lint_ply(data_dir / "ply" / f"{name}.ply")}
+
+
+def test_what_is_said_of_no_splats_is_looked_at_too(path):
+    path.write_bytes(header(good_rows(0), before=("comment csplat unit_metres -1",)))
+    with pytest.raises(InputError, match="unit_metres is -1"):
+        lint_ply(path)

@@ -101,8 +101,9 @@ def lint_ply(file: File) -> list[Finding]:
             survey = _surveyed(path, opened, findings)
             if len(opened.rows) == 0:
                 findings.append(_EMPTY)
+            _without_splats(opened, survey)  # a model refuses what no finding is about
             for _ in _models(path, opened, survey, keep_extra=False):
-                pass  # a model refuses what no finding is about
+                pass
     return findings
 
 
@@ -119,9 +120,7 @@ def open_ply(path: Path) -> Iterator[Scene]:
     assert opened is not None, "without an error there are rows"
     survey = _surveyed(path, opened, findings)
     refuse(findings, strict=False)
-    empty = gather([], 0, opened.rows.dtype, opened.columns, keep_extra=True)
-    placed = relative_to_origin(empty.means, opened.facts)
-    facts = _model(empty, placed if survey.placed is None else (placed[0], survey.placed[1], None), opened)
+    facts = _without_splats(opened, survey)
     yield Scene(survey.kept, facts, partial(_models, path, opened, survey, keep_extra=True), findings)
 
 
@@ -157,6 +156,13 @@ def _surveyed(path: Path, opened: _Opened, findings: list[Finding]) -> _Survey:
     placed = relative_to_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
     findings.append(_doubles_finding(total, placed[1]))
     return _Survey(total, thinnest, placed)
+
+
+def _without_splats(opened: _Opened, survey: _Survey) -> SplatModel:
+    """Everything that is said of the scene."""
+    empty = gather([], 0, opened.rows.dtype, opened.columns, keep_extra=True)
+    placed = relative_to_origin(empty.means, opened.facts)
+    return _model(empty, placed if survey.placed is None else (placed[0], survey.placed[1], None), opened)
 
 
 def _models(path: Path, opened: _Opened, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
