@@ -7,7 +7,7 @@ from unittest import mock
 import pytest
 
 from csplat import _spec
-from csplat.decoder import scene
+from csplat.decoder import job
 from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter, wrong
 from csplat_conformance.manifest import load
@@ -74,7 +74,7 @@ def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector():
 
     def apply(stack):
         for name in ("read_json", "read_serr"):
-            stack.enter_context(mock.patch.object(scene, name, frames))
+            stack.enter_context(mock.patch.object(job, name, frames))
 
     assert [] == list(wrong.catch(wrong.Mistake("none", "", "CHK-6", apply)).failed)
 

@@ -110,7 +110,7 @@ def test_a_mutant_that_changes_nothing_is_the_same(few):
     few("valid/means_morton", "invalid/chunk_crc")
     decoder = PythonDecoder([BY_NAME["valid/rich"].data])
 
-    result = decoder.attempt(mutant(decoder, "scene.py", "8", "(8 - 1)"))
+    result = decoder.attempt(mutant(decoder, "job.py", "8", "(8 - 1)"))
     assert (Fate.SAME, "") == (result.fate, result.by)
 
 

@@ -235,7 +235,7 @@ MISTAKES: Final = (
     Mistake("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),
     Mistake("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
     Mistake("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
-    Mistake("chunks unused", "what is not used is not read", "CHK-2", replaced("_read_side_chunks", _no_side_chunks)),
+    Mistake("chunks unused", "what is not used is not read", "CHK-2", replaced("read_side_chunks", _no_side_chunks)),
     Mistake("trailing bytes", "bytes behind the file are accepted", "HDR-6", replaced("view_of", _cut_to_size)),
     Mistake("tails of payloads", "a payload may go on", "TLE-3", method(container.Cursor, "finish", nothing)),
     Mistake("lenient inflate", "as most libraries do by default", "COD-2", replaced("_inflate", _tail_of_inflate)),
