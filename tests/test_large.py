@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 from dataclasses import replace
 from itertools import pairwise
@@ -162,7 +163,7 @@ def test_a_killed_worker_is_said_and_nothing_is_lost(model, expected, tmp_path):
 def test_a_full_disk_is_said_before_and_survived_within(model, expected, tmp_path, monkeypatch):
     target = tmp_path / "out.csplat"
     with monkeypatch.context() as patch:
-        patch.setattr(encoding.shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
+        patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
         with pytest.raises(InputError, match="0 MB free, and 3 are wanted"):
             encode_scene(scene_of(model), target, FAST)
     assert not list(tmp_path.iterdir())
@@ -192,6 +193,41 @@ def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
     with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
         encode_scene(scene_of(model), target, FAST, resume=True)
     assert not target.exists()
+
+
+def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    (folder / "one.jpg").write_bytes(b"dear to somebody")
+    for resume in (False, True):
+        with pytest.raises(InputError, match="photographs holds something else"):
+            encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
+    assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
+
+
+def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model, expected, tmp_path, monkeypatch):
+    target = tmp_path / "out.csplat"
+    with pytest.raises(KeyboardInterrupt):
+        encode_scene(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
+    monkeypatch.setattr(encoding, "_WHOLE_ROW", 1.0)
+    stages = []
+    encode_scene(scene_of(model), target, FAST, resume=True, progress=lambda stage, _done: stages.append(stage))
+    assert "coding" in stages
+    assert "sorting" not in stages
+    assert expected == target.read_bytes()
+    assert [target] == list(tmp_path.iterdir())
+
+
+def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
+    times = []
+
+    def blocks():
+        times.append(1)
+        yield model.select(slice(0, 9000 if len(times) == 1 else 8000))
+
+    with pytest.raises(InputError, match="8,000 splats came where 9,000 were announced"):
+        encode_scene(replace(scene_of(model), blocks=blocks), tmp_path / "out.csplat", FAST)
+    assert not (tmp_path / "out.csplat").exists()
 
 
 def test_too_little_memory_is_refused(model, tmp_path):

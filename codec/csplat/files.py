@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,9 +19,10 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import File
 
-__all__ = ["BinaryWriter", "atomic_writer", "local_file", "opened_for_writing", "read_array"]
+__all__ = ["BinaryWriter", "atomic_writer", "check_room", "local_file", "opened_for_writing", "read_array"]
 
 _PART_SIZE = 1 << 20
+_MB = 1e6
 
 
 class BinaryWriter(Protocol):
@@ -29,6 +31,25 @@ class BinaryWriter(Protocol):
     def write(self, data: bytes | memoryview, /) -> object:
         """Take some bytes."""
         ...
+
+
+def check_room(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:
+    """Refuse work that a disk has no room for.
+
+    Args:
+        folder: on the disk.
+        wanted_bytes: that the work will write.
+        what: while what they are wanted, in words.
+
+    Raises:
+        InputError: the disk has fewer free.
+        OSError: there is no such folder.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < wanted_bytes:
+        raise InputError(
+            f"{os.fspath(folder)} has {free / _MB:,.0f} MB free, and {wanted_bytes / _MB:,.0f} are wanted while {what}"
+        )
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate
@@ -11,11 +11,11 @@ from itertools import accumulate
 from csplat import _spec
 from csplat.decoder.container import open_chunk
 from csplat.decoder.header import SceneHeader, Tile
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Payload, SceneFields, parts
+from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, Payload, SceneFields, parts
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.stores import Window
 
-__all__ = ["InTurn", "Later", "Part", "TileCopies", "chunk_payload", "scene_fields", "write_part"]
+__all__ = ["InTurn", "Part", "TileCopies", "chunk_payload", "scene_fields", "write_part"]
 
 #: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
@@ -67,28 +67,6 @@ def write_part(
             stream.write(part)
             size += len(part)
     return Part(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
-
-
-@dataclass(frozen=True)
-class Later:
-    """A payload that is read when it is written; see `csplat.encoder.container.Stored`.
-
-    Attributes:
-        size: its bytes.
-        crc: of its chunk.
-        give: reads it.
-    """
-
-    size: int
-    crc: int
-    give: Callable[[], bytes]
-
-    def __len__(self) -> int:
-        return self.size
-
-    def read(self) -> bytes:
-        """Its bytes."""
-        return self.give()
 
 
 class InTurn:

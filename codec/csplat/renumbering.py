@@ -12,8 +12,8 @@ from typing import IO
 from csplat import _spec
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.references import codebook_references
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, chunk_crc
-from csplat.parts import InTurn, Later, TileCopies, chunk_payload
+from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, chunk_crc
+from csplat.parts import InTurn, TileCopies, chunk_payload
 from csplat.stores import Window
 
 __all__ = ["Books", "Spool", "renumbered"]

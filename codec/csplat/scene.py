@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 
-__all__ = ["BLOCK", "Scene", "joined", "scene_of"]
+__all__ = ["BLOCK", "Scene", "joined", "scene_of", "watched"]
 
 #: Splats of a block, at most.
 BLOCK = 65_536
@@ -81,3 +82,22 @@ def joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
         extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in facts.extra},
         means_double=None if doubles[0] is None else np.concatenate([one for one in doubles if one is not None]),
     )
+
+
+def watched(scene: Scene, stage: str, progress: Callable[[str, float], object]) -> Scene:
+    """The same scene; who goes through its blocks tells how far it has come.
+
+    Its blocks raise InputError where they are not as many splats as they were: somebody changed the file.
+    """
+
+    def blocks() -> Iterator[SplatModel]:
+        done = 0
+        for model in scene.blocks():
+            progress(stage, done / max(1, scene.count))
+            yield model
+            done += len(model)
+        if done != scene.count:
+            raise InputError(f"{done:,} splats came where {scene.count:,} were announced: did the file change?")
+        progress(stage, 1.0)
+
+    return replace(scene, blocks=blocks)

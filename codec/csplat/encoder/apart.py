@@ -29,13 +29,16 @@ Rows = NDArray[np.intp]
 _BLOCK = 1 << 14  # splats that are looked at at a time
 
 
-def cut_scene(model: SplatModel, plan: Plan, grades: Grades | None = None) -> list[Tile]:
+def cut_scene(
+    model: SplatModel, plan: Plan, grades: Grades | None = None, buckets: Sequence[Rows] | None = None
+) -> list[Tile]:
     """Cut a scene into tiles.
 
     Args:
         model: the scene.
         plan: lattices and tile size.
         grades: which splats share steps; None: all do.
+        buckets: `bucket_rows` of the model, where they are known.
 
     Returns:
         As `cut`, bucket by bucket, or grade by grade; and after those of each the tiles of splats some of whose values
@@ -46,15 +49,13 @@ def cut_scene(model: SplatModel, plan: Plan, grades: Grades | None = None) -> li
         groups = grades.index if kinds is None else grades.index + np.uint8(len(grades.coarse)) * kinds
         return _cut_groups(model.means, np.arange(len(model)), groups, grades.coarse, plan)
     tiles: list[Tile] = []
-    for rows in bucket_rows(model.means):
+    for rows in bucket_rows(model.means) if buckets is None else buckets:
         found = None if kinds is None else kinds[rows]
         tiles += _cut_groups(model.means, rows, found, [EVEN], plan)
     return tiles
 
 
-def _cut_groups(
-    means: F32, rows: Rows, groups: Flags | None, coarse: Sequence[Coarse], plan: Plan
-) -> list[Tile]:  # fmt: skip
+def _cut_groups(means: F32, rows: Rows, groups: Flags | None, coarse: Sequence[Coarse], plan: Plan) -> list[Tile]:
     """Cut the splats `rows`, those of each group by themselves; group g has the steps of grade g modulo the grades."""
     tiles: list[Tile] = []
     for group in (0,) if groups is None else np.unique(groups):

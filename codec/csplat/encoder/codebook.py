@@ -26,7 +26,7 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Books", "Service", "books_of", "choose_sh", "served", "settled"]
+__all__ = ["Books", "Service", "books_of", "choose_sh", "largest_sh", "served", "settled"]
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -169,6 +169,11 @@ def _train(model: SplatModel, judge: _Judge, plan: Plan, options: EncodeOptions,
     return _Trained(index, entries, float(errors.sum()) / total, service)
 
 
+def largest_sh(shN: F32) -> float:
+    """Magnitude of the largest coefficient."""
+    return float(max(shN.max(initial=0.0), -shN.min(initial=0.0)))
+
+
 def settled(plan: Plan, largest: float) -> Plan:
     """The plan for a scene whose largest SH coefficient is that: no codebook where it would not fit beside one."""
     fine = replace(plan, sh_step=plan.codebook_step)
@@ -227,7 +232,7 @@ def _size(count: int, plan: Plan, options: EncodeOptions) -> int:
 
 def _escapes_fit(shN: F32, plan: Plan) -> bool:
     """Whether every splat could be coded directly beside a codebook, whose lattice no tile makes coarser."""
-    return _fits(float(max(shN.max(initial=0.0), -shN.min(initial=0.0))), plan)
+    return _fits(largest_sh(shN), plan)
 
 
 def _fits(largest: float, plan: Plan) -> bool:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +17,9 @@ __all__ = [
     "CodebookTable",
     "FileChunk",
     "FileTile",
+    "Later",
     "Payload",
     "SceneFields",
-    "Stored",
     "chunk_crc",
     "json_payload",
     "parts",
@@ -28,22 +28,25 @@ __all__ = [
 ]
 
 
-class Stored(Protocol):
-    """A payload that lies elsewhere until the file is written."""
+@dataclass(frozen=True)
+class Later:
+    """A payload that is read when it is written.
 
-    @property
-    def crc(self) -> int:
-        """As of `chunk_crc`."""
-        ...
+    Attributes:
+        size: its bytes.
+        crc: as of `chunk_crc`.
+        read: gives all of it.
+    """
 
-    def __len__(self) -> int: ...
+    size: int
+    crc: int
+    read: Callable[[], bytes]
 
-    def read(self) -> bytes:
-        """All of it."""
-        ...
+    def __len__(self) -> int:
+        return self.size
 
 
-Payload = bytes | Stored
+Payload = bytes | Later
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder.apart import cut_scene
 from csplat.encoder.buckets import WHOLE, bucket_rows, looked_at, sample_rows
-from csplat.encoder.codebook import Books, choose_sh, served, settled
+from csplat.encoder.codebook import Books, choose_sh, largest_sh, served, settled
 from csplat.encoder.coded import Coded
 from csplat.encoder.colour import ShBook
 from csplat.encoder.frozen import Frozen
@@ -89,6 +89,7 @@ class Draft:
         grades: of the splats, if there are several.
         sample: of a scene of many splats that nothing but itself says anything of: the draft of its sample, on which
             is decided.
+        buckets: rows of each bucket of such a scene.
     """
 
     model: SplatModel
@@ -101,6 +102,7 @@ class Draft:
     shapes: ShapeTables | None
     grades: Grades | None
     sample: Draft | None = None
+    buckets: Sequence[NDArray[np.intp]] = ()
 
     @classmethod
     def of(
@@ -156,10 +158,9 @@ class Draft:
         buckets = bucket_rows(model.means)
         contrast = contrast_of(model.select(buckets[place]) for place in looked_at(len(buckets)))
         sample = cls.of(model.select(sample_rows(len(model))), options, contrast=contrast, progress=progress)
-        largest = float(max(model.shN.max(initial=0.0), -model.shN.min(initial=0.0)))
-        sample = replace(sample, plan=settled(sample.plan, largest))
-        plan, extras = sample.plan, extra_columns(model, options)
-        return cls(model, options, origin, None, plan, cut_scene(model, plan), extras, None, None, sample)
+        sample = replace(sample, plan=settled(sample.plan, largest_sh(model.shN)))
+        tiles, extras = cut_scene(model, sample.plan, buckets=buckets), extra_columns(model, options)
+        return cls(model, options, origin, None, sample.plan, tiles, extras, None, None, sample, buckets)
 
     @cached_property
     def scene(self) -> SplatModel:
@@ -236,7 +237,7 @@ class Draft:
         tables, count = books.tables, len(self.model)
         index = None if tables.book is None else np.empty(count, np.int32)
         weights = None if tables.weights is None else np.empty(count, np.float32)
-        for rows in bucket_rows(self.model.means) if index is not None or weights is not None else ():
+        for rows in self.buckets if index is not None or weights is not None else ():
             part = served(books, self.model.select(rows), plan, self.options.thread_count)
             if weights is not None and part.weights is not None:
                 weights[rows] = part.weights
@@ -261,6 +262,7 @@ class Draft:
             ],
             shapes=None if self.shapes is None else self.shapes.select(order),
             sample=None,
+            buckets=(),
         )
 
 

@@ -59,9 +59,7 @@ class Layout:
         named: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=False))
         rest = list(arrays[len(_ARRAYS) :])
         doubles = None if self.facts.means_double is None else rest.pop(0)
-        return replace(
-            self.facts, **named, means_double=doubles, extra=dict(zip(self.facts.extra, rest, strict=True))
-        )  # fmt: skip
+        return replace(self.facts, **named, means_double=doubles, extra=dict(zip(self.facts.extra, rest, strict=True)))
 
 
 @dataclass(eq=False)

@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from csplat import _spec
 from csplat.encoder.apart import cut_scene
 from csplat.encoder.codebook import Books, served
-from csplat.encoder.container import FileTile, chunk_crc
+from csplat.encoder.container import FileTile, Later, chunk_crc
 from csplat.encoder.draft import within_binary32
 from csplat.encoder.measure import ErrorSums
 from csplat.encoder.plan import Plan
@@ -59,53 +60,22 @@ class Coding:
     books: Books
 
 
-@dataclass(frozen=True)
-class StoredChunk:
-    """A payload in a file of chunks; see `csplat.encoder.container.Stored`."""
-
-    path: Path
-    offset: int
-    size: int
-    crc: int
-
-    def __len__(self) -> int:
-        return self.size
-
-    def read(self) -> bytes:
-        """Its bytes.
-
-        Raises:
-            InputError: they are not those that were written.
-            OSError: they cannot be read.
-        """
-        with self.path.open("rb") as stream:
-            stream.seek(self.offset)
-            data = stream.read(self.size)
-        if len(data) != self.size or chunk_crc(_spec.CHUNK_TILE, data) != self.crc:
-            raise damaged(self.path)
-        return data
-
-
-def code_bucket(folder: Path, bucket: Bucket, coding: Coding, threads: int = 1) -> int:
+def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
     """Code a bucket, unless that is done.
 
     Args:
         folder: the working folder.
         bucket: which splats.
         coding: what was decided.
-        threads: of searches; the result does not depend on it.
-
-    Returns:
-        Its splats.
 
     Raises:
         InputError: values that no lattice can hold, or a damaged file.
         OSError: a file cannot be read or written.
     """
     if _said_path(folder, bucket).exists():
-        return bucket.stop - bucket.start
+        return
     model = within_binary32(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
-    tables = served(coding.books, model, coding.plan, threads)
+    tables = served(coding.books, model, coding.plan, threads=1)
     said, size = [], 0
     with atomic_writer(_chunks_path(folder, bucket)) as stream:
         for tile in cut_scene(model, coding.plan):
@@ -118,7 +88,6 @@ def code_bucket(folder: Path, bucket: Bucket, coding: Coding, threads: int = 1) 
     text = json.dumps(said).encode()
     with atomic_writer(_said_path(folder, bucket)) as stream:  # last: where it is, all is
         stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
-    return len(model)
 
 
 def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
@@ -158,9 +127,20 @@ def _said(coded: EncodedTile, start: int) -> dict[str, Any]:
 
 def _tile(said: Mapping[str, Any], chunks: Path) -> EncodedTile:
     fields = dict(said["tile"])
-    fields["layers"] = {int(layer): StoredChunk(chunks, *where) for layer, where in fields["layers"].items()}
+    fields["layers"] = {
+        int(layer): Later(size, crc, partial(_read_payload, chunks, offset, size, crc))
+        for layer, (offset, size, crc) in fields["layers"].items()
+    }
     for name in ("corner", "extent", "tables"):
         fields[name] = tuple(fields[name])
-    return EncodedTile(
-        FileTile(**fields), np.zeros(0, np.intp), ErrorSums(**said["errors"]), frozenset(said["coarsened"])
-    )  # fmt: skip
+    errors, coarsened = ErrorSums(**said["errors"]), frozenset(said["coarsened"])
+    return EncodedTile(FileTile(**fields), np.zeros(0, np.intp), errors, coarsened)
+
+
+def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        data = stream.read(size)
+    if len(data) != size or chunk_crc(_spec.CHUNK_TILE, data) != crc:
+        raise damaged(path)
+    return data

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,14 +23,14 @@ from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, fi
 from csplat.encoder.statistics import contrast_of
 from csplat.encoder.tile import EncodedTile
 from csplat.errors import InputError
-from csplat.files import atomic_writer
+from csplat.files import atomic_writer, check_room
 from csplat.large.bucket_files import BucketWriter, Layout, bucket_path, read_splats
 from csplat.large.coding import Coding, coded_bucket
 from csplat.large.survey import take_survey
 from csplat.large.work import Work
 from csplat.large.workers import code_here, code_on_cluster
 from csplat.memory import default_bytes
-from csplat.scene import Scene
+from csplat.scene import Scene, watched
 
 __all__ = ["Needs", "encode_scene", "needs_of"]
 
@@ -62,22 +61,23 @@ class Needs:
     disk_bytes: int
 
 
-def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = None) -> Needs:
+def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = None, *, by_disk: bool = False) -> Needs:
     """Say what the encoding of a scene will take.
 
     Args:
         scene: whose blocks are not looked at.
         options: of the encoder.
         memory_bytes: a bound; `None`: half of what is free.
+        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
 
     Raises:
         InputError: the bound is too low for any way.
     """
     bound = default_bytes() if memory_bytes is None else memory_bytes
-    row = Layout(scene.facts).row_bytes
+    row = _layout(scene, options).row_bytes
     whole = _PROGRAM + int(scene.count * row * _WHOLE_ROW)
     file_bytes = int(scene.count * row * _CODED)
-    if scene.count <= WHOLE or whole <= bound:
+    if scene.count <= WHOLE or (whole <= bound and not by_disk):
         if memory_bytes is not None and whole > bound:
             raise _too_low(bound, whole)
         return Needs(True, options.thread_count, whole, file_bytes)
@@ -90,6 +90,11 @@ def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = No
     workers = max(1, min(options.thread_count, (bound - _PROGRAM) // worker))
     memory = here if workers == 1 else max(here, _PROGRAM + workers * worker)
     return Needs(False, workers, memory, scene.count * row + file_bytes)
+
+
+def _layout(scene: Scene, options: EncodeOptions) -> Layout:
+    """Which arrays of a scene are carried."""
+    return Layout(scene.facts if options.keep_extra else replace(scene.facts, extra={}))
 
 
 def _too_low(bound: int, least: int) -> InputError:
@@ -136,22 +141,22 @@ def encode_scene(
         OSError: a file cannot be read or written; or a worker was killed.
     """
     options = options or EncodeOptions()
-    needs = needs_of(scene, options, memory_bytes)
-    if needs.in_memory and not (cluster and scene.count > WHOLE):
+    path = Path(target)
+    work_folder = path.with_name(path.name + ".work") if folder is None else Path(folder)
+    by_disk = cluster is not None or (resume and work_folder.exists())
+    needs = needs_of(scene, options, memory_bytes, by_disk=by_disk)
+    if needs.in_memory:
         result = encode_with_report(scene.model(), options, progress=progress)
         with atomic_writer(target) as stream:
             stream.write(result.data)
         return result.report
-    facts = scene.facts if options.keep_extra else replace(scene.facts, extra={})
-    path = Path(target)
-    work_folder = path.with_name(path.name + ".work") if folder is None else Path(folder)
     key = {
         "source": dict(source or {}),
         "options": options.chosen(),
         "splats": scene.count,
         "csplat": __version__,
     }
-    work = Work.begun(work_folder, Layout(facts), key, resume=resume)
+    work = Work.begun(work_folder, _layout(scene, options), key, resume=resume)
     return _Encoding(scene, path, options, work, needs, cluster, progress or _silent).run()
 
 
@@ -170,64 +175,50 @@ class _Encoding:
     def run(self) -> EncodeReport:
         work = self.work
         if "counts" not in work.state:
-            self._check_disk()
+            work.clear_buckets()
+            self._check_room()
             self._sort()
         if "contrast" not in work.state:
             buckets = work.buckets
-            parts_ = (
-                read_splats(bucket_path(work.folder, one.place), work.layout, one.rows)
-                for one in (buckets[place] for place in looked_at(len(buckets)))
+            some = (buckets[number] for number in looked_at(len(buckets)))
+            work.note(
+                contrast=contrast_of(
+                    read_splats(bucket_path(work.folder, one.place), work.layout, one.rows) for one in some
+                )
             )
-            work.note(contrast=contrast_of(parts_))
         draft, books = self._decide()
         self._code(Coding(work.layout, draft.plan, books))
         report = self._write(draft, books)
         work.remove()
         return report
 
-    def _check_disk(self) -> None:
-        free = shutil.disk_usage(self.work.folder).free
-        if free < self.needs.disk_bytes:
-            wanted = self.needs.disk_bytes / _MB
-            self.work.remove()
-            raise InputError(
-                f"{self.work.folder.parent} has {free / _MB:,.0f} MB free, and {wanted:,.0f} are wanted while this"
-                " scene is encoded"
-            )
+    def _check_room(self) -> None:
+        work = self.work
+        try:
+            check_room(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
+        except InputError:
+            if "curve" not in work.state:  # nothing is lost
+                work.remove()
+            raise
 
     def _sort(self) -> None:
         """Two passes over the scene: what it is like, and its splats into their buckets."""
         work, survey = self.work, self.work.survey
         if survey is None:
-            survey = take_survey(self._watched("looking"), work.layout)
+            survey = take_survey(watched(self.scene, "looking", self.progress), work.layout)
             work.keep(survey)
-        work.clear_buckets()
         writer = BucketWriter(work.folder, work.layout, survey.curve, _ROOM)
         del survey
-        for block in self._watched("sorting").blocks():
+        for block in watched(self.scene, "sorting", self.progress).blocks():
             writer.add(block)
         writer.flush()
         work.note(counts=writer.counts.tolist())
-
-    def _watched(self, stage: str) -> Scene:
-        """The scene, which tells how far it is read."""
-
-        def blocks() -> Any:
-            done = 0
-            for block in self.scene.blocks():
-                done += len(block)
-                self.progress(stage, done / self.scene.count)
-                yield block
-
-        return replace(self.scene, blocks=blocks)
 
     def _decide(self) -> tuple[Draft, Books]:
         """Decide on the sample; what comes back has no splats."""
         work, survey = self.work, self.work.survey
         assert survey is not None
-        sample = Draft.of(
-            survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress
-        )  # fmt: skip
+        sample = Draft.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
         plan, books = replace(sample, plan=settled(sample.plan, survey.largest)).decided(self.progress)
         return self._without_splats(plan, books)
 
@@ -264,12 +255,12 @@ class _Encoding:
         errors = ErrorSums.total(part.errors for part in tiles)
         settings = chosen_settings(draft, books.tables)
         fields = file_scene(draft, books, file_chunks(draft, errors, settings))
-        size, about = 0, max(1, self.needs.disk_bytes - self.scene.count * self.work.layout.row_bytes)
+        size, payloads = 0, sum(len(payload) for part in tiles for payload in part.tile.layers.values())
         with atomic_writer(self.target) as stream:
             for piece in parts(fields, [part.tile for part in tiles]):
                 stream.write(piece)
                 size += len(piece)
-                self.progress("writing", min(1.0, size / about))
+                self.progress("writing", min(1.0, size / max(1, payloads)))
         notes = notes_on(tiles, strict=draft.plan.lattice.strict)
         return EncodeReport(settings, errors.stated(), errors.count, len(tiles), size, notes)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from csplat.encoder.buckets import Curve, sample_rows
+from csplat.encoder.codebook import largest_sh
 from csplat.large.bucket_files import Layout
 from csplat.model import SplatModel
 from csplat.scene import Scene
@@ -42,6 +43,6 @@ def take_survey(scene: Scene, layout: Layout) -> Survey:
         first, last = np.searchsorted(rows, (where.start, where.stop))
         for array, values in zip(arrays, layout.arrays(block), strict=True):
             array[first:last] = values[rows[first:last] - where.start]
-        largest = max(largest, float(block.shN.max(initial=0.0)), float(-block.shN.min(initial=0.0)))
+        largest = max(largest, largest_sh(block.shN))
     sample = layout.model(arrays)
     return Survey(sample, largest, Curve.through(sample.means, scene.count))

@@ -45,11 +45,16 @@ class Work:
         """Make a folder, or go on in one.
 
         Raises:
-            InputError: the folder is there and `resume` is not said, or is about another scene or other options.
+            InputError: the folder is there and `resume` is not said, or is about another scene or other options, or
+                holds something else.
             OSError: it cannot be made or read.
         """
         work = cls(folder, layout)
-        if resume and (folder / _STATE).exists():
+        if (folder / _STATE).exists():
+            if not resume:
+                raise InputError(
+                    f"{folder} is left of an interrupted encoding: `--resume` goes on with it; or remove it"
+                )
             try:
                 work.state = json.loads((folder / _STATE).read_text())
             except ValueError:
@@ -58,13 +63,9 @@ class Work:
                 if (found := work.state["key"].get(name)) != value:
                     raise InputError(f"{folder} was begun with another {name} ({found}, now {value}): remove it")
             return work
-        if folder.exists():
-            if not resume:
-                raise InputError(
-                    f"{folder} is left of an interrupted encoding: `--resume` goes on with it; or remove it"
-                )
-            shutil.rmtree(folder)
-        folder.mkdir()
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder} holds something else: splats wait in a folder of their own, which is removed")
+        folder.mkdir(exist_ok=True)
         work.note(key=key)
         return work
 

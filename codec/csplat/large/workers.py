@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import multiprocessing
-import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -55,12 +54,11 @@ def code_here(folder: Path, buckets: Sequence[Bucket], coding: Coding, workers: 
 
 def _begin(folder: Path, coding: Coding) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and says what to do
-    os.environ["OMP_NUM_THREADS"] = "1"
     _shared.update(folder=folder, coding=coding)
 
 
-def _code(bucket: Bucket) -> int:
-    return code_bucket(_shared["folder"], bucket, _shared["coding"])
+def _code(bucket: Bucket) -> None:
+    code_bucket(_shared["folder"], bucket, _shared["coding"])
 
 
 def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: Coding, address: str) -> Iterator[Bucket]:
@@ -83,13 +81,7 @@ def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: Coding, add
         raise missing(error, extra="scale") from None
     with distributed.Client(address, set_as_default=False) as client, client.as_current():
         shared = client.scatter(coding, broadcast=True)
-        futures = {
-            client.submit(_code_alone, folder, bucket, shared, pure=False): bucket for bucket in buckets
-        }  # fmt: skip
+        futures = {client.submit(code_bucket, folder, bucket, shared, pure=False): bucket for bucket in buckets}
         for future in distributed.as_completed(list(futures)):
             future.result()
             yield futures[future]
-
-
-def _code_alone(folder: Path, bucket: Bucket, coding: Coding) -> int:
-    return code_bucket(folder, bucket, coding)

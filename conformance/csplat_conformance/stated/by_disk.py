@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from mmap import mmap
 from typing import Any
 
@@ -198,20 +199,10 @@ class _ByDisk:
         self, low: F64, high: F64, most: float, found: NDArray[np.int8], *, far: bool
     ) -> Iterator[tuple[SplatModel, F64, I64]]:
         """Splats without a partner that may lie within their radius of a box, some at a time; radii and numbers."""
-        header = self.opened.header
-        step = header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = np.array([tile.corners(step) for tile in header.tiles]).reshape(-1, 2, 3)
-        # A centre was rounded to float32; a radius is a cell's, and as much again for that.
-        widths = (
-            np.array([np.ldexp(step, tile.exponent) for tile in header.tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
-        )
+        header, (boxes, widths) = self.opened.header, self._boxes
         margins = np.full(len(widths), most)[:, None] if far else np.minimum(widths, most)[:, None]
         touching = ((boxes[:, 0] - margins <= high) & (boxes[:, 1] + margins >= low)).all(axis=1)
-        chosen = [
-            tile
-            for tile in np.flatnonzero(touching).tolist()
-            if (found[self._splats(tile)] == UNMATCHED).any()
-        ]  # fmt: skip
+        chosen = [tile for tile in np.flatnonzero(touching).tolist() if (found[self._splats(tile)] == UNMATCHED).any()]
         models, radii, splats, count = [], [], [], 0
         for tile, model in zip(chosen, self.opened.models(chosen), strict=True):
             own = tile_radii(model.means, header, header.tiles[tile])
@@ -232,6 +223,14 @@ class _ByDisk:
                 models, radii, splats, count = [], [], [], 0
         if models:
             yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
+
+    @cached_property
+    def _boxes(self) -> tuple[F64, F64]:
+        """Boxes of the tiles, [T, 2, 3], and how near the partners of their splats are expected at most, [T]."""
+        tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
+        boxes = np.array([tile.corners(step) for tile in tiles]).reshape(-1, 2, 3)
+        # A centre was rounded to float32; a radius is a cell's, and as much again for that.
+        return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
 
     def _splats(self, tile: int) -> slice:
         record = self.opened.header.tiles[tile]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.files import check_room
 from csplat_conformance.stated.source import Source
 
 __all__ = ["Rows", "Spool", "opened_spool"]
@@ -21,7 +20,6 @@ I64 = NDArray[np.int64]
 Records = NDArray[Any]  # structured, a splat each
 
 _WAITING_BYTES = 1 << 25  # of splats that wait for being written: so parts of a file are not too small to be read
-_MB = 1e6
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -152,11 +150,5 @@ def opened_spool(dtype: np.dtype[Any], count: int) -> Spool:
         InputError: the disk has no room for them.
         OSError: it cannot be made.
     """
-    folder, wanted = tempfile.gettempdir(), count * dtype.itemsize
-    free = shutil.disk_usage(folder).free
-    if free < wanted:
-        raise InputError(
-            f"{folder} has {free / _MB:,.0f} MB free, and {wanted / _MB:,.0f} are wanted while the source is compared:"
-            " TMPDIR names another folder"
-        )
+    check_room(tempfile.gettempdir(), count * dtype.itemsize, "the source is compared: TMPDIR names another folder")
     return Spool(tempfile.TemporaryFile(), dtype)

@@ -18,6 +18,7 @@ from csplat_tools.batches.scene import Planned
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
+from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.files.console import format_about, format_bytes, format_seconds, format_table, note, step_progress
 
 __all__ = ["batch"]
@@ -78,7 +79,7 @@ def batch(
             return
         with step_progress("batch", _words(), quiet=out.quiet) as progress:
             done = run_batch(
-                scenes, folder, words, ending=ending, match=match, workers=workers, memory_bytes=_bytes(memory),
+                scenes, folder, words, ending=ending, match=match, workers=workers, memory_bytes=parse_bytes(memory),
                 dask=dask, force=out.force, thumbnails=thumbnails, progress=progress,
             )  # fmt: skip
     except CommandLineError as error:
@@ -87,14 +88,6 @@ def batch(
     _tell_failures(done)
     if done.failures:
         sys.exit(FAILED)
-
-
-def _bytes(text: str | None) -> int | None:
-    if text is None:
-        return None
-    from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
-
-    return parse_size_bytes(text)
 
 
 def _words() -> Callable[[Step], str]:

@@ -18,7 +18,7 @@ from csplat_render.standing import seeming_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.options import Importance, SourceIndex, command
-from csplat_tools.cli.parsing import parse_decibels
+from csplat_tools.cli.parsing import parse_bytes, parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.by_disk import Scale, expected
@@ -94,9 +94,9 @@ class Goal(Group):
         """
         if not self.is_rendered and self.max_error is None:
             return None
-        from csplat_tools.optimise.target import Target, parse_max_error, parse_size_bytes  # wants the renderer's names
+        from csplat_tools.optimise.target import Target, parse_max_error  # wants the renderer's names
 
-        size = None if self.target_size is None else parse_size_bytes(self.target_size)
+        size = parse_bytes(self.target_size)
         loss = None if self.max_loss is None else parse_decibels(self.max_loss)
         bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
         psnr = None if self.target_psnr is None else parse_decibels(self.target_psnr)
@@ -144,10 +144,7 @@ class Room(Group):
         Raises:
             InputError: the memory is no size.
         """
-        from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
-
-        memory = None if self.memory is None else parse_size_bytes(self.memory)
-        return Scale(memory, self.work, self.resume, self.dask)
+        return Scale(parse_bytes(self.memory), self.work, self.resume, self.dask)
 
 
 @command(

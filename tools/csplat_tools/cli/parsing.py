@@ -10,8 +10,18 @@ import typer
 from csplat.errors import InputError
 from csplat.model import check_axes
 from csplat.upright import Direction, unit_up
+from csplat_tools.files.sizes import parse_size_bytes
 
-__all__ = ["parse_axes", "parse_colour", "parse_decibels", "parse_numbers", "parse_size", "parse_up", "up_word"]
+__all__ = [
+    "parse_axes",
+    "parse_bytes",
+    "parse_colour",
+    "parse_decibels",
+    "parse_numbers",
+    "parse_size",
+    "parse_up",
+    "up_word",
+]
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -26,6 +36,15 @@ def parse_size(text: str) -> tuple[int, int]:
     if found is None:
         raise typer.BadParameter(f"a size is {text!r}, wanted width and height in pixels, as 640x480")
     return int(found[1]), int(found[2])
+
+
+def parse_bytes(text: str | None) -> int | None:
+    """Bytes from `2GB`; `None` where nothing was given.
+
+    Raises:
+        InputError: it is something else.
+    """
+    return None if text is None else parse_size_bytes(text)
 
 
 def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...] | None:

@@ -11,6 +11,7 @@ from csplat_conformance.stated import MeasureProof, Proof
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
+from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.files.console import format_table, note
 from csplat_tools.inspect.verify import Verified, verify_file
 
@@ -51,11 +52,7 @@ def verify(
       csplat verify scene.csplat --source scene.ply --source-index scene.npy --json
     """
     out.check(inputs=(path, source, source_index))
-    memory_bytes = None
-    if memory is not None:
-        from csplat_tools.optimise.target import parse_size_bytes  # wants the renderer's names
-
-        memory_bytes = parse_size_bytes(memory)
+    memory_bytes = parse_bytes(memory)
     try:
         with out.bar() as progress:
             verified = verify_file(

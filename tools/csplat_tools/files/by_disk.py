@@ -90,19 +90,18 @@ def encode_by_disk(
     if progress is not None:
         progress("opening", 0.0)
     with open_scene(local) as opened:
-        needs = needs_of(opened, options, scale.memory_bytes)
-        if needs.in_memory and scale.cluster is None and not scale.resume:
+        in_memory = needs_of(opened, options, scale.memory_bytes).in_memory
+        if in_memory and scale.cluster is None and not scale.resume:
             return None
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
         refuse(opened.findings, strict=strict)
         scene = (facts or SceneOverrides()).applied_to_all(opened)
-        status = local.stat()
         try:
             report = encode_scene(
                 scene, target, options, memory_bytes=scale.memory_bytes, folder=scale.folder, resume=scale.resume,
                 cluster=scale.cluster, progress=progress,
-                source={"name": local.name, "size": size_of(local), "changed": status.st_mtime_ns},
+                source={"name": local.name, "size": size_of(local), "changed": local.stat().st_mtime_ns},
             )  # fmt: skip
         except (KeyboardInterrupt, OSError):
             folder = Path(scale.folder or f"{target}.work")

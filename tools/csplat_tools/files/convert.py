@@ -183,9 +183,7 @@ def encode_file(
     write_bytes(target, made.result.data)
     if source_index is not None:
         write_array(source_index, made.result.source_index)
-    return Encoded(
-        model, made.result.report, made, read.findings, read.size_bytes, time.perf_counter() - start
-    )  # fmt: skip
+    return Encoded(model, made.result.report, made, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
 def decode_file(

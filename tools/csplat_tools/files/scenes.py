@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from csplat import formats
+from csplat import scene as scenes
 from csplat.decoder import Limits, SceneHeader, StatedErrors, decode_scene
 from csplat.errors import LimitError
 from csplat.inputs import File
@@ -126,17 +127,13 @@ def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:
 
 
 def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
-    """The same scene; who goes through its blocks tells how far it has come."""
+    """The same scene; who goes through its blocks, to write them, tells how far it has come."""
     if progress is None:
         return scene
+    told = scenes.watched(scene, stage, progress)
 
     def blocks() -> Iterator[SplatModel]:
-        done = 0
-        for model in scene.blocks():
-            progress(stage, done / max(1, scene.count))
-            yield model
-            done += len(model)
-        progress(stage, 1.0)
+        yield from told.blocks()
         progress("writing", 0.0)  # or going through it once more, which begins anew
 
     return replace(scene, blocks=blocks)

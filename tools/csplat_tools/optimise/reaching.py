@@ -11,9 +11,10 @@ from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
+from csplat_tools.files.sizes import parse_size_bytes
 from csplat_tools.optimise.bounds import Bounded, Weights, meet_bounds
 from csplat_tools.optimise.report import Optimised, Report
-from csplat_tools.optimise.target import Target, parse_size_bytes
+from csplat_tools.optimise.target import Target
 from csplat_tools.views import ViewSet, find_view_set
 
 if TYPE_CHECKING:

@@ -12,12 +12,11 @@ from typing import Any
 from csplat._spec import MEASURE_NAMES
 from csplat.errors import InputError
 from csplat_render.metrics import PSNR_CAP
+from csplat_tools.files.sizes import NUMBER
 
-__all__ = ["Target", "parse_max_error", "parse_size_bytes"]
+__all__ = ["Target", "parse_max_error"]
 
-_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
-_NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _IN_UNITS = "means"  # the one measure that is a length
 _LOSSES = (0.001, 60.0)  # dB
 
@@ -85,24 +84,7 @@ class Target:
         return {**said, "max_error": dict(self.max_error)} if self.max_error else said
 
 
-_LEAST_FILE = 64  # bytes of a header
 _ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_loss": "a loss", "keep": "a share of the splats"}
-
-
-def parse_size_bytes(text: str) -> int:
-    """Bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
-
-    Raises:
-        InputError: it is something else.
-    """
-    found = re.fullmatch(_NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
-    unit = None if found is None else _UNITS.get(found[2].lower())
-    size = None if found is None or unit is None else float(found[1]) * unit
-    if size is None or not 1.0 <= size < 2.0**63:
-        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
-    if size < _LEAST_FILE:
-        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
-    return int(size)
 
 
 def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
@@ -119,7 +101,7 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
     for part in text.split(","):
         name, _, value = part.partition("=")
         name = name.strip()
-        found = re.fullmatch(_NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
+        found = re.fullmatch(NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
         if found is None:
             raise InputError(f"{part.strip()!r} bounds no error, wanted a measure and a number, as means=0.001")
         if name in bounds:

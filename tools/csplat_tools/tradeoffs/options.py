@@ -11,7 +11,7 @@ from csplat.encoder import PRESETS, PresetName
 from csplat.errors import InputError
 from csplat_render import Mode
 from csplat_render.conventions import MODES
-from csplat_tools.optimise.target import parse_size_bytes
+from csplat_tools.files.sizes import parse_size_bytes
 
 __all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
 
