@@ -1,5 +1,6 @@
 """The rasteriser's pictures: against the exact twin, and against numbers worked out by hand."""
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -198,6 +199,38 @@ def test_buffers_of_earlier_pictures_do_not_show():
     rasteriser.forward(large, camera(200, 150))
     again = rasteriser.forward(small, camera(33, 17)).rgb
     np.testing.assert_array_equal(again, Rasteriser().forward(small, camera(33, 17)).rgb)
+
+
+@pytest.mark.parametrize("mode", ["standard", "fast"])
+def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
+    model, view, behind = scene(), camera(70, 53), (0.3, 0.6, 0.1)
+    rasteriser = Rasteriser(mode, gradients=False)
+    wanted = rasteriser.forward(model, view, background=behind)
+    near = rasteriser.seen(model, view).near
+    assert wanted.drawn == np.count_nonzero(near)
+    limits = np.quantile(near[near > 0], [0.0, 0.1, 0.4, 0.4, 0.9, 1.0])  # one slice is empty
+    state, found = rasteriser.begun(view), wanted
+    for first, last in itertools.pairwise([*limits[:-1], np.inf]):
+        part = model.select((near >= first) & (near < last))
+        found = rasteriser.forward(part, view, background=behind, state=state)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
+
+
+def test_tiles_that_a_splat_may_touch_are_no_fewer_than_it_touches():
+    rasteriser = Rasteriser(gradients=False)
+    model, view = scene(), camera(70, 53)
+    seen, drawn = rasteriser.seen(model, view), rasteriser.forward(model, view)
+    assert drawn.intersections <= seen.tiles.sum() <= 2 * drawn.intersections
+
+
+def test_gradients_of_a_slice_are_refused():
+    rasteriser = Rasteriser()
+    with pytest.raises(InputError, match="slice"):
+        rasteriser.forward(scene(), camera(), state=rasteriser.begun(camera()))
+    rasteriser = Rasteriser(gradients=False)
+    with pytest.raises(InputError, match="state"):
+        rasteriser.forward(scene(), camera(), state=rasteriser.begun(camera(width=65)))
 
 
 def test_results_belong_to_the_caller():

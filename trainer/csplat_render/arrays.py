@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Gradients", "HasSplats", "RenderResult", "Splats"]
+__all__ = ["Array", "Gradients", "HasSplats", "RenderResult", "Seen", "Splats"]
 
 Array = NDArray[Any]
 
@@ -71,6 +71,21 @@ class RenderResult:
     radii: Array
     drawn: int
     intersections: int
+    ignored: int
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Which splats a picture shows.
+
+    Attributes:
+        near: [N] float32, depths, by which splats are sorted; 0 for what is not drawn.
+        tiles: [N] integers, how many tiles of the picture each may touch; 0 likewise.
+        ignored: how many splats hold NaN or infinity.
+    """
+
+    near: Array
+    tiles: Array
     ignored: int
 
 

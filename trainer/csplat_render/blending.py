@@ -15,6 +15,8 @@ from csplat_render.blending_steps import (
     alpha_at,
     begin_tile,
     gather,
+    go_on,
+    leave,
     middles,
     narrow_rows,
     numbers_of,
@@ -44,6 +46,7 @@ def _blender(counted: bool) -> ParallelKernel[...]:
         transmittance: Any,
         fifth: Any,
         used: Any,
+        state: Any,
     ) -> None:
         """Blend the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
@@ -63,6 +66,8 @@ def _blender(counted: bool) -> ParallelKernel[...]:
             fifth: [H, W], written: the sum of weight · depth; where counted the place, from its tile's start, of the
                 last splat of those whose rows the pixel lies in that came before it was finished, −1 if there is none.
             used: [tiles] int64, written: the end of what was looked at of each tile.
+            state: [H, W, 5], changed: what nearer splats left of each pixel, see `go_on`; where it is empty there are
+                none, and nothing is kept for farther ones.
         """
         height, width = transmittance.shape
         # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
@@ -82,6 +87,8 @@ def _blender(counted: bool) -> ParallelKernel[...]:
             begin_tile(planes, columns, one)
             planes[:, TILE : 4 * TILE] = zero
             planes[:, 4 * TILE : 5 * TILE] = nothing
+            if len(state):
+                go_on(state, X0, Y0, columns, on_picture, planes)
             end = starts[tile + 1]
             for begin in range(starts[tile], end, CHECK):
                 low, high = alive_rows(planes, low, high)
@@ -111,6 +118,8 @@ def _blender(counted: bool) -> ParallelKernel[...]:
                             else:
                                 row[4 * TILE + x] += weight * d
             used[tile] = end
+            if len(state):
+                leave(state, X0, Y0, columns, on_picture, planes)
             for y in range(on_picture):
                 for x in range(columns):
                     left = abs(planes[y, x])

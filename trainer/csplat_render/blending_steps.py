@@ -24,6 +24,8 @@ __all__ = [
     "alpha_at",
     "begin_tile",
     "gather",
+    "go_on",
+    "leave",
     "middles",
     "narrow_rows",
     "numbers_of",
@@ -88,6 +90,31 @@ def begin_tile(T: Any, columns: int, one: Any) -> None:
     for y in range(TILE):
         for x in range(TILE):
             T[y, x] = one if x < columns else -one
+
+
+@inline
+def go_on(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
+    """Begin a tile where nearer splats left it.
+
+    Args:
+        state: [H, W, 5]: transmittance, negative where a pixel is finished, red, green, blue, and the fifth plane.
+        X0, Y0: first column and row of the tile.
+        columns, high: how many of either are on the picture.
+        planes: [TILE, 5 * TILE or more], written on the picture.
+    """
+    for y in range(high):
+        for x in range(columns):
+            for k in range(5):
+                planes[y, k * TILE + x] = state[Y0 + y, X0 + x, k]
+
+
+@inline
+def leave(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
+    """Keep a tile for farther splats: the opposite of `go_on`."""
+    for y in range(high):
+        for x in range(columns):
+            for k in range(5):
+                state[Y0 + y, X0 + x, k] = planes[y, k * TILE + x]
 
 
 @inline

@@ -187,6 +187,7 @@ class Contributions(Rasteriser):
             blend_counted(
                 drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
                 rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
+                np.empty((0, 0, 5), self.dtype),
             )  # fmt: skip
             error = np.zeros_like(rgb) if reference is None else rgb - reference
             sum_removal(
@@ -205,7 +206,7 @@ class Contributions(Rasteriser):
             blend(
                 drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits,
                 np.ascontiguousarray(background, self.dtype), rgb, self._buffer("through", size, self.dtype),
-                self._buffer("depth", size, self.dtype), used,
+                self._buffer("depth", size, self.dtype), used, np.empty((0, 0, 5), self.dtype),
             )  # fmt: skip
             error = rgb if reference is None else rgb - reference
             sum_colours(

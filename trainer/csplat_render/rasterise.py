@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from csplat.errors import InputError, LimitError
 from csplat.model import sh_degree_of
-from csplat_render.arrays import Array, Gradients, HasSplats, RenderResult, Splats
+from csplat_render.arrays import Array, Gradients, HasSplats, RenderResult, Seen, Splats
 from csplat_render.binning import (
     CHUNKS,
     TILE,
@@ -31,7 +31,7 @@ from csplat_render.jit import thread_count
 from csplat_render.projecting import BLOCK, project
 from csplat_render.projecting_backward import project_backward
 
-__all__ = ["MAX_INTERSECTIONS", "Gradients", "HasSplats", "Rasteriser", "RenderResult", "Splats"]
+__all__ = ["MAX_INTERSECTIONS", "Gradients", "HasSplats", "Rasteriser", "RenderResult", "Seen", "Splats"]
 
 #: Most pairs of splat and tile in one picture; each takes 4 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
@@ -98,8 +98,12 @@ class Rasteriser:
         background: ArrayLike = (0.0, 0.0, 0.0),
         antialiased: bool = False,
         sh_degree: int | None = None,
+        state: Array | None = None,
     ) -> RenderResult:
         """Render a picture.
+
+        Splats may come in slices of depth, nearest first, each with the `state` that the one before it left: the last
+        picture is that of all splats, bit for bit.
 
         Args:
             splats: what to render; arrays of another dtype are converted.
@@ -107,45 +111,59 @@ class Rasteriser:
             background: red, green, blue behind everything.
             antialiased: scale opacities by what the dilation of 0.3 pixels added (mip-splatting).
             sh_degree: highest degree of the spherical harmonics; None for all there are.
+            state: [H, W, 5] of the rasteriser's dtype, from `begun`; changed: what the splats so far left of each
+                pixel. `None`: these are all splats.
 
         Returns:
-            The picture, in new arrays.
+            The picture, in new arrays; of a slice what there is of it so far, and the slice's own counts.
 
         Raises:
-            InputError: shapes do not fit together.
+            InputError: shapes do not fit together; or `backward` would want all slices.
             LimitError: there are more than `MAX_INTERSECTIONS`.
         """
         arrays = _checked(splats, self.dtype)
         degree = _checked_degree(sh_degree, arrays.shN.shape[1])
         colour = _checked_background(background, self.dtype)
-        view = view_vector(camera)
-        n, width, height = len(arrays.means), camera.W, camera.H
+        width, height = camera.W, camera.H
+        pixels = _checked_state(state, (height, width, 5), self.dtype)
+        if self.gradients and state is not None:
+            raise InputError("gradients want all splats at once, and these are a slice: use gradients=False")
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         tile_count = tiles_x * tiles_y
-        shape, extent = self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64)
-        box, near = self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32)
-        ignored = self._buffer("ignored", (-(-n // BLOCK),), np.int64)
-        radii = np.empty(n, np.float32)
         rgb = np.empty((height, width, 3), self.dtype)
         transmittance, depth = np.empty((height, width), self.dtype), np.empty((height, width), self.dtype)
         with thread_count(self.threads):
-            project(
-                arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh0, arrays.shN, degree, view,
-                width, height, antialiased, self.settings.alpha_min, shape, extent, box, near, radii, ignored,
-            )  # fmt: skip
+            view, radii, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
+            shape, extent, box, near = (self._buffers[name] for name in ("shape", "extent", "box", "near"))
             order = self._depth_order(near)
             starts, intersections = self._sort_into_tiles(order, near, extent, box, tiles_x, tile_count)
             blend(
                 starts, self._buffers["ids"], shape, box, tiles_x, self._limits, colour,
-                rgb, transmittance, depth, self._buffer("used", (tile_count,), np.int64),
+                rgb, transmittance, depth, self._buffer("used", (tile_count,), np.int64), pixels,
             )  # fmt: skip
-        result = RenderResult(rgb, 1 - transmittance, depth, radii, len(order), intersections, int(ignored.sum()))
+        result = RenderResult(rgb, 1 - transmittance, depth, radii, len(order), intersections, ignored)
         if self.gradients:
             self._last = _Drawn(
                 arrays, view, degree, antialiased, tiles_x, tile_count, intersections, rgb.copy(), transmittance,
                 depth.copy(), radii,
             )  # fmt: skip
         return result
+
+    def begun(self, camera: Camera) -> Array:
+        """The `state` of a picture before its first slice: all light comes through."""
+        state = np.zeros((camera.H, camera.W, 5), self.dtype)
+        state[..., 0] = 1
+        return state
+
+    def seen(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> Seen:
+        """Say which splats a picture would show, and how near they are; the arguments are those of `forward`."""
+        arrays = _checked(splats, self.dtype)
+        degree = _checked_degree(None, arrays.shN.shape[1])
+        with thread_count(self.threads):
+            *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
+        near, box = self._buffers["near"].copy(), self._buffers["box"]
+        tiles = np.where(near > 0, ((box[:, 1::2] - 1) // TILE - box[:, ::2] // TILE + 1).prod(axis=1), 0)
+        return Seen(near, tiles, ignored)
 
     def backward(
         self, grad_rgb: ArrayLike, grad_alpha: ArrayLike | None = None, grad_depth: ArrayLike | None = None
@@ -195,6 +213,18 @@ class Rasteriser:
                 result.means, result.quats, result.scales, result.opacities, result.sh0, result.shN, result.means2d,
             )  # fmt: skip
         return result
+
+    def _project(self, splats: Splats, camera: Camera, degree: int, *, antialiased: bool) -> tuple[Array, Array, int]:
+        """Fill the buffers shape, extent, box and near; return view, radii and how many splats were ignored."""
+        n, view = len(splats.means), view_vector(camera)
+        ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
+        project(
+            splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN, degree, view,
+            camera.W, camera.H, antialiased, self.settings.alpha_min,
+            self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64),
+            self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32), radii, ignored,
+        )  # fmt: skip
+        return view, radii, int(ignored.sum())
 
     def _depth_order(self, near: Array) -> Array:
         n = len(near)
@@ -278,6 +308,14 @@ def _checked_background(background: ArrayLike, dtype: Any) -> Array:
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InputError(f"the background is {background!r}, wanted red, green and blue")
     return colour
+
+
+def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Array:
+    if state is None:
+        return np.empty((0, 0, 5), dtype)
+    if state.shape != tuple(shape) or state.dtype != dtype:
+        raise InputError(f"the state has shape {list(state.shape)} of {state.dtype}, wanted {list(shape)} of {dtype}")
+    return state
 
 
 def _checked_gradient(name: str, gradient: ArrayLike | None, shape: Sequence[int], dtype: Any) -> Array:
