@@ -75,13 +75,14 @@ def surface_areas(model: SplatModel) -> F64:
     return areas
 
 
-def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator) -> Cloud:
+def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every: int = 1) -> Cloud:
     """Draw points from a scene's splats.
 
     Args:
         model: the scene, at least one splat.
         count: how many points.
         rng: where the random numbers come from.
+        every: how many splats of the scene each of the model's stands for.
 
     Returns:
         `count` points. Splats are drawn in proportion to the square root of their mass, so that few
@@ -101,7 +102,7 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator) -> Clo
     # Mass over the number of points that a splat expects: chance · sums[-1] / count.
     return Cloud(
         points=np.asfortranarray(model.means[index].astype(np.float64) + offsets),  # `_project` takes columns
-        masses=chance[index] * (sums[-1] / count),
+        masses=chance[index] * (sums[-1] / count) * every,
         sizes=np.sqrt(areas[index]),
     )
 

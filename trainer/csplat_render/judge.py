@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +21,7 @@ from csplat_render.camera import Camera
 from csplat_render.cameras import relative_to
 from csplat_render.conventions import Mode
 
-__all__ = ["Judge", "Look", "OnView", "renderer"]
+__all__ = ["Drawable", "Judge", "Look", "OnView", "renderer"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -28,6 +29,21 @@ F64 = NDArray[np.float64]
 OnView = Callable[[int, F32, F32], None]
 
 _KEPT_BYTES = 1 << 30  # of a source's pictures; where they are more, they are rendered anew for each scene
+
+
+class Drawable(Protocol):
+    """A scene that draws itself, because it is not in memory."""
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """What cameras are relative to."""
+        ...
+
+    def renderer(
+        self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+    ) -> Callable[[Camera], RenderResult]:
+        """As `renderer` of this module."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +93,7 @@ class Judge:
     @classmethod
     def of_source(
         cls,
-        source: SplatModel,
+        source: SplatModel | Drawable,
         cameras: Sequence[Camera],
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
@@ -141,7 +157,7 @@ class Judge:
 
     def scores(
         self,
-        model: SplatModel,
+        model: SplatModel | Drawable,
         *,
         ssim: bool = True,
         lpips: metrics.Distance | None = None,
@@ -173,7 +189,7 @@ class Judge:
             progress("comparing", 1.0)
         return metrics.Scores.of(each, ignored)
 
-    def _renderer(self, model: SplatModel) -> Callable[[Camera], RenderResult]:
+    def _renderer(self, model: SplatModel | Drawable) -> Callable[[Camera], RenderResult]:
         draw = renderer(model, self.background, mode=self.mode, threads=self.threads)
         if self.origin is None:
             return draw
@@ -182,7 +198,7 @@ class Judge:
 
 
 def renderer(
-    model: SplatModel, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+    model: SplatModel | Drawable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
     """What draws a scene from camera after camera, and keeps its memory in between.
 
@@ -192,6 +208,8 @@ def renderer(
         mode: `exact`, `standard` or `fast`.
         threads: how many; `None` for all.
     """
+    if not isinstance(model, SplatModel):
+        return model.renderer(background, mode=mode, threads=threads)
     # numba takes a second to import: those who want the classes alone do not wait for it.
     from csplat_render.rasterise import Rasteriser
     from csplat_render.twin import render_exact

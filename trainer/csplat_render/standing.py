@@ -28,11 +28,12 @@ _DISTANCE = 2.0  # extents
 _CELL, _FINE = 20, 2.0  # pixels
 
 
-def seeming_up(model: SplatModel) -> Direction | None:
+def seeming_up(model: SplatModel, every: int = 1) -> Direction | None:
     """Which axis of an object seems to be up, or its opposite.
 
     Args:
         model: the scene.
+        every: how many splats of the scene each of the model's stands for.
 
     Returns:
         `None` where the scene or the cameras that it carries say which way is up, where nothing tells it, and inside
@@ -43,7 +44,8 @@ def seeming_up(model: SplatModel) -> Direction | None:
     frame = scene_frame(model)
     if frame.kind != "object":
         return None
-    cloud, K = sample_cloud(model, _POINTS, np.random.default_rng(0)), intrinsics(_SIDE, _SIDE, FIELD_OF_VIEW)
+    cloud = sample_cloud(model, _POINTS, np.random.default_rng(0), every)
+    K = intrinsics(_SIDE, _SIDE, FIELD_OF_VIEW)
     heights = 1.0 - (2.0 * np.arange(_DIRECTIONS) + 1.0) / _DIRECTIONS  # a spiral: evenly over the sphere
     turns, radii = np.pi * (1.0 + 5.0**0.5) * np.arange(_DIRECTIONS), np.sqrt(1.0 - heights**2)
     ways = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights], axis=1)

@@ -125,7 +125,7 @@ def scene_frame(model: SplatModel) -> Frame:
 
 
 def virtual_cameras(
-    model: SplatModel, count: int = 8, width: int = 640, height: int = 480, seed: int = 0
+    model: SplatModel, count: int = 8, width: int = 640, height: int = 480, seed: int = 0, every: int = 1
 ) -> list[Camera]:
     """Cameras around a scene, chosen from the scene alone.
 
@@ -135,6 +135,7 @@ def virtual_cameras(
         width: pixels.
         height: pixels.
         seed: decides where around the scene the cameras begin, and what exactly they look at.
+        every: how many splats of the scene each of the model's stands for.
 
     Returns:
         `count` cameras, the same for the same arguments. An object covers at least half of each
@@ -151,7 +152,7 @@ def virtual_cameras(
     if len(model) == 0:
         K = intrinsics(width, height, FIELD_OF_VIEW)
         return orbit(frame.centre, 2.2, frame.up, count, K, width, height, near=frame.near)
-    cloud = sample_cloud(model, _POINTS, rng)
+    cloud = sample_cloud(model, _POINTS, rng, every)
     K = intrinsics(width, height, FIELD_OF_VIEW)
     views = _Views(frame, K, width, height)
     if frame.kind == "object":

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from csplat.errors import counted
+from csplat.errors import InputError, counted
 from csplat.files import read_array
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import Lpips, ModeWord, command
+from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.cli.view_options import SplitWord, Views
-from csplat_tools.files.console import format_table
+from csplat_tools.files.console import format_bytes, format_table
 from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import load_model
+from csplat_tools.files.scenes import OpenedScene, opened_scenes
 from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.inspect.attributes import AttributeErrors
 from csplat_tools.views import counted_views
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from csplat_tools.inspect.compare import Comparison
 
 __all__ = ["compare"]
+
+_INDEX_BYTES = 1 << 27  # of a source index that is read as a whole
 
 _PAIRING = {
     "index": "pairs from the source index",
@@ -57,6 +60,9 @@ def compare(
     amplify: Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Of the differences shown.")] = 10.0,
     lpips: Lpips = None,
     mode: ModeWord = "standard",
+    memory: Annotated[
+        str | None, typer.Option(metavar="2GB", help="What it may take; else half of what is free.")
+    ] = None,
 ) -> None:
     """Compare a scene with its source: sizes, errors of the splats, and pictures.
 
@@ -67,10 +73,16 @@ def compare(
     all of them. With --data the held-out photographs judge A and B as well.
     Needs the packages of the render extra.
 
+    Scenes of any size: those that do not fit the memory together are drawn by
+    way of a file in the folder for temporary ones (TMPDIR), as large as the
+    splats; errors of splats then want --source-index, but of scenes whose
+    splats have the same order.
+
     Examples:
       csplat compare scene.ply scene.csplat
       csplat compare scene.ply scene.csplat --data capture --lpips auto
       csplat compare scene.ply scene.csplat --pictures differences
+      csplat compare city.ply city.csplat --memory 4GB
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
     import csplat_tools
@@ -79,18 +91,22 @@ def compare(
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
     need_renderer()
-    rows = None if source_index is None else read_array(source_index)
-    source = load_model(a)
-    around = views.find(source.model, out, count=0, split=split)
-    if mode == "exact":
-        from csplat_tools.views.timing import pictures_seconds
+    rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
+    with opened_scenes((a, b), parse_bytes(memory)) as (source, other), out.bar() as progress:
+        if isinstance(source, OpenedScene):
+            if mode == "exact":
+                raise InputError("--mode exact wants both scenes in memory, and they do not fit: take standard")
+            out.remark(
+                f"A and B do not fit {format_bytes(source.memory_bytes)} of memory: they are drawn by way of the disk"
+            )
+        model, every = source.sample(progress) if isinstance(source, OpenedScene) else (source.model, 1)
+        around = views.find(model, out, count=0, split=split, every=every)
+        if mode == "exact":
+            from csplat_tools.views.timing import pictures_seconds
 
-        out.foretell(
-            lambda: 2 * pictures_seconds(source.model, around.judges, mode=mode), "--mode standard takes seconds"
-        )
-    with out.bar() as progress:
+            out.foretell(lambda: 2 * pictures_seconds(model, around.judges, mode=mode), "--mode standard takes seconds")
         compared = csplat_tools.compare(
-            source, b, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
+            source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
             background=views.colour, mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
@@ -115,9 +131,9 @@ def _format(compared: Comparison, a: str, b: str) -> str:
 def _sizes(compared: Comparison, a: str, b: str) -> str:
     rows = []
     for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
-        count = len(one.model)
+        count = one.count
         per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
-        rows.append((name, one.size_bytes, count, one.model.sh_degree, per_splat))
+        rows.append((name, one.size_bytes, count, one.facts.sh_degree, per_splat))
     table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
     ratio = compared.ratio
     return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
@@ -147,8 +163,8 @@ def _quality(compared: Comparison) -> str:
     head, *others = format_table(("pictures", views), rows).splitlines()
     lines = [head, *(f"{line}  {_WORDS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)
-    if compared.a.model.antialiased != compared.b.model.antialiased:
-        lines.append(f"only {'A' if compared.a.model.antialiased else 'B'} is antialiased, and was rendered so")
+    if compared.a.facts.antialiased != compared.b.facts.antialiased:
+        lines.append(f"only {'A' if compared.a.facts.antialiased else 'B'} is antialiased, and was rendered so")
     return "\n".join(lines)
 
 

@@ -128,18 +128,22 @@ class Views(Group):
         size = None if self.size is None else parse_size(self.size)
         return None if self.data is None else DataOptions(self.data, size, self.images, self.test_every, near)
 
-    def find(self, model: SplatModel, output: Output, *, near: float | None = None, **how: Any) -> ViewSet:
+    def find(
+        self, model: SplatModel, output: Output, *, near: float | None = None, every: int = 1, **how: Any
+    ) -> ViewSet:
         """Find views of a scene, and say what the user should know of them.
 
         Args:
             model: the scene.
             output: whether remarks are wanted.
             near: near plane of the photographs; `None`: one that suits.
+            every: as of `find_view_set`.
             how: what else `find_view_set` is told; handed on, so that its defaults stand in one place.
         """
-        found = find_view_set(model, cameras=self.cameras, data=self.photographs(near), background=self.colour, **how)
+        data = self.photographs(near)
+        found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
         output.remark(*found.notes)
-        axis = None if output.quiet or found.name != VIRTUAL else seeming_up(model)
+        axis = None if output.quiet or found.name != VIRTUAL else seeming_up(model, every)
         if axis is not None:
             word = up_word(axis)
             output.remark(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +16,25 @@ from csplat.decoder import Limits, SceneHeader, StatedErrors, decode_scene
 from csplat.errors import LimitError
 from csplat.inputs import File
 from csplat.lint import Finding
-from csplat.memory import available_bytes
+from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
-from csplat.scene import Scene
+from csplat.scene import Scene, joined
 from csplat_tools.files.console import Progress
-from csplat_tools.files.streams import is_csplat, local_path, mapped_csplat
+from csplat_tools.files.streams import is_csplat, kept_path, local_path, mapped_csplat, naming
 
 __all__ = [
-    "FOLDER_NAMES", "LoadedModel", "SceneLike", "load_model", "ply_splat_bytes", "size_of", "watched", "without_bands",
-    "without_extra",
+    "FOLDER_NAMES", "LoadedModel", "OpenedScene", "SceneLike", "load_model", "opened_scenes", "ply_splat_bytes",
+    "size_of", "watched", "without_bands", "without_extra",
 ]  # fmt: skip
 
 #: Files that stand for all that lies beside them: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
+
+
+_SAMPLE = 1 << 19  # splats
+_SMALL = 1 << 20  # bytes of a file of any format that fits every memory
+#: What comparing takes in memory beside the arrays: the program; of a splat what is drawn and searched.
+_BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +61,80 @@ class LoadedModel:
         """What a notebook shows of it: see `SplatModel`."""
         return self.model._repr_html_()  # a protocol of notebooks, and public there
 
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.model)
+
+    @property
+    def facts(self) -> SplatModel:
+        """What the scene says beside its splats."""
+        return self.model
+
     def as_json(self) -> dict[str, Any]:
         """Return size and counts as JSON-compatible values."""
-        count = len(self.model)
-        return {
-            "size_bytes": self.size_bytes,
-            "splats": count,
-            "sh_degree": self.model.sh_degree,
-            "bytes_per_splat": self.size_bytes / count if count else None,
-        }
+        return _sizes(self.count, self.facts, self.size_bytes)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedScene:
+    """A scene that is not in memory.
+
+    Attributes:
+        scene: the splats, some at a time.
+        size_bytes: of the file.
+        path: of the file.
+        memory_bytes: what may be taken by those who look at it, about.
+    """
+
+    scene: Scene
+    size_bytes: int
+    path: Path
+    memory_bytes: int
+    _sample: list[SplatModel] = field(default_factory=list, init=False)
+
+    def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:
+        """Every so-manieth splat, without SH bands; and for how many splats each stands. It is kept.
+
+        Raises:
+            CsplatError: the scene is not whole.
+        """
+        every = max(1, -(-self.count // _SAMPLE))
+        if not self._sample:
+            parts = []
+            for rows, block in self.scene.numbered():
+                if progress is not None:
+                    progress("looking at the scene", rows.start / max(1, self.count))
+                parts.append(_plain(block.select(np.arange(-rows.start % every, len(block), every))))
+            self._sample.append(joined(_plain(self.facts), parts))
+        return self._sample[0], every
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.scene.count
+
+    @property
+    def facts(self) -> SplatModel:
+        """What the scene says beside its splats."""
+        return self.scene.facts
+
+    def as_json(self) -> dict[str, Any]:
+        """Return size and counts as JSON-compatible values."""
+        return _sizes(self.count, self.facts, self.size_bytes)
+
+
+def _plain(model: SplatModel) -> SplatModel:
+    return replace(without_bands(model, 0), extra={}, means_double=None)
+
+
+def _sizes(count: int, facts: SplatModel, size_bytes: int) -> dict[str, Any]:
+    return {
+        "size_bytes": size_bytes,
+        "splats": count,
+        "sh_degree": facts.sh_degree,
+        "bytes_per_splat": size_bytes / count if count else None,
+    }
 
 
 #: A scene, as functions of this package take it: a model, or a file in any format.
@@ -92,14 +164,81 @@ def load_model(scene: SceneLike) -> LoadedModel:
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
-        size_bytes, name, free = size_of(local), local.name, available_bytes()
-        if not is_csplat(local):
-            if size_bytes > free:
-                raise LimitError("memory for all splats at once", size_bytes, free)
-            return LoadedModel(formats.read(local), size_bytes, name=name)
-        with mapped_csplat(str(local)) as data:
-            decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)))
+        return _loaded(local)
+
+
+def _loaded(local: Path) -> LoadedModel:
+    size_bytes, name, free = size_of(local), local.name, available_bytes()
+    if not is_csplat(local):
+        if size_bytes > free:
+            raise LimitError("memory for all splats at once", size_bytes, free)
+        return LoadedModel(formats.read(local), size_bytes, name=name)
+    with mapped_csplat(str(local)) as data:
+        decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)))
     return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
+
+
+@contextmanager
+def opened_scenes(
+    given: Sequence[SceneLike | OpenedScene], memory_bytes: int | None = None
+) -> Iterator[Sequence[LoadedModel] | Sequence[OpenedScene]]:
+    """Read scenes that are to be compared, all into memory, or none where they do not fit together.
+
+    Args:
+        given: as of `load_model`. Beside a model, or what is loaded already, all are read into memory; what is opened
+            already, all of it, stays so.
+        memory_bytes: bound, about; `None`: half of what is free.
+
+    Yields:
+        The scenes; they can be read as long as the context lasts.
+
+    Raises:
+        CsplatError: as of `load_model`, but for memory; or less is allowed than the disk wants.
+        OSError: one cannot be read.
+    """
+    opened = [one for one in given if isinstance(one, OpenedScene)]
+    if opened:
+        assert len(opened) == len(given), "all are in memory, or none"
+        yield opened
+        return
+    bound = default_bytes() if memory_bytes is None else memory_bytes
+    with ExitStack() as stack:
+        local: dict[int, Path] = {}
+        for place, one in enumerate(given):
+            if not isinstance(one, (SplatModel, LoadedModel, OpenedScene)):
+                with naming(one):
+                    local[place] = stack.enter_context(kept_path(one))
+        looked_at = memory_bytes is not None or any(size_of(path) > _SMALL for path in local.values())
+        if len(local) == len(given) and looked_at:
+            found = [_opened(stack, given[place], path, bound) for place, path in local.items()]
+            if _together_bytes(found) > bound:
+                yield found
+                return
+        loaded = []
+        for place, one in enumerate(given):
+            if isinstance(one, (SplatModel, LoadedModel)):
+                loaded.append(load_model(one))
+                continue
+            with naming(one):
+                loaded.append(_loaded(local[place]))
+        yield loaded
+
+
+def _opened(stack: ExitStack, given: object, path: Path, bound: int) -> OpenedScene:
+    with naming(given):
+        scene = stack.enter_context(formats.open_scene(path))
+
+    def blocks() -> Iterator[SplatModel]:
+        with naming(given):
+            yield from scene.blocks()
+
+    return OpenedScene(replace(scene, blocks=blocks), size_of(path), path, bound)
+
+
+def _together_bytes(found: Sequence[OpenedScene]) -> float:
+    """Bytes of memory that comparing takes, all splats at once."""
+    arrays = sum(one.count * ply_splat_bytes(one.facts.sh_degree) for one in found)
+    return _BASE_BYTES + arrays + _SPLAT_BYTES * max(one.count for one in found)
 
 
 def size_of(path: Path) -> int:

@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -40,8 +40,10 @@ __all__ = [
     "csplat_file",
     "is_csplat",
     "is_one_way",
+    "kept_path",
     "local_path",
     "mapped_csplat",
+    "naming",
     "open_output",
     "source_path",
     "whole_output",
@@ -168,12 +170,26 @@ def local_path(file: File) -> Iterator[Path]:
         InputError: it is no file.
         OSError: it cannot be read.
     """
+    with naming(file), kept_path(file) as path:
+        yield path
+
+
+def kept_path(file: File) -> AbstractContextManager[Path]:
+    """As `local_path`, but errors that occur while it is open are not said to be about this file."""
     if isinstance(file, str) and file == STANDARD_STREAM:
-        with _naming(file), local_file(sys.stdin.buffer, "standard input") as path:
-            yield path
-    else:
-        with _naming(file), local_file(file) as path:
-            yield path
+        return local_file(sys.stdin.buffer, "standard input")
+    return local_file(file)
+
+
+@contextmanager
+def naming(file: object) -> Iterator[None]:
+    """Note in errors which file they are about, if it has a name."""
+    try:
+        yield
+    except CsplatError as error:
+        if error.path is None and isinstance(file, (str, os.PathLike)):
+            error.path = "standard input" if file == STANDARD_STREAM else os.fspath(file)
+        raise
 
 
 @contextmanager
@@ -221,7 +237,7 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
     is_path = path != STANDARD_STREAM
     data = mapped(path) if is_path else sys.stdin.buffer.read()
     try:
-        with _naming(path):
+        with naming(path):
             _refuse_others(path if is_path else "standard input", data[:HEAD_SIZE])
             yield data
     finally:
@@ -317,17 +333,6 @@ def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None
 def is_one_way(path: str) -> bool:
     """Whether what is written there cannot be taken back: standard output, a device, a named pipe."""
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
-
-
-@contextmanager
-def _naming(file: File) -> Iterator[None]:
-    """Note in errors which file they are about, if it has a name."""
-    try:
-        yield
-    except CsplatError as error:
-        if error.path is None and isinstance(file, (str, os.PathLike)):
-            error.path = "standard input" if file == STANDARD_STREAM else os.fspath(file)
-        raise
 
 
 def _refuse_others(name: str, data: bytes) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import scene as scenes
+from csplat.decoder import StatedErrors, open_tiles
 from csplat.model import SplatModel
-from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs
+from csplat.scene import Scene
+from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs, prove_by_disk
+from csplat_conformance.stated.pairs import merged
 from csplat_tools.files.console import Progress, finite
-from csplat_tools.files.scenes import LoadedModel
+from csplat_tools.files.scenes import LoadedModel, OpenedScene
+from csplat_tools.files.streams import is_csplat
 
-__all__ = ["AttributeErrors", "attribute_errors"]
+__all__ = ["AttributeErrors", "attribute_errors", "attribute_errors_by_disk"]
 
 Pairing = Literal["index", "order", "search"]
 
@@ -88,6 +94,46 @@ def attribute_errors(
         return None
     errors = _errors(ours, theirs.select(matched), found[matched])
     return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
+
+
+def attribute_errors_by_disk(
+    source: OpenedScene,
+    other: OpenedScene,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> AttributeErrors | None:
+    """As `attribute_errors`, of scenes not in memory: nothing is searched for; an index is used of .csplat files."""
+    if source_index is not None:
+        if not is_csplat(other.path):
+            return None
+        # All is measured of a file that states nothing, and may do so.
+        nothing = StatedErrors(source.count, 0, source.facts.sh_degree, refitted=True, records=())
+        opened = replace(open_tiles(other.path), stated_errors=nothing)
+        proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
+        found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
+        return AttributeErrors("index", other.count, 0, found)
+    if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
+        return None
+    parts = [
+        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
+        for start, ours, theirs in _beside(source.scene, other.scene, progress)
+    ]
+    found = {name: (one.max, one.rms) for name, one in merged(parts).items()}
+    return AttributeErrors("order", other.count, 0, found)
+
+
+def _beside(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+    """Splats of two scenes of as many, some at a time, and the number of the first of them."""
+    first = scenes.watched(a, "measuring splats", progress or (lambda _stage, _share: None)).blocks()
+    second = scenes.watched(b, "", lambda _stage, _share: None).blocks()
+    start, ours, theirs = 0, a.facts, b.facts
+    while start < a.count:
+        ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
+        count = min(len(ours), len(theirs))
+        if count:
+            yield start, ours.select(slice(0, count)), theirs.select(slice(0, count))
+        ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
 
 
 def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,15 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.files import check_room
+from csplat.model import SplatModel
 from csplat_render import Mode
+from csplat_render.camera import Camera
 from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
-from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
-from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors
+from csplat_tools.files.scenes import LoadedModel, OpenedScene, SceneLike, opened_scenes
+from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors, attribute_errors_by_disk
 from csplat_tools.views import Colour, ViewSet, find_view_set
+from csplat_tools.views.sliced import Sliced
 
 __all__ = ["USUAL_WEIGHTS", "Comparison", "compare"]
 
@@ -29,15 +35,18 @@ F32 = NDArray[np.float32]
 #: Instead of a file of LPIPS weights: look for them where they usually are.
 USUAL_WEIGHTS = "auto"
 
+_PIXEL_BYTES = 13  # of a picture of the source, which is kept
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """What was found out about two scenes.
 
     Attributes:
-        a: the source.
-        b: what became of it.
-        attributes: errors of its splats; `None` where it cannot be found out which splat is which.
+        a: the source; opened alone where both do not fit the memory together.
+        b: what became of it; likewise.
+        attributes: errors of its splats; `None` where it cannot be found out which splat is which, as mostly without
+            a source index where they are not in memory.
         quality: what pictures say.
         ignored: splats of A that were not drawn because they hold NaN or infinities.
         cameras: where they were taken from: the name of a camera file or of a data set, or `virtual`.
@@ -48,8 +57,8 @@ class Comparison:
         seconds: reading what was not in memory, matching, rendering and writing.
     """
 
-    a: LoadedModel
-    b: LoadedModel
+    a: LoadedModel | OpenedScene
+    b: LoadedModel | OpenedScene
     attributes: AttributeErrors | None
     quality: Scores
     ignored: int
@@ -90,8 +99,8 @@ class Comparison:
 
 
 def compare(
-    a: SceneLike,
-    b: SceneLike,
+    a: SceneLike | OpenedScene,
+    b: SceneLike | OpenedScene,
     *,
     views: ViewSet | None = None,
     source_index: NDArray[np.integer[Any]] | None = None,
@@ -101,6 +110,7 @@ def compare(
     background: Colour | None = None,
     mode: Mode = "standard",
     force: bool = False,
+    memory_bytes: int | None = None,
     prepare: Callable[[], object] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Comparison:
@@ -118,6 +128,8 @@ def compare(
         background: red, green, blue, 0..1; if left out that of the views.
         mode: of the renderer.
         force: existing pictures may be replaced.
+        memory_bytes: what may be taken, about; by way of the disk, if that is too little for both files. `None`: half
+            of what is free. Photographs come to it.
         prepare: is called when all that is named has been read and checked, before the first picture.
         progress: is told the stage and the share of it that is done, 0 to 1.
 
@@ -128,7 +140,8 @@ def compare(
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
-        CsplatError: a file is not valid, or exists; or no view judges; or the renderer is not installed.
+        CsplatError: a file is not valid, or exists; or no view judges; or the renderer is not installed; or the disk
+            has no room for the splats of a scene that does not fit the memory.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
@@ -136,27 +149,56 @@ def compare(
     if pictures is not None:
         need_pictures()
     distance = None if lpips is None else load_lpips(None if lpips == USUAL_WEIGHTS else lpips)
-    source, other = load_model(a), load_model(b)
-    views = views or find_view_set(source.model, background=background, count=0)
-    if not views.judges:
-        raise InputError(f"{views.name} has no {views.split} pictures")
-    by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
-    viewers: list[OnView] = []
-    if pictures is not None:
-        names = picture_names([camera.image for camera in views.judges])
-        viewers.append(_Sheets(os.fspath(pictures), names, by_photographs, amplification, force=force))
-    errors = attribute_errors(source, other, source_index, progress=progress)
-    if prepare is not None:
-        prepare()
-    judges = None if by_photographs is None else _Both(by_photographs, distance)
-    viewers += [] if judges is None else [judges]
-    judge = views.judge(source.model, mode=mode, background=background, progress=progress)
-    quality = judge.scores(other.model, lpips=distance, on_view=_all_of(viewers), progress=progress)
-    return Comparison(
-        source, other, errors, quality, judge.look(0).ignored, views.name,
-        None if judges is None else {"split": views.split, **judges.as_json()},
-        views.background, mode, views.notes, time.perf_counter() - start,
-    )  # fmt: skip
+    with opened_scenes((a, b), memory_bytes) as (source, other):
+        views = views or _views(source, background, progress)
+        if not views.judges:
+            raise InputError(f"{views.name} has no {views.split} pictures")
+        by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
+        viewers: list[OnView] = []
+        if pictures is not None:
+            names = picture_names([camera.image for camera in views.judges])
+            viewers.append(_Sheets(os.fspath(pictures), names, by_photographs, amplification, force=force))
+        first, second, errors = _measured(source, other, views.judges, source_index, progress)
+        if prepare is not None:
+            prepare()
+        judges = None if by_photographs is None else _Both(by_photographs, distance)
+        viewers += [] if judges is None else [judges]
+        judge = views.judge(first, mode=mode, background=background, progress=progress)
+        quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+        return Comparison(
+            source, other, errors, quality, judge.look(0).ignored, views.name,
+            None if judges is None else {"split": views.split, **judges.as_json()},
+            views.background, mode, views.notes, time.perf_counter() - start,
+        )  # fmt: skip
+
+
+def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
+    model, every = (source.model, 1) if isinstance(source, LoadedModel) else source.sample(progress)
+    return find_view_set(model, background=background, count=0, every=every)
+
+
+def _measured(
+    source: LoadedModel | OpenedScene,
+    other: LoadedModel | OpenedScene,
+    cameras: Sequence[Camera],
+    source_index: NDArray[np.integer[Any]] | None,
+    progress: Progress | None,
+) -> tuple[SplatModel | Sliced, SplatModel | Sliced, AttributeErrors | None]:
+    """What draws either scene, and the errors of its splats."""
+    if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
+        return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
+    assert isinstance(source, OpenedScene), "both are in memory, or none"
+    assert isinstance(other, OpenedScene), "likewise"
+    kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
+    first, second = (
+        Sliced(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
+    )
+    check_room(
+        tempfile.gettempdir(),
+        max(first.disk_bytes, second.disk_bytes),
+        "pictures are drawn: TMPDIR names another folder",
+    )
+    return first, second, attribute_errors_by_disk(source, other, source_index, progress=progress)
 
 
 class _Both:

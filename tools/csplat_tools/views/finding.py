@@ -57,9 +57,9 @@ class DataOptions:
     near: float | None = None
 
 
-def comparison_cameras(source: SplatModel) -> list[Camera]:
-    """The cameras of `psnr`: virtual ones, chosen from the source alone."""
-    return virtual_cameras(source, *_JUDGING, seed=0)
+def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
+    """The cameras of `psnr`: virtual ones, chosen from the source alone, or from every so-manieth of its splats."""
+    return virtual_cameras(source, *_JUDGING, seed=0, every=every)
 
 
 def find_view_set(
@@ -73,6 +73,7 @@ def find_view_set(
     seed: int = 0,
     aside: int | None = None,
     split: Split = "test",
+    every: int = 1,
 ) -> ViewSet:
     """Read or place views, and give each its role; see the table above.
 
@@ -86,6 +87,8 @@ def find_view_set(
         size, seed: of virtual views.
         aside: how many views decide; `None`: as many as the table says.
         split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
+        every: how many splats of the scene each of the source's stands for, where it is a part of them: for views that
+            judge.
 
     Raises:
         InputError: both are given, or one cannot be read, or has not as many views.
@@ -98,10 +101,14 @@ def find_view_set(
     if data is not None:
         return _of_data(source, data, background, aside, split)
     if cameras is None:
-        judges = comparison_cameras(source)
+        judges = comparison_cameras(source, every)
         judging = {pose(camera) for camera in judges}  # of a scene without splats all are alike
         teaches, decides = (_without(judging, part) for part in _virtual(source, count, size, seed, aside))
-        return ViewSet(VIRTUAL, background or BLACK, teaches, decides, judges, virtual=True, origin=source.origin)
+        notes = (
+            () if every < 2 else (f"the scene is not in memory: one in {every} of its splats says where views stand",)
+        )
+        colour = background or BLACK
+        return ViewSet(VIRTUAL, colour, teaches, decides, judges, virtual=True, origin=source.origin, notes=notes)
     return _of_file(source, cameras, background, (count, size, seed), aside)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_render import Camera, Mode
-from csplat_render.judge import Judge
+from csplat_render.judge import Drawable, Judge
 
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
@@ -78,7 +78,7 @@ class ViewSet:
 
     def judge(
         self,
-        source: SplatModel,
+        source: SplatModel | Drawable,
         *,
         background: Colour | None = None,
         mode: Mode = "standard",

@@ -1,0 +1,247 @@
+"""Scenes that are drawn and compared without being in memory: what comes out is what memory gives."""
+
+import json
+import tempfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+import csplat_tools
+from csplat import EncodeOptions, files, write_ply
+from csplat.encoder import encode_with_report
+from csplat.errors import InputError
+from csplat.scene import scene_of
+from csplat_render.cameras import intrinsics, look_at
+from csplat_render.judge import renderer
+from csplat_tools.cli.app import app
+from csplat_tools.files import scenes
+from csplat_tools.files.scenes import LoadedModel, OpenedScene, opened_scenes
+from csplat_tools.views import comparison_cameras, sliced
+from csplat_tools.views.sliced import Sliced, slice_limits
+
+UP = (0.0, -1.0, 0.0)
+BEHIND = (0.3, 0.6, 0.1)
+LITTLE = 1  # byte of memory
+
+
+@pytest.fixture(autouse=True)
+def small_slices(monkeypatch):
+    """So that small scenes have many: 100 splats of SH degree 1, more or less."""
+    monkeypatch.setattr(sliced, "_LEAST_BYTES", 60_000)
+    monkeypatch.setattr("csplat.scene.BLOCK", 300)
+
+
+@pytest.fixture
+def model(make_model):
+    cloud = make_model(1500, 1)
+    return replace(cloud, scales=cloud.scales * np.float32(0.3) - np.float32(1.5))
+
+
+@pytest.fixture
+def view():
+    return look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), UP, intrinsics(70, 53, 60.0), 70, 53)
+
+
+@pytest.fixture
+def camera_file(view, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([view.to_json()]))
+    return str(path)
+
+
+@pytest.fixture
+def files_of_both(model, tmp_path):
+    """A PLY, what became of it, and which splat is which."""
+    result = encode_with_report(model, EncodeOptions(preset="fast"))
+    source, made, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
+    write_ply(source, model)
+    made.write_bytes(result.data)
+    np.save(index, result.source_index)
+    return str(source), str(made), str(index)
+
+
+def by_disk(model, every=1):
+    scene = scene_of(model)
+    return Sliced(scene, model.select(slice(None, None, every)), every, LITTLE)
+
+
+def slices_of(monkeypatch):
+    """How many splats each slice has that will be drawn."""
+    counts, draw = [], sliced._Picture._draw
+
+    def noted(picture, splats):
+        counts.append(len(splats.means))
+        draw(picture, splats)
+
+    monkeypatch.setattr(sliced._Picture, "_draw", noted)
+    return counts
+
+
+def assert_same_picture(model, view, every=1, mode="standard"):
+    wanted = renderer(model, BEHIND, mode=mode)(view)
+    found = renderer(by_disk(model, every), BEHIND, mode=mode)(view)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
+    assert wanted.ignored == found.ignored
+
+
+# pictures
+
+
+@pytest.mark.parametrize("mode", ["standard", "fast"])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_pictures_are_those_of_memory_to_the_bit(model, view, monkeypatch, mode, antialiased):
+    counts = slices_of(monkeypatch)
+    assert_same_picture(replace(model, antialiased=antialiased), view, mode=mode)
+    assert len(counts) > 5
+    assert max(counts) < 300
+
+
+def test_a_sample_that_knows_little_changes_no_bit(model, view, monkeypatch):
+    counts = slices_of(monkeypatch)
+    assert_same_picture(model, view, every=700)
+    assert max(counts) < 300
+
+
+@pytest.mark.parametrize("crowd", [1500, 900])
+def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, monkeypatch):
+    means = model.means.copy()
+    means[:crowd, 2] = 0.25
+    counts = slices_of(monkeypatch)
+    assert_same_picture(replace(model, means=means), view)
+    assert max(counts) < 300
+
+
+def test_what_lies_behind_finished_pixels_is_not_drawn(model, view, monkeypatch):
+    counts = slices_of(monkeypatch)
+    wall = np.arange(len(model)) < 20
+    means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
+    means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
+    assert_same_picture(replace(model, means=means, scales=scales, opacities=opacities), view)
+    assert sum(counts) < 600
+
+
+def test_a_scene_that_shows_nothing_is_the_background(model, view):
+    assert_same_picture(replace(model, means=model.means + np.float32([0, 0, -90])), view)
+    assert_same_picture(model.select(slice(0, 0)), view)
+
+
+def test_mode_exact_is_refused(model, view):
+    with pytest.raises(InputError, match="exact"):
+        renderer(by_disk(model), BEHIND, mode="exact")(view)
+
+
+def test_limits_cut_alike_and_keep_what_is_of_one_depth_together():
+    near = np.array([0, 5, 1, 2, 4, 3], np.float32)
+    taken = np.where(near > 0, 10.0, 0.0)
+    assert [] == slice_limits(near, taken, 1).tolist()
+    assert [] == slice_limits(0 * near, 0 * taken, 9).tolist()
+    assert [2.0, 4.0] == slice_limits(near, taken, 3).tolist()
+    same = np.float32(2.0)
+    assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
+
+
+# scenes
+
+
+def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
+    with opened_scenes(files_of_both[:2]) as loaded, opened_scenes(files_of_both[:2], LITTLE) as opened:
+        assert {LoadedModel} == {type(one) for one in loaded}
+        assert {OpenedScene} == {type(one) for one in opened}
+        assert [one.as_json() for one in loaded] == [one.as_json() for one in opened]
+        with opened_scenes(opened) as again:
+            assert opened == again
+        with opened_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
+            assert {LoadedModel} == {type(one) for one in both}
+
+
+def test_a_sample_has_every_so_manieth_splat(files_of_both, model, monkeypatch):
+    monkeypatch.setattr(scenes, "_SAMPLE", 220)
+    with opened_scenes(files_of_both[:2], LITTLE) as (source, _):
+        found, every = source.sample()
+    assert 7 == every
+    np.testing.assert_array_equal(model.means[::7], found.means)
+    assert 0 == found.sh_degree
+
+
+def test_views_placed_by_a_sample_stand_about_where_the_scene_puts_them(sample_path):
+    whole = csplat_tools.load_model(sample_path).model
+    part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
+    for wanted, found in zip(comparison_cameras(whole), part, strict=True):
+        distance = np.linalg.norm(wanted.position)
+        assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
+
+
+# comparisons
+
+
+def test_comparing_finds_what_memory_finds(files_of_both, camera_file, tmp_path):
+    source, made, index = files_of_both
+    words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
+    found = []
+    for more in ([], ["--memory", "1kB"]):
+        result = CliRunner().invoke(app, [*words, "--pictures", str(tmp_path / f"shown{len(more)}"), *more])
+        assert 0 == result.exit_code, result.stderr
+        found.append(json.loads(result.stdout))
+        assert ("by way of the disk" in result.stderr) == bool(more)
+        del found[-1]["seconds"]
+    errors, others = (one["attributes"].pop("errors") for one in found)
+    assert found[0] == found[1]
+    assert errors.keys() == others.keys()
+    for name, one in errors.items():
+        assert one == pytest.approx(others[name], rel=1e-12)
+    shown, also = (sorted((tmp_path / f"shown{n}").iterdir()) for n in (0, 2))
+    assert [one.read_bytes() for one in shown] == [one.read_bytes() for one in also]
+
+
+def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
+    source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
+    write_ply(source, model)
+    write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
+    views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
+    wanted, found = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
+    assert wanted.quality == found.quality
+    assert "order" == found.attributes.pairing
+    assert wanted.attributes.errors == {
+        name: pytest.approx(one, rel=1e-12) for name, one in found.attributes.errors.items()
+    }
+
+
+def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camera_file):
+    source, made, _ = files_of_both
+    result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file, "--memory", "1kB"])
+    assert 0 == result.exit_code
+    assert "errors of the splats are not known" in result.stdout
+
+
+def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both):
+    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--memory", "1kB", "--mode", "exact"])
+    assert 1 == result.exit_code
+    assert ["error: --mode exact wants both scenes in memory, and they do not fit: take standard (E_INPUT)"] == [
+        line for line in result.stderr.splitlines() if "exact" in line
+    ]
+
+
+def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, monkeypatch):
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(InputError, match="TMPDIR"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+
+
+def test_nothing_is_left_where_drawing_ends_early(model, view, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sliced._Picture, "_read", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        renderer(by_disk(model), BEHIND)(view)
+    assert [] == list(Path(tmp_path).iterdir())
+    assert {"scene", "sample", "every", "memory_bytes", "progress"} == {one.name for one in fields(Sliced)}
