@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ STAGE = "matching splats"
 
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats at a time
-_PAIR_BLOCK = 4096  # pairs whose SH is compared at a time
+_FIRST = frozenset(("means", "opacities", "sh0"))  # are compared first
+_PAIR_BLOCK = 4096  # pairs that are compared at a time
 _CANDIDATES_MAX = 1000  # of one cell: scenes of equals would take for ever
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
@@ -181,19 +182,14 @@ def _within(
     source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
     """Which pairs lie within the bounds; SH and covariance are looked at only where the rest does."""
-    near = np.abs(decoded.opacities[decoded_rows].astype(np.float64) - source.opacities[source_rows])
-    good = near <= bounds["opacities"]
-    moved = decoded.means[decoded_rows].astype(np.float64) - source.means[source_rows]
-    good &= np.einsum("ij,ij->i", moved, moved) <= bounds["means"] * bounds["means"] * (1.0 + 1e-12)
-    colour = np.abs(decoded.sh0[decoded_rows].astype(np.float64) - source.sh0[source_rows]).max(axis=1)
-    good &= colour <= bounds["sh0"]
-    pairs = np.flatnonzero(good)
-    for start in range(0, len(pairs), _PAIR_BLOCK):
-        part = pairs[start : start + _PAIR_BLOCK]
-        errors = differences(source, decoded, source_rows[part], decoded_rows[part])
-        for name, bound in bounds.items():
-            if name in errors:
-                good[part] &= np.abs(errors[name]).max(axis=1) <= bound
+    good = np.ones(len(source_rows), bool)
+    for names in (_FIRST, bounds.keys() - _FIRST):
+        pairs = np.flatnonzero(good)
+        for start in range(0, len(pairs), _PAIR_BLOCK):
+            part = pairs[start : start + _PAIR_BLOCK]
+            errors = differences(source, decoded, source_rows[part], decoded_rows[part], names)
+            for name, values in errors.items():
+                good[part] &= reduce(np.maximum, np.abs(values).T) <= bounds[name]
     return good
 
 
