@@ -52,6 +52,7 @@ def match(
     bounds: Mapping[str, float],
     radii: F64,
     *,
+    far: bool = True,
     reach: float | None = None,
     candidates_max: int = _CANDIDATES_MAX,
     threads: int | None = None,
@@ -64,7 +65,8 @@ def match(
         decoded: N splats; its origin may be another one.
         bounds: largest error by measure, to which comes what SER-7 allows. `means` is among them; measures that are
             not named are not looked at.
-        radii: [N], how near the partner's centre is expected; where there is none, the search goes on up to the bound.
+        radii: [N], how near the partner's centre is expected.
+        far: where there is none, the search goes on up to the bound.
         reach: of all of the scene, as `Source.reach` has it, where the splats are a part of it.
         candidates_max: how many splats of one cell are looked at for one partner.
         threads: how many to use, one per core by default. The result does not depend on it.
@@ -82,7 +84,7 @@ def match(
     bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
     bound = bounds["means"]
     levels = _levels(radii, bound)
-    for radius in [*np.unique(levels[levels < bound]), bound]:
+    for radius in np.unique(np.append(levels, bound) if far else levels):
         rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
         if not len(rows):
             continue

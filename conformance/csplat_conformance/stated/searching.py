@@ -75,9 +75,8 @@ class Search:
             columns = source.about(self.opened.facts.origin).means.T
             low, high = (np.array([end(column) for column in columns], np.float64) for end in (np.min, np.max))
             for model, radii, splats in self._near(low, high, found, far=far):
-                partners = match(
-                    source, model, self.bounds, radii, reach=self.reach, threads=1 if self.workers > 1 else None
-                )
+                threads = 1 if self.workers > 1 else None
+                partners = match(source, model, self.bounds, radii, far=far, reach=self.reach, threads=threads)
                 yield splats, np.where(partners >= 0, FOUND, partners).astype(np.int8)
 
     def _near(self, low: F64, high: F64, found: I8, *, far: bool) -> Iterator[tuple[SplatModel, F64, I64]]:
