@@ -1,7 +1,10 @@
 """Proofs of stated errors by way of the disk: what they find in parts is what is found in memory."""
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
 import tempfile
 from collections import namedtuple
 from dataclasses import replace
@@ -14,6 +17,7 @@ from csplat.decoder import decode, open_tiles
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
 from csplat.ply import write_ply
+from csplat.processes import CAN_COPY
 from csplat.scene import scene_of
 from csplat_conformance.stated import Source, by_disk, check_source_index, prove, prove_by_disk
 from csplat_conformance.stated.cells import Cells
@@ -98,6 +102,32 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
         at_once, in_parts = both(moved, result.data, states(stated, means={"max": most}))
         assert at_once == in_parts
         assert bool(at_once["failures"]) == (most < 0.07)
+
+
+@pytest.mark.skipif(not CAN_COPY, reason="processes are no copies of each other here")
+def test_processes_find_what_one_finds(make_model, monkeypatch):
+    source = make_model(1500, 1)
+    opened = open_tiles(encode_with_report(source, OPTIONS).data)
+    far = np.where(np.arange(1500) % 50, np.float32(0.04), np.float32(0.5))
+    moved = replace(source, means=source.means + far[:, None])
+    opened = replace(opened, stated_errors=states(opened.stated_errors, means={"max": 0.07}))
+    alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1)
+    assert alone.failures
+    monkeypatch.setattr(by_disk, "_SHARE", 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    memory, seen = by_disk._BASE_BYTES + 3 * (by_disk._WORKER_BYTES + 10**6), []
+
+    def count(_stage, _done):
+        seen.append(len(multiprocessing.active_children()))
+
+    def kill(_stage, _done):
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, signal.SIGKILL)
+
+    assert alone == prove_by_disk(scene_of(moved), opened, memory_bytes=memory, progress=count)
+    assert max(seen) == 3
+    with pytest.raises(OSError, match="a worker process was killed"):
+        prove_by_disk(scene_of(moved), opened, memory_bytes=memory, progress=kill)
 
 
 def test_another_scene_is_told_before_any_splat(make_model):

@@ -34,6 +34,7 @@ def small_slices(monkeypatch):
     """So that small scenes have many: 100 splats of SH degree 1, more or less."""
     monkeypatch.setattr(sliced, "_LEAST_BYTES", 60_000)
     monkeypatch.setattr("csplat.scene.BLOCK", 300)
+    monkeypatch.setattr(Sliced, "least_bytes", -(10**12))
 
 
 @pytest.fixture
@@ -231,6 +232,12 @@ def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, mo
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match="TMPDIR"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+
+
+def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
+    monkeypatch.setattr(Sliced, "least_bytes", 450_000_000)
+    with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which want 482$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 

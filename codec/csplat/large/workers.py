@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import multiprocessing
-import signal
-import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from csplat.errors import missing
 from csplat.large.coding import Bucket, Coding, code_bucket
+from csplat.processes import each_apart
 
 __all__ = ["code_here", "code_on_cluster"]
-
-_shared: dict[str, Any] = {}  # of a worker process: what all of its buckets share
 
 
 def code_here(folder: Path, buckets: Sequence[Bucket], coding: Coding, workers: int) -> Iterator[Bucket]:
@@ -34,31 +27,13 @@ def code_here(folder: Path, buckets: Sequence[Bucket], coding: Coding, workers: 
         CsplatError: as of `code_bucket`.
         OSError: likewise; or a process was killed.
     """
-    if workers == 1 or len(buckets) < 2:
-        for bucket in buckets:
-            code_bucket(folder, bucket, coding)
-            yield bucket
-        return
-    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-    pool = ProcessPoolExecutor(workers, context, _begin, (folder, coding))
-    try:
-        futures = {pool.submit(_code, bucket): bucket for bucket in buckets}
-        for future in as_completed(futures):
-            future.result()
-            yield futures[future]
-    except BrokenProcessPool:
-        raise OSError(errno.ENOMEM, "a worker process was killed, perhaps for want of memory", str(folder)) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
+    for bucket, _ in each_apart(_code, (folder, coding), buckets, workers):
+        yield bucket
 
 
-def _begin(folder: Path, coding: Coding) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and says what to do
-    _shared.update(folder=folder, coding=coding)
-
-
-def _code(bucket: Bucket) -> None:
-    code_bucket(_shared["folder"], bucket, _shared["coding"])
+def _code(shared: tuple[Path, Coding], bucket: Bucket) -> None:
+    folder, coding = shared
+    code_bucket(folder, bucket, coding)
 
 
 def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: Coding, address: str) -> Iterator[Bucket]:

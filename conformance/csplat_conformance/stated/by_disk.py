@@ -8,27 +8,27 @@ the tiles that they became.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from mmap import mmap
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat import _spec
 from csplat.decoder import Opened
 from csplat.inputs import LetGo
 from csplat.memory import default_bytes
 from csplat.model import SplatModel
+from csplat.processes import CAN_COPY
 from csplat.scene import Scene, joined
-from csplat_conformance.room import room
 from csplat_conformance.stated.cells import Cells
-from csplat_conformance.stated.matching import STAGE, UNMATCHED, Progress, match, tile_radii
+from csplat_conformance.stated.matching import STAGE, UNMATCHED, Progress
 from csplat_conformance.stated.pairs import check_source_index, measure_names, measure_pairs, merged, wrong_extras
 from csplat_conformance.stated.proof import Pairs, farthest, nearest, prove_by, tile_of
+from csplat_conformance.stated.searching import Search
 from csplat_conformance.stated.source import Source
 from csplat_conformance.stated.spool import Rows, Spool, opened_spool
 from csplat_conformance.stated.verdict import Proof, Worst
@@ -38,11 +38,12 @@ __all__ = ["fits_memory", "prove_by_disk"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_FOUND = 0
 _FOLDS = 2.2  # of the arrays of both scenes: what comparing them in memory takes
 _SPLAT_BYTES = 80  # of the source, beside its arrays: keys, order, centres in doubles
 _PART_FOLDS = 5  # of a part's arrays: records, source, tiles and their selection
 _BASE_BYTES = 200_000_000  # program, tiles that are being decoded, splats that wait for being written
+_WORKER_BYTES = 50_000_000  # of a process beside its part
+_SHARE = 1 << 18  # splats of a part, so that a process is worth it: at the rims of parts work is done twice
 _PART = (1 << 14, 1 << 20)  # splats that are compared at a time: more are hardly faster, for caches are small
 _INDEX_BLOCK = 1 << 20  # numbers of a source index
 
@@ -104,7 +105,6 @@ class _ByDisk:
     memory_bytes: int | None
     progress: Progress | None
     _spool: Spool | None = field(default=None, init=False)
-    _rows: Rows | None = field(default=None, init=False)
     _reach: float = field(default=0.0, init=False)
 
     def close(self) -> None:
@@ -128,11 +128,27 @@ class _ByDisk:
         return self.scene.facts.sh_degree
 
     @property
+    def _memory(self) -> int:
+        """Of the bound, what parts may take."""
+        return (default_bytes() if self.memory_bytes is None else self.memory_bytes) - _BASE_BYTES
+
+    @property
     def _most(self) -> int:
         """Splats of a part."""
-        memory = default_bytes() if self.memory_bytes is None else self.memory_bytes
-        some = (memory - _BASE_BYTES) // (_PART_FOLDS * (_splat_bytes(self.opened) + _SPLAT_BYTES))
-        return max(_PART[0], min(_PART[1], some))
+        return max(_PART[0], min(_PART[1], self._memory // self._row_bytes))
+
+    @property
+    def _row_bytes(self) -> int:
+        return _PART_FOLDS * (_splat_bytes(self.opened) + _SPLAT_BYTES)
+
+    @property
+    def _shares(self) -> tuple[int, int]:
+        """Processes, and splats of the part that each has: as many as have parts that are large enough."""
+        for workers in range(os.cpu_count() or 1, 1, -1):
+            most = (self._memory // workers - _WORKER_BYTES) // self._row_bytes
+            if CAN_COPY and most >= _SHARE:
+                return workers, min(most, _PART[1])
+        return 1, self._most
 
     def _tell(self, stage: str, done: float) -> None:
         if self.progress is not None:
@@ -149,17 +165,17 @@ class _ByDisk:
             start += len(model)
 
     def _add(self, block: Source, rows: NDArray[Any], keys: I64, numbers: I64, names: tuple[str, ...] = ()) -> None:
-        if self._spool is None or self._rows is None:
-            self._rows = Rows.of(block, names)
-            self._spool = opened_spool(self._rows.dtype, self.scene.count)
-        self._spool.add(keys, self._rows.packed(block, rows, numbers))
+        if self._spool is None:
+            self._spool = opened_spool(Rows.of(block, names), self.scene.count)
+        self._spool.add(block, rows, keys, numbers)
 
     # Without a source index ------------------------------------------------------------------------
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
         """As of `Way`: [N] int8."""
         header, origin = self.opened.header, self.opened.facts.origin
-        cells = Cells.of(header, self.scene.count, self._most)
+        workers, most = self._shares
+        cells = Cells.of(header, self.scene.count, most)
         for start, block in self._sources():
             everything = np.arange(len(block))
             self._add(block, everything, cells.place(block.about(origin).means), start + everything)
@@ -167,74 +183,16 @@ class _ByDisk:
         if self._spool is None:
             return found
         self._spool.flush()
+        search = Search(self.opened, self._spool, bounds, self._reach, most, workers)
         done, everywhere = 0, 2 * self.scene.count
         for far in (False, True):
             if far and not (found == UNMATCHED).any():
                 break
-            for source, _ in self._parts():
+            for count in search.search(found, far=far):
+                done += count
                 self._tell(STAGE, done / everywhere)
-                done += len(source)
-                self._match(source, bounds, found, far=far)
         self._tell(STAGE, 1.0)
         return found
-
-    def _parts(self) -> Iterator[tuple[Source, I64]]:
-        """The source a part at a time: those of a cell, and their numbers."""
-        assert self._spool is not None, "the source is sorted"
-        assert self._rows is not None, "likewise"
-        for key in self._spool.counts():
-            for records in self._spool.read(key, self._most):
-                yield self._rows.source(records), records["number"].copy()
-
-    def _match(self, source: Source, bounds: Mapping[str, float], found: NDArray[np.int8], *, far: bool) -> None:
-        """Match a part of the source with the splats of the file that may have a partner in it."""
-        columns = source.about(self.opened.facts.origin).means.T
-        low, high = (np.array([end(column) for column in columns], np.float64) for end in (np.min, np.max))
-        most = (bounds["means"] + room("means", bounds["means"], self._reach)) * (1.0 + 1e-6)
-        for model, radii, splats in self._near(low, high, most, found, far=far):
-            partners = match(source, model, bounds, radii, reach=self._reach)
-            found[splats] = np.where(partners >= 0, _FOUND, partners)
-
-    def _near(
-        self, low: F64, high: F64, most: float, found: NDArray[np.int8], *, far: bool
-    ) -> Iterator[tuple[SplatModel, F64, I64]]:
-        """Splats without a partner that may lie within their radius of a box, some at a time; radii and numbers."""
-        header, (boxes, widths) = self.opened.header, self._boxes
-        margins = np.full(len(widths), most)[:, None] if far else np.minimum(widths, most)[:, None]
-        touching = ((boxes[:, 0] - margins <= high) & (boxes[:, 1] + margins >= low)).all(axis=1)
-        chosen = [tile for tile in np.flatnonzero(touching).tolist() if (found[self._splats(tile)] == UNMATCHED).any()]
-        models, radii, splats, count = [], [], [], 0
-        for tile, model in zip(chosen, self.opened.models(chosen), strict=True):
-            own = tile_radii(model.means, header, header.tiles[tile])
-            margin = most if far else np.minimum(own, most)
-            rows = self._splats(tile)
-            inside = found[rows] == UNMATCHED
-            for axis in range(3):
-                column = model.means[:, axis]
-                inside &= (column >= low[axis] - margin) & (column <= high[axis] + margin)
-            if not inside.any():
-                continue
-            models.append(model.select(inside))
-            radii.append(own[inside])
-            splats.append(rows.start + np.flatnonzero(inside))
-            count += len(models[-1])
-            if count >= self._most:
-                yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
-                models, radii, splats, count = [], [], [], 0
-        if models:
-            yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
-
-    @cached_property
-    def _boxes(self) -> tuple[F64, F64]:
-        """Boxes of the tiles, [T, 2, 3], and how near the partners of their splats are expected at most, [T]."""
-        tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = np.array([tile.corners(step) for tile in tiles]).reshape(-1, 2, 3)
-        # A centre was rounded to float32; a radius is a cell's, and as much again for that.
-        return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
-
-    def _splats(self, tile: int) -> slice:
-        record = self.opened.header.tiles[tile]
-        return slice(record.start, record.start + record.splat_count)
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
         """As of `Way`: what is near is gathered from all parts, and compared as in memory."""
@@ -243,11 +201,12 @@ class _ByDisk:
         header = self.opened.header
         decoded = self._picked(rows)
         sources, numbers = [], []
-        for source, known in self._parts():
-            means = source.about(self.opened.facts.origin).means.astype(np.float64)
-            near = np.unique(np.concatenate([nearest(means, point) for point in decoded.means]))
-            sources.append(source.some(near))
-            numbers.append(known[near])
+        for cell in self._spool.counts():
+            for source, known in self._spool.sources(cell, self._most):
+                means = source.about(self.opened.facts.origin).means.astype(np.float64)
+                near = np.unique(np.concatenate([nearest(means, point) for point in decoded.means]))
+                sources.append(source.some(near))
+                numbers.append(known[near])
         order = np.argsort(np.concatenate(numbers))
         number = np.concatenate(numbers)[order]
         some = Source.joined(sources).some(order)
@@ -264,10 +223,11 @@ class _ByDisk:
 
     def _picked(self, rows: I64) -> SplatModel:
         """Some splats of the file, by their numbers in order."""
-        tiles = np.array([tile_of(self.opened.header, row) for row in rows.tolist()])
+        header = self.opened.header
+        tiles = np.array([tile_of(header, row) for row in rows.tolist()])
         chosen = np.unique(tiles)
         models = [
-            model.select(rows[tiles == tile] - self._splats(tile).start)
+            model.select(rows[tiles == tile] - header.tiles[tile].start)
             for tile, model in zip(chosen.tolist(), self.opened.models(chosen.tolist()), strict=True)
         ]
         return joined(models[0], models)
@@ -279,7 +239,7 @@ class _ByDisk:
         count = self.opened.header.splat_count
         check_source_index(source_index, self.scene.count, count)
         groups = self._groups()
-        firsts = np.array([self._splats(group[0]).start for group in groups], np.int64)
+        firsts = np.array([self.opened.header.tiles[group[0]].start for group in groups], np.int64)
         became = _inverse(source_index, self.scene.count)
         names = tuple(name for name in self.opened.facts.extra if name in self.scene.facts.extra)
         for start, block in self._sources():
@@ -288,7 +248,7 @@ class _ByDisk:
             keys = np.searchsorted(firsts, splats[kept], "right") - 1
             self._add(block, kept, keys, splats[kept], names)
         del became
-        if self._spool is None or self._rows is None:
+        if self._spool is None:
             empty = Source.of(self.scene.facts)
             return Pairs(measure_pairs(empty, self.opened.facts, np.empty(0, np.int64)), [], self._reach)
         self._spool.flush()
@@ -297,9 +257,8 @@ class _ByDisk:
             self._tell("measuring splats", int(firsts[key]) / count)
             models = list(self.opened.models(group))
             decoded = joined(models[0], models)
-            (records,) = self._spool.read(key, len(decoded))
-            places = np.argsort(records["number"])
-            source = self._rows.source(records)
+            ((source, numbers),) = self._spool.sources(key, len(decoded))
+            places = np.argsort(numbers)
             parts.append((int(firsts[key]), len(decoded), measure_pairs(source, decoded, places)))
             lines.update(dict.fromkeys(wrong_extras(source, decoded, places)))
         return Pairs(merged(parts), list(lines), self._reach)

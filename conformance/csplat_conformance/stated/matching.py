@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ STAGE = "matching splats"
 
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats at a time
-_PAIR_BLOCK = 4096  # pairs whose SH is compared at a time
+_FIRST = frozenset(("means", "opacities", "sh0"))  # are compared first
+_PAIR_BLOCK = 4096  # pairs that are compared at a time
 _CANDIDATES_MAX = 1000  # of one cell: scenes of equals would take for ever
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
@@ -51,6 +52,7 @@ def match(
     bounds: Mapping[str, float],
     radii: F64,
     *,
+    far: bool = True,
     reach: float | None = None,
     candidates_max: int = _CANDIDATES_MAX,
     threads: int | None = None,
@@ -63,7 +65,8 @@ def match(
         decoded: N splats; its origin may be another one.
         bounds: largest error by measure, to which comes what SER-7 allows. `means` is among them; measures that are
             not named are not looked at.
-        radii: [N], how near the partner's centre is expected; where there is none, the search goes on up to the bound.
+        radii: [N], how near the partner's centre is expected.
+        far: where there is none, the search goes on up to the bound.
         reach: of all of the scene, as `Source.reach` has it, where the splats are a part of it.
         candidates_max: how many splats of one cell are looked at for one partner.
         threads: how many to use, one per core by default. The result does not depend on it.
@@ -81,7 +84,7 @@ def match(
     bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
     bound = bounds["means"]
     levels = _levels(radii, bound)
-    for radius in [*np.unique(levels[levels < bound]), bound]:
+    for radius in np.unique(np.append(levels, bound) if far else levels):
         rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
         if not len(rows):
             continue
@@ -181,19 +184,14 @@ def _within(
     source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
     """Which pairs lie within the bounds; SH and covariance are looked at only where the rest does."""
-    near = np.abs(decoded.opacities[decoded_rows].astype(np.float64) - source.opacities[source_rows])
-    good = near <= bounds["opacities"]
-    moved = decoded.means[decoded_rows].astype(np.float64) - source.means[source_rows]
-    good &= np.einsum("ij,ij->i", moved, moved) <= bounds["means"] * bounds["means"] * (1.0 + 1e-12)
-    colour = np.abs(decoded.sh0[decoded_rows].astype(np.float64) - source.sh0[source_rows]).max(axis=1)
-    good &= colour <= bounds["sh0"]
-    pairs = np.flatnonzero(good)
-    for start in range(0, len(pairs), _PAIR_BLOCK):
-        part = pairs[start : start + _PAIR_BLOCK]
-        errors = differences(source, decoded, source_rows[part], decoded_rows[part])
-        for name, bound in bounds.items():
-            if name in errors:
-                good[part] &= np.abs(errors[name]).max(axis=1) <= bound
+    good = np.ones(len(source_rows), bool)
+    for names in (_FIRST, bounds.keys() - _FIRST):
+        pairs = np.flatnonzero(good)
+        for start in range(0, len(pairs), _PAIR_BLOCK):
+            part = pairs[start : start + _PAIR_BLOCK]
+            errors = differences(source, decoded, source_rows[part], decoded_rows[part], names)
+            for name, values in errors.items():
+                good[part] &= reduce(np.maximum, np.abs(values).T) <= bounds[name]
     return good
 
 

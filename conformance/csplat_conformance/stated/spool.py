@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -64,32 +66,36 @@ class Rows:
 
 @dataclass(eq=False)
 class Spool:
-    """Records in a file that nobody else sees, under keys. Owns what waits for being written.
+    """Splats in a file that nobody else sees, under keys. Owns what waits for being written.
 
     Attributes:
         stream: a file of no name.
-        dtype: of the records.
+        rows: how splats lie in it.
     """
 
     stream: BufferedRandom
-    dtype: np.dtype[Any]
+    rows: Rows
     _parts: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # by key: byte of the file, and records
     _waiting: dict[int, list[Records]] = field(default_factory=dict)
     _waiting_bytes: int = 0
     _size: int = 0
 
-    def add(self, keys: I64, records: Records) -> None:
-        """Take records, those of a key in the order in which they come.
+    def add(self, source: Source, rows: NDArray[Any], keys: I64, numbers: I64) -> None:
+        """Take some splats, those of a key in the order in which they come.
 
         Args:
+            source: of the layout.
+            rows: [n] which of its splats.
             keys: [n] what each is to be found under.
-            records: [n].
+            numbers: [n] what is said of each.
 
         Raises:
             OSError: they cannot be written.
         """
+        if not len(rows):
+            return
         order = np.argsort(keys, kind="stable")
-        keys, records = keys[order], records[order]
+        keys, records = keys[order], self.rows.packed(source, rows[order], numbers[order])
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         for start, end in zip(starts, [*starts[1:], len(keys)], strict=True):
             self._waiting.setdefault(int(keys[start]), []).append(records[start:end])
@@ -109,46 +115,55 @@ class Spool:
                 self.stream.write(records.view(np.uint8).data)
             count = sum(map(len, waiting))
             self._parts.setdefault(key, []).append((self._size, count))
-            self._size += count * self.dtype.itemsize
+            self._size += count * self.rows.dtype.itemsize
         self.stream.flush()
         self._waiting, self._waiting_bytes = {}, 0
 
     def counts(self) -> dict[int, int]:
-        """How many records each key has, by key."""
+        """How many splats each key has, by key."""
         return {key: sum(count for _, count in parts) for key, parts in sorted(self._parts.items())}
 
-    def read(self, key: int, most: int) -> Iterator[Records]:
-        """Read the records of a key, so many at a time at most.
+    def sources(self, key: int, most: int) -> Iterator[tuple[Source, I64]]:
+        """Read the splats of a key, so many at a time at most, and their numbers. Processes may do it together.
 
         Raises:
             OSError: they cannot be read.
         """
-        left = self.counts().get(key, 0)
-        block, filled = np.empty(min(most, left), self.dtype), 0
+        left, size = self.counts().get(key, 0), self.rows.dtype.itemsize
+        block, filled = np.empty(min(most, left), self.rows.dtype), 0
         for at, count in self._parts.get(key, ()):
             done = 0
             while done < count:
                 step = min(count - done, len(block) - filled)
-                self.stream.seek(at + done * self.dtype.itemsize)
-                self.stream.readinto(block[filled : filled + step].view(np.uint8).data)
+                _read_at(self.stream, at + done * size, block[filled : filled + step].view(np.uint8).data)
                 done, filled = done + step, filled + step
                 if filled == len(block):
-                    yield block
+                    yield self.rows.source(block), block["number"].copy()
                     filled = 0
         if filled:
-            yield block[:filled]
+            yield self.rows.source(block[:filled]), block["number"][:filled].copy()
 
 
-def opened_spool(dtype: np.dtype[Any], count: int) -> Spool:
+def _read_at(stream: BufferedRandom, at: int, buffer: memoryview) -> None:
+    """Fill a buffer, without moving the place where the next one reads."""
+    while buffer:
+        count = os.preadv(stream.fileno(), [buffer], at)
+        if not count:
+            raise OSError(errno.EIO, "the file of sorted splats has become shorter")
+        buffer, at = buffer[count:], at + count
+
+
+def opened_spool(rows: Rows, count: int) -> Spool:
     """Open a spool in the folder for temporary files (TMPDIR).
 
     Args:
-        dtype: of a record.
-        count: records that will lie in it, at most.
+        rows: how splats will lie in it.
+        count: splats that will lie in it, at most.
 
     Raises:
         InputError: the disk has no room for them.
         OSError: it cannot be made.
     """
-    check_room(tempfile.gettempdir(), count * dtype.itemsize, "the source is compared: TMPDIR names another folder")
-    return Spool(tempfile.TemporaryFile(), dtype)
+    folder = tempfile.gettempdir()
+    check_room(folder, count * rows.dtype.itemsize, "the source is compared: TMPDIR names another folder")
+    return Spool(tempfile.TemporaryFile(), rows)

@@ -30,10 +30,12 @@ def extract(
 ) -> None:
     """Cut a part of a scene out of a file, as a file of its own.
 
-    Tiles that touch the box are copied as they are, up to 65,536 splats each: nothing is decoded or coded again, and
-    splats around the box come along. `csplat convert --crop-box` cuts splat by splat. Stated errors are left out: they
-    are those of the whole. Of a URL (https, s3 and others; pip install 'csplat[remote]') the index and what is copied
-    are fetched, no more.
+    Tiles that touch the box are copied as they are, up to 65,536 splats each:
+    nothing is decoded or coded again, and splats around the box come along.
+    `csplat convert --crop-box` cuts splat by splat. Stated errors are left out:
+    they are those of the whole. Of a URL (https, s3 and others) the index and
+    what is copied are fetched, no more; that needs the packages of the remote
+    extra.
 
     Examples:
       csplat extract city.csplat square.csplat --box -10,-2,-10,10,8,10

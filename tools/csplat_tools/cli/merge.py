@@ -30,10 +30,11 @@ def merge(
 ) -> None:
     """Join files into one.
 
-    Tiles are copied bit for bit where the files agree on steps, SH degree, origin and extra columns, as parts of one
-    scene do. Else the scenes are decoded and coded again together, with --preset; a line says so, and why. Files whose
-    axes or units contradict each other are refused. What the files say alike of the scene is kept; errors that they
-    state are left out.
+    Tiles are copied bit for bit where the files agree on steps, SH degree,
+    origin and extra columns, as parts of one scene do. Else the scenes are
+    decoded and coded again together, with --preset; a line says so, and why.
+    Files whose axes or units contradict each other are refused. What the files
+    say alike of the scene is kept; errors that they state are left out.
 
     Examples:
       csplat merge north.csplat south.csplat -o city.csplat

@@ -141,7 +141,7 @@ def compare(
 
     Raises:
         CsplatError: a file is not valid, or exists; or no view judges; or the renderer is not installed; or the disk
-            has no room for the splats of a scene that does not fit the memory.
+            has no room for the splats of a scene that does not fit the memory, or the bound is too low even so.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
@@ -193,6 +193,10 @@ def _measured(
     first, second = (
         Sliced(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
     )
+    for one in (first, second):
+        if one.memory_bytes < one.least_bytes:
+            bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
+            raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which want {least:,.0f}")
     check_room(
         tempfile.gettempdir(),
         max(first.disk_bytes, second.disk_bytes),

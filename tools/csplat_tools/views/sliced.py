@@ -83,10 +83,18 @@ class Sliced:
         return _FOLDS * self.layout.dtype.itemsize + _SPLAT_BYTES
 
     @property
+    def least_bytes(self) -> int:
+        """Bytes of memory without which nothing can be drawn."""
+        return self._beside + _LEAST_BYTES
+
+    @property
     def room_bytes(self) -> int:
         """Bytes of memory for a slice."""
-        blocks = _BLOCKS * BLOCK * self.layout.dtype.itemsize
-        return max(_LEAST_BYTES, self.memory_bytes - _BASE_BYTES - blocks)
+        return max(_LEAST_BYTES, self.memory_bytes - self._beside)
+
+    @property
+    def _beside(self) -> int:
+        return _BASE_BYTES + _BLOCKS * BLOCK * self.layout.dtype.itemsize
 
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
@@ -153,7 +161,7 @@ class _Picture:
             limits: as of `slice_limits`.
             first: whether this is the first time that they are looked at.
         """
-        spool = opened_spool(self._layout.dtype, count)
+        spool = opened_spool(self._layout, count)
         with closing(spool.stream):
             sizes = np.zeros(len(limits) + 1)
             for block in blocks():
@@ -161,8 +169,7 @@ class _Picture:
                 rows = np.flatnonzero(near)
                 keys = np.searchsorted(limits, near[rows], "right")
                 sizes += np.bincount(keys, taken[rows], len(sizes))
-                if len(rows):
-                    spool.add(keys, self._layout.packed(block, rows, rows))
+                spool.add(block, rows, keys, rows)
                 if first:
                     self._ignored, self._visible = self._ignored + ignored, self._visible + len(rows)
             spool.flush()
@@ -180,7 +187,7 @@ class _Picture:
                     self._sort_and_draw(partial(read, BLOCK), number, self._limits(read(BLOCK), every, every, least=2))
 
     def _read(self, spool: Spool, key: int, most: int) -> Iterator[Source]:
-        return map(self._layout.source, spool.read(key, most))
+        return (source for source, _ in spool.sources(key, most))
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:
         """As `slice_limits`: by one in `every` of some splats, of which each stands for `share`."""

@@ -77,8 +77,9 @@ def main(
             back.unlink()
         if "verify" in wanted:
             found.append(_measured("verify", [str(target), "--quiet"], path, target))
-        if "prove" in wanted:
-            found.append(_measured("verify", [str(target), "--source", str(path), "--quiet"], path, target))
+        for bound in listed(memory) if "prove" in wanted else ():
+            words = [str(target), "--source", str(path), "--memory", bound, "--quiet"]
+            found.append(_measured("verify", words, path, target))
         target.unlink()
     header = ("scene", "command", "options", "s", "peak, MB", "file, MB", "CRC-32")
     rows = [
@@ -113,7 +114,7 @@ def _measured(command: str, words: Sequence[str], source: Path, result: Path) ->
     seconds = time.perf_counter() - start
     if process.returncode:
         raise ChildProcessError(f"csplat {command} ended with {process.returncode}")
-    options = " ".join(word for word in words[1:] if word.startswith("--s") or word[0].isdigit())
+    options = " ".join(word for word in words[1:] if word == "--source" or word[0].isdigit())
     return Stage(source.name, command, options, seconds, peak, result.stat().st_size, _crc(result))
 
 
