@@ -21,8 +21,9 @@ from csplat_tools.files.streams import STANDARD_STREAM
 __all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected"]
 
 _FOLDS = 4  # a scene in memory, in times of a PLY's bytes; of others it has to be looked at
-#: By SH degree: seconds per million splats to read and sort, and to code; seconds for a codebook.
-_SECONDS = ((0.3, 3.5, 0.0), (0.45, 5.5, 8.0), (0.7, 8.0, 12.0), (1.0, 11.0, 20.0))
+#: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of what
+#: copies of fox120k took at `balanced`: 10 M and 100 M of degree 0, 3 M of 1, 2 and 3, 30 M of 3.
+_SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
 #: By preset and SH degree, bytes of a file per splat.
 _FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
 _SMALL = 4 << 20  # bytes of a file of any format that fits every memory
