@@ -148,10 +148,10 @@ def add_removal(
 
 @parallel_kernel()
 def add_gradient(
-    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, blocks: Any
 ) -> None:
     """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
-    with_diagonal = diagonal.shape[0] > 0
+    with_blocks = blocks.shape[0] > 0
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             r, g, b, squares = 0.0, 0.0, 0.0, 0.0
@@ -169,6 +169,9 @@ def add_gradient(
                 to[k, 0] += own[k] * r32
                 to[k, 1] += own[k] * g32
                 to[k, 2] += own[k] * b32
-            if with_diagonal:
+            if with_blocks:
+                sums, place = blocks[rows[j]], 0
                 for k in range(basis.shape[1]):
-                    diagonal[rows[j], k] += squares * own[k] * own[k]
+                    for m in range(k + 1):
+                        sums[place] += squares * own[k] * own[m]
+                        place += 1

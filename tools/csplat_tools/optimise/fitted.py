@@ -35,8 +35,8 @@ _GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 o
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
-_BAND_STEPS = 8  # of a fit after bands were left out
-_STEPS = 4  # of a fit that begins where another one ended
+_BAND_STEPS = 4  # of a fit after bands were left out
+_STEPS = 2  # of a fit that begins where another one ended
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
 

@@ -21,7 +21,7 @@ __all__ = ["ColourFit", "fit", "refitted"]
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-_SECOND_STEPS = 4  # of a fit after something has changed a little
+_SECOND_STEPS = 2  # of a fit after something has changed a little
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ class SimplifyOptions:
 
     rounds: int = 4
     refit: bool = True
-    steps: int = 8
+    steps: int = 4
     adjust: bool = True
     passes: int = 2
     bands: bool = True
