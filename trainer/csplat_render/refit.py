@@ -173,7 +173,8 @@ def fit_colours(
     )
     x = np.concatenate([splats.sh0[:, None], splats.shN], axis=1, dtype=np.float32)
     mask = np.ones(x.shape[:2], bool) if free is None else np.ascontiguousarray(free)
-    pull = np.where(np.arange(x.shape[1]) > 0, *ridge[::-1]).astype(np.float32)
+    pull = np.full(x.shape[1], ridge[1], np.float32)
+    pull[0] = ridge[0]
     gradient, blocks = np.zeros_like(x), no_blocks(*x.shape[:2])
     errors = [operator.error(x, references, gradient, blocks)]
     if centre is not None:

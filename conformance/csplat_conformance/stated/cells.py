@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat import _spec
+from csplat.boxes import tile_boxes
 from csplat.decoder import SceneHeader
 
 __all__ = ["Cells"]
@@ -33,8 +33,7 @@ class Cells:
     @classmethod
     def of(cls, header: SceneHeader, count: int, most: int) -> Cells:
         """Cut space so that about `most` of `count` splats lie in a cell: tiles stand for what lies in them."""
-        step = header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = np.array([tile.corners(step) for tile in header.tiles]).reshape(-1, 2, 3)
+        boxes = tile_boxes(header)
         points = (boxes[:, None, 0] + _EIGHTHS * (boxes[:, None, 1] - boxes[:, None, 0])).reshape(-1, 3)
         weights = np.repeat([float(tile.splat_count) for tile in header.tiles], len(_EIGHTHS))
         depth = max(0, int(np.ceil(np.log2(max(1.0, count / most))))) if len(points) else 0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.boxes import tile_boxes
 from csplat.decoder import Opened
 from csplat.model import SplatModel
 from csplat.processes import each_apart
@@ -112,7 +113,7 @@ class Search:
     def _boxes(self) -> tuple[F64, F64]:
         """Boxes of the tiles, [T, 2, 3], and how near the partners of their splats are expected at most, [T]."""
         tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = np.array([tile.corners(step) for tile in tiles]).reshape(-1, 2, 3)
+        boxes = tile_boxes(self.opened.header)
         # A centre was rounded to float32; a radius is a cell's, and as much again for that.
         return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
 

@@ -99,7 +99,7 @@ def compare(
             out.remark(
                 f"A and B do not fit {format_bytes(source.memory_bytes)} of memory: they are drawn by way of the disk"
             )
-        model, every = source.sample(progress) if isinstance(source, OpenedScene) else (source.model, 1)
+        model, every = source.sample(progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":
             from csplat_tools.views.timing import pictures_seconds

@@ -119,7 +119,7 @@ class Expected:
     Attributes:
         count, sh_degree: of the scene.
         needs: memory, disk, workers.
-        seconds: about, by what was measured on one core of 2024, here with as many as will work.
+        seconds: about, by what was measured (`_SECONDS`) on one core, here with as many as will work.
         file_bytes: of the file, about, at the preset's precision.
     """
 

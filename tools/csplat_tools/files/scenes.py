@@ -61,6 +61,10 @@ class LoadedModel:
         """What a notebook shows of it: see `SplatModel`."""
         return self.model._repr_html_()  # a protocol of notebooks, and public there
 
+    def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:  # noqa: ARG002  # as of `OpenedScene`
+        """All splats, each of which stands for itself."""
+        return self.model, 1
+
     @property
     def count(self) -> int:
         """N."""

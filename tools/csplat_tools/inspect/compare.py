@@ -173,7 +173,7 @@ def compare(
 
 
 def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
-    model, every = (source.model, 1) if isinstance(source, LoadedModel) else source.sample(progress)
+    model, every = source.sample(progress)
     return find_view_set(model, background=background, count=0, every=every)
 
 
