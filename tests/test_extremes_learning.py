@@ -66,7 +66,7 @@ def test_half_the_splats_keep_what_the_guide_says(name):
     source, found = learnt_from(name), half(name)
     assert max(1, len(source) // 2) == len(found.model)
     assert_finite(found.model)
-    assert small_judge(name).psnr(found.model) >= float(told(name, 1)) - 1.0
+    assert small_judge(name).psnr(found.model) >= float(told(name, 1)) - 0.3
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
 
 
