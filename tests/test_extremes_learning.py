@@ -73,7 +73,7 @@ def test_half_the_splats_keep_what_the_guide_says(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_simplified_file_states_what_holds(name):
     source = learnt_from(name)
-    views, options = find_view_set(source, count=10, size=(60, 45)), replace(FEW, adjust=False)
+    views, options = find_view_set(source, count=10, size=(60, 45)), FEW
     result = encode_to(source, keep=0.5, views=views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)

@@ -24,6 +24,7 @@ from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
 from csplat.model import normalise_quats
+from csplat_trainer.tuning.state import TunedScene
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 12_000  # splats, enough for several grades
@@ -193,9 +194,21 @@ def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
-def test_several_grades_are_not_frozen(model):
+def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
+    frozen = Draft.of(model, importance=important(model)).frozen()
+    held = frozen.start()
+    result = frozen.coded(held).write()
+    decoded, seen = csplat.decode(result.data), frozen.seen(held)
+    order = np.argsort(frozen.source_index)[result.source_index]
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
+
+
+def test_bytes_of_several_grades_are_not_counted_together(model):
+    scene = TunedScene(Draft.of(model, importance=important(model)).frozen())
+    seen, _ = scene.seen()
     with pytest.raises(InputError, match="several grades"):
-        Draft.of(model, importance=important(model)).frozen()
+        scene.count(seen, 1.0)
 
 
 def test_codings_are_tried_on_splats_of_all_grades(model):
@@ -258,6 +271,7 @@ import numpy as np
 from csplat import SplatModel
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.model import normalise_quats
+
 from test_grades import COUNT, important
 rng = np.random.default_rng(0)
 model = SplatModel(

@@ -1,6 +1,7 @@
 """Simplification: which splats go, how good the rest is, and the command."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.optimise.simplify.fitting import Fit
 from csplat_tools.optimise.simplify.order import removal_order
 from csplat_tools.study import prune_share
 from csplat_tools.views import camera_sequence, find_view_set, reduced
@@ -32,7 +34,7 @@ from csplat_trainer.pictures import Picture
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
-SMALL = SimplifyOptions(views=12, view_size=(48, 36), steps=4, rounds=2)
+SMALL = SimplifyOptions(views=12, view_size=(48, 36), steps=200, rounds=2)
 
 
 def render_pictures(model, seen_from):
@@ -127,7 +129,6 @@ def test_keeping_a_share_keeps_that_many_and_says_which(source):
     result = simplify(source, keep=0.5, options=SMALL)
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
-    np.testing.assert_array_equal(source.quats[result.source_index], result.model.quats)
     report = result.report
     assert report["removed"]["invisible"] == 10
     assert sum(report["removed"].values()) == 225
@@ -138,39 +139,29 @@ def test_keeping_a_share_keeps_that_many_and_says_which(source):
 def test_a_refit_gains_on_views_that_it_did_not_see(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
-    options = replace(SMALL, views=40, steps=8)
-    report = simplify(shell, keep=0.5, options=options).report
-    assert report["check_psnr"] > report["check_psnr_pruned"] + 0.5
-    errors = report["fit_errors"][0]
-    assert errors == sorted(errors, reverse=True)
+    report = simplify(shell, keep=0.5, options=replace(SMALL, views=40)).report
+    assert report["check_psnr"] > report["check_psnr_pruned"] + 1.5
 
 
-def test_a_refit_that_serves_its_own_views_alone_is_refused(source):
-    options = replace(SMALL, views=1, view_size=(16, 12), bands=False, adjust=False)
-    report = simplify(source, keep=0.6, options=options).report
-    assert report["refit_refused"]
-    assert report["check_psnr"] == report["check_psnr_pruned"]
+def test_a_fit_that_serves_its_own_views_alone_is_refused(source, monkeypatch):
+    def dark(model, *_arguments, **_options):
+        return Fit(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
 
-
-def test_adjusted_opacities_and_scales_gain_on_views_that_were_not_used(source):
-    shell = source.select(slice(10, 300))
-    shell = replace(shell, scales=shell.scales + np.float32(0.5), shN=shell.shN[:, :0])
-    scores = {}
-    for adjusted in (False, True):
-        options = replace(SMALL, views=40, steps=8, adjust=adjusted)
-        scores[adjusted] = simplify(shell, keep=0.5, options=options).report["check_psnr"]
-    assert scores[True] > scores[False] + 0.3
+    monkeypatch.setattr(sys.modules[simplify.__module__], "fit", dark)
+    result = simplify(source, keep=0.6, options=SMALL)
+    assert result.report["refit_refused"]
+    assert result.report["check_psnr"] == result.report["check_psnr_pruned"]
+    np.testing.assert_array_equal(source.sh0[result.source_index], result.model.sh0)
 
 
 def test_what_no_view_shows_is_not_adjusted(source):
     cameras = camera_sequence(source, 4, (48, 36))[:1]
     wanted = [picture + np.float32(0.1) for picture in render_pictures(source, cameras)]
-    adjusted = adjust(source, cameras, wanted, SMALL, error=0.1)
+    adjusted = adjust(source, cameras, wanted, SMALL, steps=8)
     seen = measure_removal(source, cameras).seen
     assert 0 < np.count_nonzero(seen) < len(source)
-    for name in ("means", "quats", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(source, name), getattr(adjusted, name))
-    for name in ("opacities", "scales"):
+    np.testing.assert_array_equal(source.means, adjusted.means)
+    for name in ("opacities", "quats", "scales", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(source, name)[~seen], getattr(adjusted, name)[~seen])
         assert (getattr(source, name)[seen] != getattr(adjusted, name)[seen]).mean() > 0.9
 
@@ -179,7 +170,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
     cameras = camera_sequence(source, 4, (48, 36))
     wanted = render_pictures(source, cameras)
     extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
-    adjusted = adjust(extreme, cameras, wanted, SMALL, error=0.1)
+    adjusted = adjust(extreme, cameras, wanted, SMALL, steps=8)
     assert np.isfinite(adjusted.scales).all()
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
@@ -249,7 +240,7 @@ def test_bands_that_are_worth_less_than_their_bits_go():
     stays = band_mask(removal, 1.0)
     np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
     free = free_coefficients(stays)
-    assert [4, 16, 16] == free.sum(axis=1).tolist()
+    assert [3, 15, 15] == free.sum(axis=1).tolist()
 
 
 def test_bands_without_worth_are_zero_and_others_are_not(source):

@@ -35,7 +35,7 @@ def warm_up(
     Args:
         announce: called with one line if anything has to be compiled, and with another at its end.
         gradients: the backward pass of the renderer too.
-        simplify: what `measure_removal` and `fit_colours` run.
+        simplify: what `measure_removal` runs.
         ssim: what `metrics.ssim` runs.
         lpips: what `lpips.Lpips` runs.
         others: are called; each compiles kernels that are not the renderer's.
@@ -81,12 +81,9 @@ def is_compiled() -> bool:
 
 def _warm_up_simplifying(camera: Camera) -> None:
     from csplat.model import SplatModel
-    from csplat_render.refit import fit_colours
     from csplat_render.removal import measure_removal
 
-    model = SplatModel(**vars(_one_splat(np.float32)))
-    measure_removal(model, [camera])
-    fit_colours(model, [camera], [np.zeros((_SIZE, _SIZE, 3), np.float32)], steps=1)
+    measure_removal(SplatModel(**vars(_one_splat(np.float32))), [camera])
 
 
 def _warm_up_metrics(picture: Array, *, ssim: bool, lpips: bool) -> None:

@@ -202,12 +202,10 @@ class Draft:
             progress: as of `of`.
 
         Raises:
-            InputError: there are no splats, or several grades; or the source has another number of splats.
+            InputError: there are no splats, or the source has another number of them than the origin says.
         """
         if not len(self.model):
             raise InputError("a scene without splats has nothing to tune")
-        if self.grades is not None:  # what tunes it reckons with one step per attribute
-            raise InputError("the splats are of several grades, wanted one: draft them with graded=False")
         source = self.model if source is None else source
         if len(source) != self.origin.source_count:
             raise InputError(f"a source of {len(source)} splats, wanted {self.origin.source_count}: that of the origin")

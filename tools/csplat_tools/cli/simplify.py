@@ -59,8 +59,8 @@ def simplify(
 
     What the removal of each splat would change is measured exactly, in many
     small views from all around, again and again as splats go. Then colours,
-    opacities and scales of the others are fitted to what the source looks
-    like in views that teach. Other views decide how much may go, and others
+    opacities, scales and rotations of the others are fitted to what the source
+    looks like in views that teach. Other views decide how much may go, and others
     again judge the result. Only --max-loss wants photographs. `csplat encode`
     with a target does all this for the file that it writes. Needs the packages
     of the render extra.

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
+from csplat.encoder import Coded, Draft, EncodeOptions, FreeValues, Frozen, Importance, Origin, most_grades
 from csplat.model import SplatModel
 from csplat_render.removal import Removal, measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import error_of_psnr
+from csplat_tools.optimise.simplify.adjusting import adjust, adjust_frozen
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
-from csplat_tools.optimise.simplify.colours import fit, refitted
+from csplat_tools.optimise.simplify.fitting import BAND_STEPS
 from csplat_tools.optimise.simplify.simplify import Session
 from csplat_tools.optimise.trials import Trial
 from csplat_tools.views import evenly
@@ -31,18 +32,18 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Seen = Callable[[SplatModel], float]
 
-_GRADED = 15_000  # splats; what is left of smaller scenes is too alike: 6,875 of plane3 take 3 % more with grades
+_GRADED = 4_000  # splats; what is left of smaller scenes is too alike
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
-_BAND_STEPS = 4  # of a fit after bands were left out
-_STEPS = 2  # of a fit that begins where another one ended
+_NEXT_STEPS = 480  # where another number of splats was fitted before
+_FILE_STEPS = (320, 160)  # through the quantisers of a file: of the first one, and where another one ended
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
 
 @dataclass(eq=False)
 class FittedSplats:
-    """So many splats of a scene, fitted. Owns the colours of its last file, where the next fit begins.
+    """So many splats of a scene, fitted. Owns the values of its last file, where those of the next one begin.
 
     Attributes:
         session: the scene, its views, the order in which its splats go.
@@ -52,6 +53,7 @@ class FittedSplats:
         seen: PSNR of some splats by the views that decide, dB.
         grades: they may be sorted into grades, if views can say how.
         progress: is told the stages.
+        before: another number of them that was fitted: where this fit begins.
     """
 
     session: Session
@@ -60,6 +62,7 @@ class FittedSplats:
     seen: Seen
     grades: bool
     progress: Progress | None
+    before: FittedSplats | None = None
     refits: bool = True
 
     def __post_init__(self) -> None:
@@ -78,7 +81,7 @@ class FittedSplats:
 
     @property
     def model(self) -> SplatModel:
-        """The splats before they are quantised: colours, opacities and scales fitted."""
+        """The splats before they are quantised, fitted."""
         return self._fitted
 
     @cached_property
@@ -111,19 +114,30 @@ class FittedSplats:
         return self._banded_psnr  # a cached property of this name would not be the protocol's for pyright
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
-        """Quantise the geometry, fit colours to that, code all of it; quick is without the fit."""
-        session, (start, stays) = self.session, self.banded
+        """Quantise and code them; unless quick, after they were adjusted through the quantisers."""
+        session, refit = self.session, self.session.options.refit
+        tuned = refit and not quick
+        start = self.banded[0] if self._last is None or not tuned else self._last
         draft = Draft.of(
-            replace(self.model, sh0=start.sh0, shN=start.shN), options,
-            importance=self._importance(options, graded=graded),
-            origin=Origin(len(session.source), self.rows, adjusted=session.options.refit and session.options.adjust),
+            start, options, importance=self._importance(options, graded=graded),
+            origin=Origin(len(session.source), self.rows, refitted=refit, adjusted=refit),
             progress=self.progress,
         )  # fmt: skip
-        if not quick and session.options.refit:
-            last = start if self._last is None else self._last
-            start = self._last = self._refitted(replace(draft.scene, sh0=last.sh0, shN=last.shN), stays, _STEPS)
-            self._check_psnr = session.checked.psnr(start)
-        return draft.with_colours(start.sh0, start.shN).coded(self.progress)
+        if not tuned:
+            return draft.coded(self.progress)
+        frozen = draft.frozen(session.source, self.progress)
+        held = adjust_frozen(
+            frozen, session.views.used, session.wanted, session.options,
+            steps=_FILE_STEPS[self._last is not None], progress=self.progress,
+        )  # fmt: skip
+        before, self._check_psnr = (
+            session.checked.psnr(replace(start, **vars(frozen.seen(values)), means_double=None))
+            for values in (frozen.start(), held)
+        )
+        if self._check_psnr < before:  # a handful of splats may be too few for steps so long
+            self._check_psnr, held = before, frozen.start()
+        self._last = _in_rows(frozen, held, start)
+        return frozen.coded(held, self.progress)
 
     def said(self, trial: Trial | None) -> Mapping[str, Any]:
         """How many there were, what decided, and how good renders of the last file are."""
@@ -140,28 +154,29 @@ class FittedSplats:
 
     @cached_property
     def _fitted(self) -> SplatModel:
-        session = self.session
-        options = replace(session.options, bands=False)
-        return fit(self._pruned, session.views.used, session.wanted, options, progress=self.progress).model
-
-    @cached_property
-    def _pruned(self) -> SplatModel:
-        return self.session.source.select(self.rows)
+        session, before, steps = self.session, self.before, self.session.options.steps
+        start, self.before = session.source.select(self.rows), None
+        if not session.options.refit:
+            return start
+        if before is not None:
+            start, steps = _carried(before.model, before.rows, start, self.rows), min(steps, _NEXT_STEPS)
+        return self._adjusted(start, steps)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
         """The splats without the bands that are not worth their bits where files err by so much; those that stay."""
         session, model = self.session, self.model
         stays = band_mask(self._removal, error * session.views.removal.value_count / max(1, len(model)))
         banded = without(model, stays)
-        return (self._refitted(banded, stays, _BAND_STEPS) if session.options.refit else banded), stays
+        if session.options.refit and not stays.all():
+            banded = self._adjusted(banded, BAND_STEPS, free_coefficients(stays))
+        return banded, stays
 
-    def _refitted(self, model: SplatModel, stays: Mask | None, steps: int) -> SplatModel:
-        """Fit the colours that may be other than zero."""
-        session, free = self.session, None if stays is None else free_coefficients(stays)
-        return refitted(
-            model, session.views.used, session.wanted, session.options, steps=steps, free=free, centre=self._pruned,
-            progress=self.progress,
-        )  # fmt: skip
+    def _adjusted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
+        """Adjust what may be other than zero."""
+        session = self.session
+        return adjust(
+            model, session.views.used, session.wanted, session.options, steps=steps, free=free, progress=self.progress
+        )
 
     def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
         if graded and most_grades(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
@@ -187,3 +202,34 @@ class FittedSplats:
             threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
         return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)
+
+
+def _carried(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
+    """Splats of the source as another fit left them, as far as they were among those; `rows` ascend."""
+    _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
+
+    def carried(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:
+        own = own.copy()
+        own[here] = its[there]
+        return own
+
+    return replace(
+        start,
+        quats=carried(start.quats, before.quats),
+        scales=carried(start.scales, before.scales),
+        opacities=carried(start.opacities, before.opacities),
+        sh0=carried(start.sh0, before.sh0),
+        shN=carried(start.shN, before.shN),
+    )
+
+
+def _in_rows(frozen: Frozen, held: FreeValues, like: SplatModel) -> SplatModel:
+    """What a file was tuned to, before it was quantised, in the order of the source; entries of codebooks as seen."""
+    order, seen = np.argsort(frozen.source_index), frozen.seen(held)
+    shN = np.zeros_like(like.shN)
+    kept = seen.shN.shape[1]
+    shN[:, :kept] = (held.sh if frozen.book is None else seen.shN)[order]
+    quats, scales = (held.quats, held.scales) if frozen.shapes is None else (seen.quats, seen.scales)
+    return replace(
+        like, quats=quats[order], scales=scales[order], opacities=held.opacities[order], sh0=held.sh0[order], shN=shN
+    )

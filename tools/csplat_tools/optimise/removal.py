@@ -28,8 +28,8 @@ _USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, wit
 _FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated errors
 _MOST_REMOVED = 0.7  # of the error that a PSNR allows
 _LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
-_MENDED = 4.0  # dB that a fit makes removal err by less, about
-_FAR = 1.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
+_MENDED = 8.0  # dB that a fit makes removal err by less, about
+_FAR = 2.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
 _FARTHER = 4.0  # times the error of an order, where that was too little
 _CALIBRATIONS = 3
 _AGREED = 1.15  # times the error that was predicted
@@ -58,6 +58,7 @@ class Removal:
     psnr: float | None
     left: int | None = None
     _session: Session | None = field(default=None, init=False)
+    _fitted: FittedSplats | None = field(default=None, init=False)
 
     @property
     def session(self) -> Session:
@@ -81,7 +82,8 @@ class Removal:
         if gone > len(self.session.order.rows):
             self._extend(left, math.inf)
         gone = min(gone, len(self.session.order.rows))
-        return FittedSplats(self.session, gone, allowed, seen, self.grades, self.progress)
+        self._fitted = FittedSplats(self.session, gone, allowed, seen, self.grades, self.progress, self._fitted)
+        return self._fitted
 
     def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:
         """How many splats to begin with for the smallest file of a PSNR.

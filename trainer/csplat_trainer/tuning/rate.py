@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen
+from csplat.errors import InputError
 from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import Splats
 
@@ -63,7 +64,12 @@ class Costs:
             frozen: what was decided.
             stored: what the streams hold.
             weight: loss per bit and splat.
+
+        Raises:
+            InputError: the splats are of several grades: integers of several steps are not counted together.
         """
+        if frozen.draft.grades is not None:
+            raise InputError("the splats are of several grades, wanted one: draft them with graded=False")
         costs = cls(frozen, weight, {})
         plan = frozen.plan
         columns = {

@@ -31,10 +31,10 @@ from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes, judge_of
 from csplat_render.judge import Judge, Look, renderer
 from csplat_render.rasterise import Rasteriser
-from csplat_render.refit import ColourOperator
 from csplat_render.removal import measure_removal
 from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.simplify.colours import fit
+from csplat_tools.optimise.simplify.adjusting import adjust
+from csplat_tools.optimise.simplify.fitting import fit
 from csplat_tools.optimise.simplify.order import removal_order
 from csplat_tools.study import prune_share
 from csplat_tools.views import BLACK, VIEW_SIZE, camera_sequence, find_view_set
@@ -61,7 +61,7 @@ class Left(TypedDict, total=False):
         psnr: dB.
         seconds: of the order.
         views: that taught.
-        fit_*: colours fitted. adjusted_*: opacities and shapes, too; used, check: by the views that taught, and others.
+        fit_*: what is left was fitted; used, check: by the views that taught, and others.
     """
 
     psnr: float
@@ -69,10 +69,8 @@ class Left(TypedDict, total=False):
     views: int
     fit_psnr: float
     fit_seconds: float
-    adjusted_psnr: float
-    adjusted_seconds: float
-    adjusted_used: float
-    adjusted_check: float
+    fit_used: float
+    fit_check: float
 
 
 def main(
@@ -119,7 +117,7 @@ class _Bench:
         return Judge.of_source(self._source, self._views.check, BLACK)
 
     def left(self, percent: int, method: str) -> Left:
-        """Remove a share by a method; by the last one without and with a fit, of colours and of all that is fitted."""
+        """Remove a share by a method; by the last one without and with a fit."""
         source, views, options = self._source, self._views, self._options
         count = round(len(source) * (1.0 - percent / 100.0))
         if method in _BY_OPACITY:
@@ -130,22 +128,17 @@ class _Bench:
             model = source.select(order.kept(len(source), min(len(source) - count, len(order.rows))))
         result: Left = {"psnr": self._judge.psnr(model), "seconds": timing.wall, "views": len(views.used)}
         if method == "rounds":
-            fitted, timing = timed(fit, model, views.used, self._wanted, replace(options, adjust=False))
-            result |= {"fit_psnr": self._judge.psnr(fitted.model), "fit_seconds": timing.wall}
-            fitted, timing = timed(fit, model, views.used, self._wanted, replace(options, adjust=True))
+            fitted, timing = timed(fit, model, views.used, self._wanted, options)
             own = Judge(views.used, [Look(picture) for picture in self._wanted])
-            result |= {"adjusted_psnr": self._judge.psnr(fitted.model), "adjusted_seconds": timing.wall}
-            result |= {"adjusted_used": own.psnr(fitted.model), "adjusted_check": self._checked.psnr(fitted.model)}
+            result |= {"fit_psnr": self._judge.psnr(fitted.model), "fit_seconds": timing.wall}
+            result |= {"fit_used": own.psnr(fitted.model), "fit_check": self._checked.psnr(fitted.model)}
         return result
 
 
 def _pass_milliseconds(source: SplatModel) -> dict[str, float]:
     """Milliseconds for each view of a plain render, of the pass, of a step of a fit: the best of three, by turns."""
     cameras, rasteriser = camera_sequence(source, _PASS_VIEWS, VIEW_SIZE), Rasteriser(gradients=False)
-    draw = renderer(source, BLACK)
-    colours = np.concatenate([source.sh0[:, None], source.shN], axis=1)
-    operator, gradient = ColourOperator(source, cameras), np.zeros_like(colours)
-    operator.error(colours, [draw(camera).rgb for camera in cameras], gradient)
+    wanted, options = [renderer(source, BLACK)(camera).rgb for camera in cameras], SimplifyOptions()
 
     def render() -> None:
         for camera in cameras:
@@ -154,7 +147,7 @@ def _pass_milliseconds(source: SplatModel) -> dict[str, float]:
     calls = {
         "render": render,
         "pass": lambda: measure_removal(source, cameras),
-        "step": lambda: operator.normal(colours, gradient),
+        "step": lambda: adjust(source, cameras, wanted, options, steps=len(cameras)),
     }
     turns = [{name: timed(call)[1].wall for name, call in calls.items()} for _ in range(3)]
     return {name: 1000.0 * min(turn[name] for turn in turns) / len(cameras) for name in calls}
@@ -172,14 +165,14 @@ def _removal_table(name: str, found: Mapping[str, Left]) -> str:
         row: list[Any] = [f"{name} {percent} %", *("-" if one is None else f"{one['psnr']:.1f}" for one in known)]
         last = known[-1]
         if last is None:
-            row += ["-"] * 8
+            row += ["-"] * 6
         else:
-            decibels = (last["fit_psnr"], last["adjusted_psnr"], last["adjusted_used"], last["adjusted_check"])
-            seconds = (last["seconds"], last["fit_seconds"], last["adjusted_seconds"])
+            decibels = (last["fit_psnr"], last["fit_used"], last["fit_check"])
+            seconds = (last["seconds"], last["fit_seconds"])
             row += [*(f"{value:.1f}" for value in decibels), last["views"], *(f"{value:.0f}" for value in seconds)]
         rows.append(row)
-    fits = ("+ colours", "+ shapes", "used views", "check views")
-    return table(("PSNR, dB", *_METHODS, *fits, "views", "rounds s", "colours s", "all s"), rows)
+    fits = ("fitted", "used views", "check views")
+    return table(("PSNR, dB", *_METHODS, *fits, "views", "rounds s", "fit s"), rows)
 
 
 if __name__ == "__main__":

@@ -1,31 +1,42 @@
-"""Opacities and scales of what stays, moved towards what the source looks like by gradient descent.
+"""What stays, moved towards what the source looks like by gradient descent, one small view after the other.
 
-Where splats have gone, their neighbours have to cover more: opacity and extent decide that, and no linear problem does.
-Centres and rotations stay: moved by the same steps they follow the views that teach and lose on others.
+Where splats have gone, their neighbours have to cover more, and where values are quantised others may make up for it:
+colours, opacities, scales and rotations together. Steps as long as what is wrong is large. Least squares over all views
+at once (colours alone are linear) follow the views that teach and lose on others; this does not: after four looks at
+each view it gains as much on views that it never saw. Centres stay: moved as well, scenes with few views lose.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder import FreeValues, Frozen
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.arrays import Gradients
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_trainer.parameters import Parameters, adam_step, from_model
+from csplat_trainer.tuning.state import TunedScene
 
-__all__ = ["adjust"]
+__all__ = ["adjust", "adjust_frozen"]
 
 F32 = NDArray[np.float32]
-_RATES = {"logits": 0.05, "scales": 0.01, "quats": 0.0}  # of logits and of log scales, in the first steps
-_LAST_RATE = 0.02  # share of them that is left in the last steps
-_LARGE_ERROR = 0.01  # of a pixel, below which the rates fall with it
+Mask = NDArray[np.bool_]
+
+#: Of the first steps, where all is wrong by one: per unit of the error's root mean square, at most `_LARGEST_ERROR`.
+_RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
+_SH_FACTOR = 2.0  # so much longer steps without SH, through quantisers as long ones
+_LARGEST_ERROR = 0.04
+_LAST_RATE = 0.02  # share of the rates that is left in the last steps
+_SAMPLE = 8  # one view of so many says how large the error is
 
 
 def adjust(
@@ -34,39 +45,153 @@ def adjust(
     wanted: Sequence[F32],
     options: SimplifyOptions,
     *,
-    error: float,
+    steps: int,
+    free: Mask | None = None,
     progress: Progress | None = None,
 ) -> SplatModel:
-    """Move opacities and scales along the gradient of the squared error, view by view.
+    """Move colours, opacities, scales and rotations along the gradient of the squared error, view by view.
 
     Args:
         model: the scene.
         cameras: the views.
         wanted: [H, W, 3], what is to be seen from each.
-        options: how often each view is looked at (`passes`), background, seed of their order, threads.
-        error: root mean square of what is wrong with the pictures: where little is, steps are small.
+        options: background, seed of the order of views, threads.
+        steps: each looks at one view.
+        free: [N, K], which SH coefficients beyond the first may change; None for all.
         progress: is told how much is done.
 
     Returns:
         The scene; splats that no view shows are as they were.
     """
-    start = from_model(model, model.sh_degree)
-    moving = {"logits": start["logits"].copy(), "scales": start["scales"].copy(), "quats": np.zeros((0, 4), np.float32)}
-    parameters = Parameters.starting_at(moving)
+    scene = _Floats.of(model, free)
+    factor = 1.0 if model.sh_degree else _SH_FACTOR
+    _descend(scene, cameras, wanted, options, steps, factor, antialiased=model.antialiased, progress=progress)
+    return scene.model(model)
+
+
+def adjust_frozen(
+    frozen: Frozen,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    steps: int,
+    progress: Progress | None = None,
+) -> FreeValues:
+    """The same through the quantisers of a file: what is seen is what a decoder sees of it.
+
+    Args:
+        frozen: what the encoder decided.
+        cameras, wanted, options, steps, progress: as for `adjust`.
+
+    Returns:
+        Values that `Frozen.coded` takes.
+    """
+    scene = _Quantised(TunedScene(frozen))
+    antialiased = frozen.draft.model.antialiased
+    _descend(scene, cameras, wanted, options, steps, 1.0, antialiased=antialiased, progress=progress)
+    return scene.tuned.held.copy()
+
+
+class _Scene(Protocol):
+    """Values that move, and what is seen of them."""
+
+    def seen(self) -> Splats: ...
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
+
+
+def _descend(
+    scene: _Scene,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    steps: int,
+    factor: float,
+    *,
+    antialiased: bool,
+    progress: Progress | None,
+) -> None:
     rasteriser = Rasteriser(threads=options.threads)
+
+    def wrong(view: int) -> F32:
+        drawn = rasteriser.forward(scene.seen(), cameras[view], background=options.background, antialiased=antialiased)
+        # Straight through what pictures do not show: a colour beyond 1 is pulled back only where less is wanted.
+        return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(wanted[view], 0.0, 1.0)
+
+    sample = [np.mean(np.square(wrong(view), dtype=np.float64)) for view in range(0, len(cameras), _SAMPLE)]
+    error = float(np.sqrt(np.mean(sample)))
+    scale = factor * min(error, _LARGEST_ERROR) if math.isfinite(error) else 0.0
     rng = np.random.default_rng(options.seed)
-    order = np.concatenate([rng.permutation(len(cameras)) for _ in range(options.passes)])
-    careful = min(1.0, error / _LARGE_ERROR)
-    for step, view in enumerate(order):
-        alphas = parameters.alphas
-        scene = Splats(model.means, model.quats, moving["scales"], alphas, model.sh0, model.shN)
-        drawn = rasteriser.forward(scene, cameras[view], background=options.background, antialiased=model.antialiased)
-        found = rasteriser.backward(drawn.rgb - wanted[view])
-        rate = careful * max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / len(order)))
-        slopes = found.opacities * alphas * (1.0 - alphas)
-        gradients = {"logits": slopes, "scales": found.scales, "quats": moving["quats"]}
-        adam_step(parameters, gradients, {name: rate * value for name, value in _RATES.items()})
+    order = np.concatenate([rng.permutation(len(cameras)) for _ in range(-(-steps // len(cameras)))])
+    for step, view in enumerate(order[:steps]):
+        gradients = rasteriser.backward(wrong(view))
+        share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
+        scene.step(gradients, {name: scale * share * rate for name, rate in _RATES.items()})
         if progress is not None:
-            progress("adjusting splats", (step + 1) / len(order))
-    unmoved = moving["logits"] == start["logits"]  # these alphas are not to be rounded
-    return replace(model, opacities=np.where(unmoved, model.opacities, parameters.alphas), scales=moving["scales"])
+            progress("adjusting splats", (step + 1) / steps)
+
+
+@dataclass(eq=False)
+class _Floats:
+    """Values that nothing quantises."""
+
+    means: F32
+    start: dict[str, F32]
+    parameters: Parameters
+    free: Mask | None
+
+    @classmethod
+    def of(cls, model: SplatModel, free: Mask | None) -> _Floats:
+        start = {name: array for name, array in from_model(model, model.sh_degree).items() if name != "means"}
+        moving = {name: array.copy() for name, array in start.items()}
+        return cls(model.means, start, Parameters.starting_at(moving), free)
+
+    def seen(self) -> Splats:
+        v = self.parameters.values
+        return Splats(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
+        alphas = self.parameters.alphas
+        slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
+        slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
+        if self.free is not None:
+            slopes["shN"] = slopes["shN"] * self.free[:, :, None]
+        adam_step(self.parameters, slopes, rates)
+
+    def model(self, before: SplatModel) -> SplatModel:
+        """What moved; the rest bit for bit as it was, and what is beyond float32 too."""
+        values, alphas = self.parameters.values, self.parameters.alphas
+        moved = np.zeros(len(before), bool)
+        for name in ("logits", "scales", "sh0", "shN"):
+            moved |= (values[name] != self.start[name]).reshape(len(before), -1).any(axis=1)
+        for array in values.values():
+            moved &= np.isfinite(array).reshape(len(before), -1).all(axis=1)
+        rows = moved[:, None]
+        return replace(
+            before,
+            opacities=np.where(moved, alphas, before.opacities),
+            quats=np.where(rows, values["quats"], before.quats),
+            scales=np.where(rows, values["scales"], before.scales),
+            sh0=np.where(rows, values["sh0"], before.sh0),
+            shN=np.where(rows[:, :, None], values["shN"], before.shN),
+        )
+
+
+@dataclass(eq=False)
+class _Quantised:
+    """Values of a frozen scene."""
+
+    tuned: TunedScene
+    _alphas: F32 | None = None
+    _seen: Any = None
+
+    def seen(self) -> Splats:
+        self._seen, self._alphas = self.tuned.seen()
+        s = self._seen
+        return Splats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
+        assert self._alphas is not None
+        rates = {**rates, "means": 0.0, "sizes": rates["scales"]}
+        self.tuned.step(gradients, self._seen, self._alphas, rates, None)

@@ -35,12 +35,12 @@ def band_mask(removal: Removal, error: float) -> Mask:
 
 
 def free_coefficients(stays: Mask) -> Mask:
-    """Which coefficients belong to bands that stay, [N, (d + 1)²]; band 0 always does."""
-    columns = [np.ones((len(stays), 1), bool)]
+    """Which coefficients beyond the first belong to bands that stay, [N, (d + 1)² − 1]."""
+    columns = [np.zeros((len(stays), 0), bool)]
     columns += [np.repeat(stays[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, stays.shape[1] + 1)]
     return np.concatenate(columns, axis=1)
 
 
 def without(model: SplatModel, stays: Mask) -> SplatModel:
     """The scene with zeros in the bands that do not stay."""
-    return replace(model, shN=model.shN * free_coefficients(stays)[:, 1:, None].astype(np.float32))
+    return replace(model, shN=model.shN * free_coefficients(stays)[:, :, None].astype(np.float32))

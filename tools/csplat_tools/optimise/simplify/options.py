@@ -16,11 +16,8 @@ class SimplifyOptions:
 
     Attributes:
         rounds: how often errors are measured anew on the way, at least 1.
-        refit: fit the colours of what stays to the source's renders.
-        steps: of that fit at most.
-        adjust: then move opacities and scales of what stays, by gradient descent, and fit colours again; not without
-            `refit`.
-        passes: how often that looks at each view.
+        refit: fit colours, opacities, scales and rotations of what stays to the source's renders.
+        steps: of that fit; each looks at one view.
         bands: set SH bands to zero that are worth less than their bits.
         keep_unseen: splats that no view shows stay.
         view_size: of the pictures that teach, width and height in pixels.
@@ -35,9 +32,7 @@ class SimplifyOptions:
 
     rounds: int = 4
     refit: bool = True
-    steps: int = 4
-    adjust: bool = True
-    passes: int = 2
+    steps: int = 960
     bands: bool = True
     keep_unseen: bool = True
     view_size: tuple[int, int] = VIEW_SIZE
@@ -47,7 +42,7 @@ class SimplifyOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "steps", "passes", "views"):
+        for name in ("rounds", "steps", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
         if min(self.view_size) < 1:

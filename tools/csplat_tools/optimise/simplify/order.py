@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _LEAST_SHARE = 0.01  # of the splats that stay, at the end of an order that is made to be cut anywhere
-_ROUND_SHARE = 0.85  # of what is left stays after each round of such an order: what hid a splat may have gone
+_ROUND_SHARE = 0.72  # of what is left stays after each round of such an order: what hid a splat may have gone
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from csplat_render.metrics import PSNR_CAP
 from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
-from csplat_tools.optimise.simplify.colours import ColourFit, fit
+from csplat_tools.optimise.simplify.fitting import Fit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import Order, removal_order
 from csplat_tools.optimise.target import Target
@@ -86,7 +86,7 @@ class Session:
         """The largest error among the first `gone`."""
         return float(self.order.errors[:gone].max(initial=0.0))
 
-    def fitted(self, rows: I64, progress: Progress | None = None) -> ColourFit:
+    def fitted(self, rows: I64, progress: Progress | None = None) -> Fit:
         """Fit what is left."""
         return fit(self.source.select(rows), self.views.used, self.wanted, self.options, progress=progress)
 
@@ -224,7 +224,6 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
         "gone": gone,
         "check_psnr_pruned": session.checked.psnr(pruned),
         "check_psnr": session.checked.psnr(fitted.model),
-        "fit_errors": [list(errors) for errors in fitted.errors],
     }
     model, stays = fitted.model, fitted.stays
     worth = 0.0 if stays is None else _BANDS_WORTH
@@ -273,7 +272,7 @@ def most_gone(session: Session, judge: Judge, goal: float, lowest: int = 0) -> i
 def _unchanged(session: Session, judge: Judge) -> Simplified:
     source = session.source
     score = session.checked.psnr(source)
-    report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score, "fit_errors": []}
+    report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score}
     report["decided_psnr"] = judge.psnr(source)
     return Simplified(source, np.arange(len(source)), 0.0, None, report)
 
