@@ -23,7 +23,7 @@ __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
 #: What it costs, in pictures of all views that teach: of a share, and of a target, which looks for one.
-_PASSES = (15.0, 55.0)
+_PASSES = (25.0, 70.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 
 

@@ -22,6 +22,7 @@ _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
 _COUNTS = 3  # numbers of splats that are fitted
 _SAME = 0.06  # of the splats that are left: fewer or more by less are not worth another fit
+_LOWER = 0.8  # of them, that are tried instead
 _FEWER = 0.7  # of the splats, where a size holds none of their files
 _ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
 _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
@@ -123,8 +124,11 @@ class Moves:
                 left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
                 left = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
-            if abs(left - before) <= _SAME * before or min(found, key=solver.cost).part is not part:
+            if min(found, key=solver.cost).part is not part:
                 break
+            if abs(left - before) <= _SAME * before:
+                # A fit mends more of a larger removal than of a smaller one, which the order does not know.
+                left = int(before * _LOWER)
         return found
 
     def _slope_of_counts(self, whole: Trial) -> float:

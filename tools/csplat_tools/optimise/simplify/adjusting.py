@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from csplat.encoder import FreeValues, Frozen
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.arrays import Gradients
+from csplat_render.arrays import Gradients, HasSplats
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
@@ -65,7 +65,7 @@ def adjust(
     """
     scene = _Floats.of(model, free)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
-    _descend(scene, cameras, wanted, options, steps, factor, antialiased=model.antialiased, progress=progress)
+    _descend(scene, _Teaching(cameras, wanted, options, model.antialiased), steps, factor, progress)
     return scene.model(model)
 
 
@@ -88,8 +88,8 @@ def adjust_frozen(
         Values that `Frozen.coded` takes.
     """
     scene = _Quantised(TunedScene(frozen))
-    antialiased = frozen.draft.model.antialiased
-    _descend(scene, cameras, wanted, options, steps, 1.0, antialiased=antialiased, progress=progress)
+    teaching = _Teaching(cameras, wanted, options, frozen.draft.model.antialiased)
+    _descend(scene, teaching, steps, 1.0, progress)
     return scene.tuned.held.copy()
 
 
@@ -101,31 +101,39 @@ class _Scene(Protocol):
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
 
 
-def _descend(
-    scene: _Scene,
-    cameras: Sequence[Camera],
-    wanted: Sequence[F32],
-    options: SimplifyOptions,
-    steps: int,
-    factor: float,
-    *,
-    antialiased: bool,
-    progress: Progress | None,
-) -> None:
-    rasteriser = Rasteriser(threads=options.threads)
+class _Teaching:
+    """Views, and what is to be seen from them."""
 
-    def wrong(view: int) -> F32:
-        drawn = rasteriser.forward(scene.seen(), cameras[view], background=options.background, antialiased=antialiased)
+    def __init__(
+        self, cameras: Sequence[Camera], wanted: Sequence[F32], options: SimplifyOptions, antialiased: bool
+    ) -> None:
+        self.cameras, self.wanted, self.seed = cameras, wanted, options.seed
+        self.rasteriser = Rasteriser(threads=options.threads)
+        self._background, self._antialiased = options.background, antialiased
+
+    def wrong(self, splats: HasSplats, view: int) -> F32:
+        """What a view shows too much, [H, W, 3]."""
+        drawn = self.rasteriser.forward(
+            splats, self.cameras[view], background=self._background, antialiased=self._antialiased
+        )
         # Straight through what pictures do not show: a colour beyond 1 is pulled back only where less is wanted.
-        return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(wanted[view], 0.0, 1.0)
+        return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(self.wanted[view], 0.0, 1.0)
 
-    sample = [np.mean(np.square(wrong(view), dtype=np.float64)) for view in range(0, len(cameras), _SAMPLE)]
-    error = float(np.sqrt(np.mean(sample)))
-    scale = factor * min(error, _LARGEST_ERROR) if math.isfinite(error) else 0.0
-    rng = np.random.default_rng(options.seed)
-    order = np.concatenate([rng.permutation(len(cameras)) for _ in range(-(-steps // len(cameras)))])
+    def rms(self, splats: HasSplats) -> float:
+        """How wrong a sample of the views is: the root mean square."""
+        sample = range(0, len(self.cameras), _SAMPLE)
+        errors = [np.mean(np.square(self.wrong(splats, view), dtype=np.float64)) for view in sample]
+        return math.sqrt(np.mean(errors))
+
+
+def _descend(scene: _Scene, teaching: _Teaching, steps: int, factor: float, progress: Progress | None) -> None:
+    """Move the values of a scene, by Adam."""
+    count, rms = len(teaching.cameras), teaching.rms(scene.seen())
+    scale = factor * min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
+    rng = np.random.default_rng(teaching.seed)
+    order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
     for step, view in enumerate(order[:steps]):
-        gradients = rasteriser.backward(wrong(view))
+        gradients = teaching.rasteriser.backward(teaching.wrong(scene.seen(), view))
         share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
         scene.step(gradients, {name: scale * share * rate for name, rate in _RATES.items()})
         if progress is not None:
