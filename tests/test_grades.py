@@ -271,7 +271,6 @@ import numpy as np
 from csplat import SplatModel
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.model import normalise_quats
-
 from test_grades import COUNT, important
 rng = np.random.default_rng(0)
 model = SplatModel(

@@ -16,7 +16,6 @@ from csplat_render import render
 from csplat_render.arrays import Splats
 from csplat_render.cameras import intrinsics, load_cameras, look_at
 from csplat_render.contributions import Contributions
-from csplat_render.preconditioning import factor, no_blocks, solve
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.removal import measure_removal, removal_exact
 from csplat_render.virtual import virtual_cameras
@@ -251,37 +250,19 @@ def test_the_operator_and_its_transpose_belong_together():
     assert across == pytest.approx(np.sum(x * images[1], dtype=np.float64), rel=1e-3, abs=1e-3 * length)
 
 
-def test_the_gradient_is_that_of_finite_differences_and_the_blocks_those_of_the_matrix():
+def test_the_gradient_is_that_of_finite_differences_and_the_diagonal_that_of_the_matrix():
     model = replace(scene(count=40), sh0=np.full((40, 3), 1.5, np.float32))  # bright: nothing is clamped
     wanted = [np.full((30, 40, 3), 0.4, np.float32)] * 2
     operator, x = ColourOperator(model, views(2)), coefficients(model)
-    gradient, blocks = np.zeros_like(x), no_blocks(*x.shape[:2])
-    before = operator.error(x, wanted, gradient, blocks)
+    gradient, diagonal = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
+    before = operator.error(x, wanted, gradient, diagonal)
     row = int(np.argmax(np.abs(gradient[:, 2, 1])))
-    for one, other in ((0.1, 0.0), (-0.1, 0.0), (0.1, 0.1), (-0.05, 0.1)):
+    for step in (0.1, -0.1):
         moved = x.copy()
-        moved[row, [2, 1], 1] += one, other
+        moved[row, 2, 1] += step
         after = operator.error(moved, wanted, np.zeros_like(x))
-        expected = 2.0 * (one * gradient[row, 2, 1] + other * gradient[row, 1, 1])
-        expected += one**2 * blocks[row, 5] + 2.0 * one * other * blocks[row, 4] + other**2 * blocks[row, 2]
+        expected = 2.0 * step * gradient[row, 2, 1] + step**2 * diagonal[row, 2]
         assert after - before == pytest.approx(expected, rel=2e-3, abs=1e-3)
-
-
-@pytest.mark.parametrize("shares", [1.0, 0.6])
-def test_solving_is_multiplying_with_the_inverse_of_what_is_free(shares):
-    rng, ridge = np.random.default_rng(4), np.linspace(0.1, 0.4, 16).astype(np.float32)
-    basis = rng.standard_normal((30, 7, 16))  # from fewer views than there are coefficients
-    matrices = np.einsum("nvk,nvm->nkm", basis, basis).astype(np.float32)
-    free = rng.random((30, 16)) <= shares
-    vector = (rng.standard_normal((30, 16, 3)) * free[..., None]).astype(np.float32)
-    blocks = np.ascontiguousarray(matrices[:, *np.tril_indices(16)])
-    found = np.empty_like(vector)
-    factor(blocks, free, ridge)
-    solve(blocks, vector, found)
-    both = free[:, :, None] & free[:, None, :]
-    expected = np.linalg.solve(matrices * both + np.diag(ridge), vector.astype(np.float64))
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3)
-    assert not found[~free].any()
 
 
 def test_fitting_finds_the_colours_that_pictures_were_made_of():
@@ -290,23 +271,20 @@ def test_fitting_finds_the_colours_that_pictures_were_made_of():
     cameras = views(12)
     wanted = [render(model, camera).rgb for camera in cameras]
     wrong = replace(model, sh0=model.sh0 + np.float32(0.2), shN=np.zeros_like(model.shN))
-    x, errors = fit_colours(wrong, cameras, wanted, steps=40, ridge=(1e-5, 1e-5), least_gain=0.0)
+    x, errors = fit_colours(wrong, cameras, wanted, steps=40, ridge=1e-5, least_gain=0.0)
     assert errors[-1] < 1e-3 * errors[0]
     fitted = replace(model, sh0=np.ascontiguousarray(x[:, 0]), shN=np.ascontiguousarray(x[:, 1:]))
     true = sum(float(np.sum((render(fitted, c).rgb - w) ** 2)) for c, w in zip(cameras, wanted, strict=True))
     assert true < 2e-3 * errors[0]
 
 
-def test_what_is_not_free_and_what_is_not_seen_stays():
+def test_what_is_not_seen_stays():
     model, cameras = scene(count=40), views(2)
     means = model.means.copy()
     means[5] = 50.0
     model = replace(model, means=means)
     wanted = [np.full((30, 40, 3), 0.5, np.float32)] * 2
-    free = np.ones((40, 16), bool)
-    free[:, 9:] = False
-    x, _ = fit_colours(model, cameras, wanted, free=free)
-    np.testing.assert_array_equal(coefficients(model)[:, 9:], x[:, 9:])
+    x, _ = fit_colours(model, cameras, wanted)
     np.testing.assert_array_equal(coefficients(model)[5], x[5])
     assert np.abs(x - coefficients(model)).max() > 0.01
 
@@ -329,7 +307,7 @@ def test_leaving_out_what_has_no_weight_changes_no_bit(opacity):
     reference = np.full((50, 70, 3), wanted, np.float32)
 
     def answer(view, mask):
-        sums = np.zeros_like(x), no_blocks(*x.shape[:2])
+        sums = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
         rgb = drawing.colours(view, x, mask, *sums, offset=0.5, background=black, reference=reference)
         return rgb, *sums
 

@@ -138,7 +138,7 @@ class Contributions(Rasteriser):
         coefficients: Array,
         active: Array,
         gradient: Array,
-        blocks: Array,
+        diagonal: Array,
         *,
         offset: float,
         background: Array,
@@ -153,8 +153,7 @@ class Contributions(Rasteriser):
             coefficients: [N, B, 3] float32.
             active: [V, 3] bool, which colours take part.
             gradient: [N, B, 3] float32, added to: sum over pixels of w · Y_k · (picture − reference).
-            blocks: [N, B (B + 1) / 2] float32, added to: sum over pixels of w² · Y_k · Y_m, m up to k; empty if it is
-                not wanted.
+            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not wanted.
             offset: ½ for pictures of splats, 0 for differences of such pictures.
             background: [3].
             reference: [H, W, 3]; None for black.
@@ -166,7 +165,7 @@ class Contributions(Rasteriser):
             set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
         rgb, records = self._colours(drawn, background, reference)
         with thread_count(self.threads):
-            add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, blocks)
+            add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
         return rgb
 
     def trimmed(self, drawn: DrawnView) -> tuple[DrawnView, Array]:

@@ -148,10 +148,10 @@ def add_removal(
 
 @parallel_kernel()
 def add_gradient(
-    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, blocks: Any
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
 ) -> None:
     """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
-    with_blocks = blocks.shape[0] > 0
+    with_diagonal = diagonal.shape[0] > 0
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             r, g, b, squares = 0.0, 0.0, 0.0, 0.0
@@ -169,9 +169,6 @@ def add_gradient(
                 to[k, 0] += own[k] * r32
                 to[k, 1] += own[k] * g32
                 to[k, 2] += own[k] * b32
-            if with_blocks:
-                sums, place = blocks[rows[j]], 0
+            if with_diagonal:
                 for k in range(basis.shape[1]):
-                    for m in range(k + 1):
-                        sums[place] += squares * own[k] * own[m]
-                        place += 1
+                    diagonal[rows[j], k] += squares * own[k] * own[k]

@@ -6,9 +6,8 @@ starts from stays 0 there, the others are taken as free. What is minimised is
 
     Σ over views, pixels, channels (picture − reference)² + Σ_i r · (c_i − c0_i)²,
 
-with a ridge r that keeps what no view saw where it was. Conjugate gradients: the matrix is never built, its product
-with a vector is a picture of the vector's colours taken back to the splats. Of the matrix only each splat's own block
-is known: it is the preconditioner.
+with a ridge r that keeps what no view saw where it was. Preconditioned conjugate gradients: the matrix is never built,
+its product with a vector is a picture of the vector's colours taken back to the splats.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from csplat_render.arrays import Array, HasSplats
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions
 from csplat_render.drawn_view import DrawnView
-from csplat_render.jit import thread_count
-from csplat_render.preconditioning import factor, no_blocks, solve
 
 __all__ = ["ColourOperator", "fit_colours"]
 
@@ -36,10 +33,8 @@ Progress = Callable[[str, float], None]
 #: Memory for views that are drawn once and kept; the others are drawn anew in every step.
 CACHE_BYTES = 2 << 30
 
-#: Squared error per square of a coefficient, of band 0 and of the others: some ten pixels at 40 dB for every 0.1 that
-#: the colour is moved. Bands are held more: what few directions say of them would cost more bits than it is worth. Held
-#: still more (3) trained scenes take 3 % fewer bytes yet, and needles lose 1.7 dB.
-RIDGE = (0.1, 0.5)
+#: Squared error per square of a coefficient: some ten pixels at 40 dB for every 0.1 that a coefficient is moved.
+RIDGE = 0.1
 
 
 class ColourOperator:
@@ -73,22 +68,23 @@ class ColourOperator:
         self._kept: dict[int, tuple[DrawnView, Array]] = {}
         self._splats = splats
 
-    def error(self, coefficients: F32, references: Sequence[Array], gradient: F32, blocks: F32 | None = None) -> float:
+    def error(
+        self, coefficients: F32, references: Sequence[Array], gradient: F32, diagonal: F32 | None = None
+    ) -> float:
         """Squared error of the pictures, and half its gradient.
 
         Args:
             coefficients: [N, B, 3].
             references: the wanted pictures, [H, W, 3] each.
             gradient: [N, B, 3], added to.
-            blocks: see `no_blocks`, added to: of the matrix transposed times itself those that belong to one splat
-                and one channel; None if they are not wanted.
+            diagonal: [N, B], added to: the diagonal of the matrix transposed times itself; None if it is not wanted.
         """
-        wanted = no_blocks(0, coefficients.shape[1]) if blocks is None else blocks
+        unwanted = np.empty((0, coefficients.shape[1]), np.float32)
         total = 0.0
         for number in range(len(self.cameras)):
             drawn, active = self._view(number)
             rgb = self._drawing.colours(
-                drawn, coefficients, active, gradient, wanted,
+                drawn, coefficients, active, gradient, unwanted if diagonal is None else diagonal,
                 offset=0.5, background=self._background, reference=references[number],
             )  # fmt: skip
             self._keep(number, drawn, active)
@@ -102,7 +98,7 @@ class ColourOperator:
             vector: [N, B, 3] float32.
             result: [N, B, 3] float32, added to.
         """
-        unwanted = no_blocks(0, vector.shape[1])
+        unwanted = np.empty((0, vector.shape[1]), np.float32)
         total = 0.0
         for number in range(len(self.cameras)):
             drawn, active = self._view(number)
@@ -132,10 +128,8 @@ def fit_colours(
     cameras: Sequence[Camera],
     references: Sequence[Array],
     *,
-    centre: F32 | None = None,
-    free: NDArray[np.bool_] | None = None,
     steps: int = 8,
-    ridge: tuple[float, float] = RIDGE,
+    ridge: float = RIDGE,
     least_gain: float = 0.01,
     background: ArrayLike = (0.0, 0.0, 0.0),
     antialiased: bool = False,
@@ -149,10 +143,8 @@ def fit_colours(
         splats: geometry, and the colours to start from.
         cameras: the views, relative to the scene's origin.
         references: the wanted pictures, [H, W, 3] each, as float; they may exceed 1.
-        centre: [N, B, 3], what the ridge pulls towards; None for the colours to start from.
-        free: [N, B], which coefficients may change; None for all.
         steps: of conjugate gradients at most.
-        ridge: squared error per square of a coefficient, of band 0 and of the others.
+        ridge: squared error per square of a coefficient.
         least_gain: stop when a step takes off less than this share of the error.
         background: red, green, blue behind everything.
         antialiased: see `Rasteriser.forward`.
@@ -172,39 +164,27 @@ def fit_colours(
         splats, cameras, background=background, antialiased=antialiased, threads=threads, cache_bytes=cache_bytes
     )
     x = np.concatenate([splats.sh0[:, None], splats.shN], axis=1, dtype=np.float32)
-    mask = np.ones(x.shape[:2], bool) if free is None else np.ascontiguousarray(free)
-    pull = np.full(x.shape[1], ridge[1], np.float32)
-    pull[0] = ridge[0]
-    gradient, blocks = np.zeros_like(x), no_blocks(*x.shape[:2])
-    errors = [operator.error(x, references, gradient, blocks)]
-    if centre is not None:
-        away = x - centre
-        pulled = pull[:, None] * away
-        errors[0] += _dot(away, pulled)
-        gradient += pulled
-    residual, preconditioned = -gradient * mask[..., None], gradient  # whose memory serves on
-    with thread_count(threads):
-        factor(blocks, mask, pull)
-        solve(blocks, residual, preconditioned)
-    direction = preconditioned.copy()
+    gradient, diagonal = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
+    errors = [operator.error(x, references, gradient, diagonal)]
+    residual = -gradient
+    scale = (np.float32(1.0) / (diagonal + np.float32(ridge)))[..., None]
+    direction = scale * residual
     product = _dot(residual, direction)
     for step in range(steps):
         if progress is not None:
             progress("fitting colours", (step + 1) / (steps + 1))
-        image = pull[:, None] * direction
+        image = np.float32(ridge) * direction
         operator.normal(direction, image)
-        image *= mask[..., None]
         curvature = _dot(direction, image)
         if not 0.0 < curvature < np.inf:
-            break  # nothing that is free is seen, or the fit is exact, or colours are beyond all measure
+            break  # nothing is seen, or the fit is exact, or colours are beyond all measure
         length = product / curvature
         x += np.float32(length) * direction
         residual -= np.float32(length) * image
         errors.append(errors[-1] - length * product)
         if errors[-2] - errors[-1] < least_gain * errors[-1]:
             break
-        with thread_count(threads):
-            solve(blocks, residual, preconditioned)
+        preconditioned = scale * residual
         product, before = _dot(residual, preconditioned), product
         direction = preconditioned + np.float32(product / before) * direction
     if progress is not None:

@@ -130,12 +130,13 @@ class FittedSplats:
             frozen, session.views.used, session.wanted, session.options,
             steps=_FILE_STEPS[self._last is not None], progress=self.progress,
         )  # fmt: skip
+        untuned = frozen.start()
         before, self._check_psnr = (
             session.checked.psnr(replace(start, **vars(frozen.seen(values)), means_double=None))
-            for values in (frozen.start(), held)
+            for values in (untuned, held)
         )
         if self._check_psnr < before:  # a handful of splats may be too few for steps so long
-            self._check_psnr, held = before, frozen.start()
+            self._check_psnr, held = before, untuned
         self._last = _in_rows(frozen, held, start)
         return frozen.coded(held, self.progress)
 
