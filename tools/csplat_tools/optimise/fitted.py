@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import Coded, Draft, EncodeOptions, FreeValues, Frozen, Importance, Origin, most_grades
+from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
 from csplat.model import SplatModel
 from csplat_render.removal import Removal, measure_removal
 from csplat_tools.files.console import Progress
@@ -37,13 +37,13 @@ _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
 _NEXT_STEPS = 480  # where another number of splats was fitted before
-_FILE_STEPS = (320, 160)  # through the quantisers of a file: of the first one, and where another one ended
+_FILE_STEPS = 480  # through the quantisers of a file
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
 
 @dataclass(eq=False)
 class FittedSplats:
-    """So many splats of a scene, fitted. Owns the values of its last file, where those of the next one begin.
+    """So many splats of a scene, fitted.
 
     Attributes:
         session: the scene, its views, the order in which its splats go.
@@ -66,7 +66,6 @@ class FittedSplats:
     refits: bool = True
 
     def __post_init__(self) -> None:
-        self._last: SplatModel | None = None
         self._check_psnr = 0.0
 
     @cached_property
@@ -116,20 +115,18 @@ class FittedSplats:
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
         """Quantise and code them; unless quick, after they were adjusted through the quantisers."""
         session, refit = self.session, self.session.options.refit
-        tuned = refit and not quick
-        start = self.banded[0] if self._last is None or not tuned else self._last
+        start = self.banded[0]
         draft = Draft.of(
             start, options, importance=self._importance(options, graded=graded),
             origin=Origin(len(session.source), self.rows, refitted=refit, adjusted=refit),
             progress=self.progress,
         )  # fmt: skip
-        if not tuned:
+        if quick or not refit:
             return draft.coded(self.progress)
         frozen = draft.frozen(session.source, self.progress)
         held = adjust_frozen(
-            frozen, session.views.used, session.wanted, session.options,
-            steps=_FILE_STEPS[self._last is not None], progress=self.progress,
-        )  # fmt: skip
+            frozen, session.taught, session.wanted, session.options, steps=_FILE_STEPS, progress=self.progress
+        )
         untuned = frozen.start()
         before, self._check_psnr = (
             session.checked.psnr(replace(start, **vars(frozen.seen(values)), means_double=None))
@@ -137,13 +134,12 @@ class FittedSplats:
         )
         if self._check_psnr < before:  # a handful of splats may be too few for steps so long
             self._check_psnr, held = before, untuned
-        self._last = _in_rows(frozen, held, start)
         return frozen.coded(held, self.progress)
 
     def said(self, trial: Trial | None) -> Mapping[str, Any]:
         """How many there were, what decided, and how good renders of the last file are."""
         session = self.session
-        said = {"splats": len(session.source), "views": len(session.views.used)}
+        said = {"splats": len(session.source), "views": len(session.taught)}
         figures = {} if trial is None else {"decided_psnr": round(trial.decided_psnr, 3)}
         if trial is not None and trial.is_careful:
             figures["check_psnr"] = round(self._check_psnr, 3)
@@ -176,7 +172,7 @@ class FittedSplats:
         """Adjust what may be other than zero."""
         session = self.session
         return adjust(
-            model, session.views.used, session.wanted, session.options, steps=steps, free=free, progress=self.progress
+            model, session.taught, session.wanted, session.options, steps=steps, free=free, progress=self.progress
         )
 
     def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
@@ -221,16 +217,4 @@ def _carried(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) ->
         opacities=carried(start.opacities, before.opacities),
         sh0=carried(start.sh0, before.sh0),
         shN=carried(start.shN, before.shN),
-    )
-
-
-def _in_rows(frozen: Frozen, held: FreeValues, like: SplatModel) -> SplatModel:
-    """What a file was tuned to, before it was quantised, in the order of the source; entries of codebooks as seen."""
-    order, seen = np.argsort(frozen.source_index), frozen.seen(held)
-    shN = np.zeros_like(like.shN)
-    kept = seen.shN.shape[1]
-    shN[:, :kept] = (held.sh if frozen.book is None else seen.shN)[order]
-    quats, scales = (held.quats, held.scales) if frozen.shapes is None else (seen.quats, seen.scales)
-    return replace(
-        like, quats=quats[order], scales=scales[order], opacities=held.opacities[order], sh0=held.sh0[order], shN=shN
     )

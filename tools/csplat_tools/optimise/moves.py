@@ -12,7 +12,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.exchange import BYTES_PER_DB, error_of_psnr
 from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.solving import Solver, bounded
+from csplat_tools.optimise.solving import MENDED, Solver, bounded
 from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
 
 __all__ = ["Moves"]
@@ -21,8 +21,8 @@ _LOSS = (5.0, 8.5)  # dB between what each attribute keeps by itself and what al
 _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
 _COUNTS = 3  # numbers of splats that are fitted
-_SAME = 0.06  # of the splats that are left: fewer or more by less are not worth another fit
-_LOWER = 0.8  # of them, that are tried instead
+_SAME = (0.12, 0.06)  # of the splats that are left: fewer or more by less are not worth another fit
+_HOPELESS = 0.5  # dB below the goal: splats whose fit is worse reach it at no precision
 _FEWER = 0.7  # of the splats, where a size holds none of their files
 _ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
 _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
@@ -63,6 +63,8 @@ class Moves:
         """
         tried = self.codings.best(self.solver, self.whole, self._start(), brief=self.removal is not None)
         if self.removal is not None:
+            if self.solver.goal.is_judged:
+                tried[0].let_judge()
             cost, fitted = self.solver.cost, self._removed(self.removal, tried[0])
             if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
                 tried = self.codings.best(self.solver, self.whole, tried[0].quality or 0.0)
@@ -100,11 +102,16 @@ class Moves:
         slope, found, seen = self._slope_of_counts(whole), list[Trial](), solver.trials.decider.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
-        start = (whole.quality or 0.0) - solver.about(whole)
+        start = (whole.quality or 0.0) - solver.about(whole) - MENDED
         for _ in range(_COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
                 break
             part = removal.fitted(left, allowed, seen)
+            if allowed is not None and part.fitted_psnr < allowed - _HOPELESS:
+                if found:
+                    break
+                left = _more(left)
+                continue
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality)
             trial, before = tries[0], left
@@ -124,11 +131,8 @@ class Moves:
                 left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
                 left = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
-            if min(found, key=solver.cost).part is not part:
+            if min(found, key=solver.cost).part is not part or -_SAME[0] <= left / before - 1.0 <= _SAME[1]:
                 break
-            if abs(left - before) <= _SAME * before:
-                # A fit mends more of a larger removal than of a smaller one, which the order does not know.
-                left = int(before * _LOWER)
         return found
 
     def _slope_of_counts(self, whole: Trial) -> float:

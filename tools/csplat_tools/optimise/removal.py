@@ -32,7 +32,8 @@ _MENDED = 8.0  # dB that a fit makes removal err by less, about
 _FAR = 2.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
 _FARTHER = 4.0  # times the error of an order, where that was too little
 _CALIBRATIONS = 3
-_AGREED = 1.15  # times the error that was predicted
+_AGREED = 0.05  # of the splats
+_GROWS = 0.85  # power of the error of removal with which that of what is left grows, once it is fitted
 _NOTHING = 1e-12
 
 
@@ -119,7 +120,7 @@ class Removal:
             psnr, slope: as above.
         """
         removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
-        return self._least(_at_psnr(psnr, slope), removed / self._error(left))
+        return self._least(_at_psnr(psnr, slope), (left, removed))
 
     def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
         """How many are likely to make the best file of a size.
@@ -132,26 +133,34 @@ class Removal:
         error = error_of_psnr(psnr)
         removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
         quantised = max(error - removed, LEAST_QUANTISED * error)
-        return self._least(_at_size(left, quantised, slope), removed / self._error(left))
+        return self._least(_at_size(left, quantised, slope), (left, removed))
 
     def _calibrated(self, cost: Cost, seen: Seen) -> int:
-        factor, left = 1.0, len(self.source)
+        mends = error_of_psnr(_MENDED)
+        left = self._least(cost, None)
         for _ in range(_CALIBRATIONS):
-            left = self._least(cost, factor * error_of_psnr(_MENDED))
             if left == len(self.source):
                 break
             rows = self.session.pruned(len(self.source) - left)
-            before, factor = factor, error_of_psnr(seen(self.source.select(rows))) / self._error(left)
-            if before / _AGREED <= factor <= before * _AGREED:
+            before, left = left, self._least(cost, (left, mends * error_of_psnr(seen(self.source.select(rows)))))
+            if abs(left - before) <= _AGREED * before:
                 break
         return left
 
-    def _least(self, cost: Cost, factor: float) -> int:
-        """Splats left where a cost of their number and of the error of the others, times a factor, is least."""
+    def _least(self, cost: Cost, known: tuple[int, float] | None) -> int:
+        """Splats left where a cost of their number and of the error of the others is least.
+
+        Args:
+            cost: of both.
+            known: so many splats have this error once they are fitted; `None`: what a fit usually mends.
+        """
         while True:
             errors = self._errors()
             left = len(self.source) - np.arange(len(errors), dtype=np.float64)
-            best = int(np.argmin(cost(left, factor * errors)))
+            fitted = error_of_psnr(_MENDED) * errors
+            if known is not None:
+                fitted = known[1] * np.power(errors / self._error(known[0]), _GROWS)
+            best = int(np.argmin(cost(left, fitted)))
             if best < len(errors) - 1 or not self._goes_on():
                 return int(left[best])
 

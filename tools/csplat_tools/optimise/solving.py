@@ -11,7 +11,10 @@ from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_
 from csplat_tools.optimise.search import FLATTEST, Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
-__all__ = ["Goal", "Solver", "bounded"]
+__all__ = ["MENDED", "Goal", "Solver", "bounded"]
+
+#: dB that an adjustment through the quantisers of a file mends, about: quick files are near the goal so far below it.
+MENDED = 1.1
 
 _QUALITIES = (24.0, 110.0)  # dB, between which the PSNR that each attribute keeps is looked for
 
@@ -20,8 +23,7 @@ _CLOSE = Window(-0.35, 0.4, 0.05)  # what is taken for the best
 _ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from one precision to the next
 _ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same of what quantisation does; each try takes pictures
 _WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
-_MENDED = 1.5  # dB that an adjustment through the quantisers mends, about
-_FEW, _SOME, _MANY = 3, 5, 6  # tries
+_FEW, _SOME, _MANY = 3, 4, 6  # tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
 _ROUGH = 16  # levels of opacity: with fewer, files jump from one precision to the next
 _BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was found, where files jump
@@ -121,7 +123,7 @@ class Solver:
             self._approach(part, coding, start, _WITHIN, _MANY, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         if part.refits:
-            start = known.quality - _quantised(known, self.about(known) + _MENDED)
+            start = known.quality - _quantised(known, self.about(known))
             self._approach(part, coding, start, _ON_REFITTED, _SOME, self.goal.above, careful=True)
             return self.goal.best(self.trials.of(part, coding, careful=True))
         self._approach(part, coding, known.quality, _ON, _MANY, self.goal.above)
@@ -154,15 +156,21 @@ class Solver:
     def expected(self, trial: Trial) -> float:
         """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant."""
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
-        above = trial.decided_psnr - level
+        above = trial.decided_psnr + self._mended(trial) - level
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
         return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
     def about(self, trial: Trial) -> float:
-        """By how many dB a file is better than the goal, or larger, as far as the views that decide say."""
+        """By how many dB a file is better than the goal, or larger, as far as the views that decide say.
+
+        A quick file of fitted splats counts as what its adjustment is going to make of it.
+        """
         if not self.goal.is_judged:
             return self.goal.above(trial)
-        return trial.decided_psnr - self.level(trial.part)
+        return trial.decided_psnr + self._mended(trial) - self.level(trial.part)
+
+    def _mended(self, trial: Trial) -> float:
+        return 0.0 if trial.is_careful or not trial.part.refits else MENDED
 
     def slope(self, trial: Trial) -> float:
         """The share of the bytes that a decibel costs here."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
@@ -23,7 +24,7 @@ from csplat_tools.optimise.simplify.fitting import Fit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import Order, removal_order
 from csplat_tools.optimise.target import Target
-from csplat_tools.views import ViewSet, find_view_set
+from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.agreeing import AgreedViews, find_views
 
 __all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "simplify"]
@@ -63,7 +64,8 @@ class Session:
         options: how to go about it.
         around: from where it is looked at.
         views: those that teach, and others.
-        wanted: what the source looks like from the views that teach.
+        taught: those that the others are fitted to; virtual ones are as many again, for a fit follows its views.
+        wanted: what the source looks like from these.
         order: of removal.
         checked: judges by views that were not used.
         seconds: by stage.
@@ -73,6 +75,7 @@ class Session:
     options: SimplifyOptions
     around: ViewSet
     views: AgreedViews
+    taught: list[Camera]
     wanted: list[F32]
     order: Order
     checked: Judge
@@ -88,7 +91,7 @@ class Session:
 
     def fitted(self, rows: I64, progress: Progress | None = None) -> Fit:
         """Fit what is left."""
-        return fit(self.source.select(rows), self.views.used, self.wanted, self.options, progress=progress)
+        return fit(self.source.select(rows), self.taught, self.wanted, self.options, progress=progress)
 
 
 def prepare(
@@ -119,13 +122,16 @@ def prepare(
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
     found = find_views(source, around, gone, size=options.view_size, threads=options.threads, progress=progress)
     draw = renderer(source, around.background, threads=options.threads)
-    wanted = [draw(camera).rgb for camera in found.used]
+    taught = list(found.used)
+    if around.virtual:
+        taught += camera_sequence(source, len(found.used), options.view_size, seed=options.seed + 1)
+    wanted = [draw(camera).rgb for camera in taught]
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
     order = removal_order(source, found, options, left, progress, enough=allowed * found.removal.value_count)
     seconds["rounds"] = time.perf_counter() - start
-    return Session(source, options, around, found, wanted, order, checked, seconds)
+    return Session(source, options, around, found, taught, wanted, order, checked, seconds)
 
 
 def simplify(
