@@ -37,7 +37,7 @@ from csplat_tools.views import BLACK, ViewSet, camera_sequence, comparison_camer
 from csplat_tools.views.viewset import pose
 from csplat_trainer.pictures import Picture
 
-SMALL = SimplifyOptions(steps=200, rounds=2)
+SMALL = SimplifyOptions(effort=1, rounds=2)
 SIZE = (32, 24)
 
 

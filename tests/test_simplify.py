@@ -34,7 +34,7 @@ from csplat_trainer.pictures import Picture
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
-SMALL = SimplifyOptions(views=12, view_size=(48, 36), steps=200, rounds=2)
+SMALL = SimplifyOptions(views=12, view_size=(48, 36), effort=1, rounds=2)
 
 
 def render_pictures(model, seen_from):
@@ -261,7 +261,7 @@ def test_several_targets_and_options_out_of_range_are_refused(source):
     for given, says in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
         with pytest.raises(InputError, match=says):
             simplify(source, options=SMALL, **given)
-    for wrong in ({"rounds": 0}, {"steps": 0}, {"views": 0}, {"view_size": (0, 1)}):
+    for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):
             SimplifyOptions(**wrong)
 

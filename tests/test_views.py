@@ -170,7 +170,7 @@ def command_words(name, folder, out):
     ply = folder / "scene.ply"
     return {
         "compare": ("compare", ply, ply),
-        "simplify": ("simplify", ply, out / "half.ply", "--keep", "0.5", "--set", "rounds=1,steps=20"),
+        "simplify": ("simplify", ply, out / "half.ply", "--keep", "0.5", "--effort", "1", "--set", "rounds=1"),
         "max-loss": ("simplify", ply, out / "less.ply", "--max-loss", "1", "--set", "rounds=1,refit=no"),
         "sensitivity": ("sensitivity", ply, out / "s.npz", "--no-matrices"),
         "finetune": (

@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat_render.standing import seeming_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.groups import Group, Output
-from csplat_tools.cli.options import Importance, SourceIndex, command
+from csplat_tools.cli.options import EFFORT, Importance, SourceIndex, command
 from csplat_tools.cli.parsing import parse_bytes, parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
@@ -52,7 +52,7 @@ class Goal(Group):
 
     target_psnr: Annotated[
         str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Least PSNR against the source's renders."),
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Least PSNR against source renders."),
     ] = None
     target_size: Annotated[
         str | None,
@@ -77,6 +77,7 @@ class Goal(Group):
     keep_all: Annotated[
         bool, typer.Option("--keep-all", rich_help_panel=_TARGET, help="Remove and refit no splat: sooner.")
     ] = False
+    effort: Annotated[int, typer.Option(rich_help_panel=_TARGET, **EFFORT)] = 3
 
     @property
     def is_rendered(self) -> bool:
@@ -158,6 +159,7 @@ class Room(Group):
     ),
     needs={
         "prune_unseen": ("importance",),
+        "effort": _RENDERED,
         "cameras": _RENDERED,
         "data": _RENDERED,
         "views": _RENDERED,
@@ -297,21 +299,26 @@ def _reach(
     target, around = goal.read(model.unit_metres), None
     assert target is not None
     weights = None if importance is None else read_weights(importance, model)
+    simplifying = None
     if target.is_rendered:
         prepare_renderer(quiet=out.quiet, simplify=True)
         from csplat_tools.optimise.optimiser import expected_seconds
+        from csplat_tools.optimise.simplify import SimplifyOptions
 
+        simplifying = SimplifyOptions(effort=goal.effort)
         around = views.find(model, out, **virtual.given())
         if len(model) and around.judges:
             may_keep_all = not goal.keep_all and goal.keep is None
             out.foretell(
-                partial(expected_seconds, model, encoding, target, around, keep_all=goal.keep_all),
+                partial(
+                    expected_seconds, model, encoding, target, around, keep_all=goal.keep_all, simplifying=simplifying
+                ),
                 "--keep-all takes a sixth of that, a preset seconds" if may_keep_all else "a preset takes seconds",
             )
     made = csplat_tools.encode_to(
         model, psnr=target.psnr, size=target.size_bytes, loss=target.max_loss, keep=target.keep,
         errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
-        progress=progress,
+        simplifying=simplifying, progress=progress,
     )  # fmt: skip
     return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
 

@@ -29,6 +29,7 @@ from csplat_tools.files.console import progress_bar, say
 from csplat_tools.files.streams import STANDARD_STREAM
 
 __all__ = [
+    "EFFORT",
     "Checkpoint",
     "CheckpointEvery",
     "Importance",
@@ -48,6 +49,10 @@ Scene = Annotated[
     str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
 ]
 Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choices.")]
+#: Of an option, in whichever panel.
+EFFORT: dict[str, Any] = {
+    "metavar": "1..9", "min": 1, "max": 9, "show_default": False, "help": "Work for fewer bytes, usually 3."
+}  # fmt: skip
 Threads = Annotated[
     int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")
 ]

@@ -10,7 +10,7 @@ import typer
 
 from csplat.errors import counted
 from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Scene, Seed, SourceIndex, Threads, chosen, command
+from csplat_tools.cli.options import EFFORT, Scene, Seed, SourceIndex, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright, Views, Virtual
@@ -23,7 +23,7 @@ __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
 #: What it costs, in pictures of all views that teach: of a share (donut 9, plane3 19), and of a target, which looks for
-#: one (20 and 45).
+#: one (20 and 45); half of that is fitting.
 _PASSES = (20.0, 45.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 
@@ -52,6 +52,7 @@ def simplify(
             metavar="DB", rich_help_panel=_TARGET, help="How far PSNR against the photographs of --data may fall."
         ),
     ] = None,
+    effort: Annotated[int, typer.Option(**EFFORT)] = 3,
     seed: Seed = 0,
     threads: Threads = None,
     source_index: SourceIndex = None,
@@ -81,7 +82,7 @@ def simplify(
     loss = None if max_loss is None else parse_decibels(max_loss)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
     chosen(Target, psnr=psnr, max_loss=loss, keep=keep)  # before anything is read
-    options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), seed=seed, threads=threads)
+    options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), effort=effort, seed=seed, threads=threads)
     out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
     model = upright.upright().applied(load_model(source).model)
@@ -89,7 +90,7 @@ def simplify(
     given = {"size": options.view_size, **virtual.given()}
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given["size"])
-    passes = _PASSES[keep is None]
+    passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
     out.foretell(
         lambda: passes * pictures_seconds(model, reduced(around.teaches, given["size"])),
         "fewer or smaller views take less: --help-all",

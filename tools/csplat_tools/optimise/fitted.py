@@ -18,7 +18,7 @@ from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import error_of_psnr
 from csplat_tools.optimise.simplify.adjusting import adjust, adjust_frozen
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
-from csplat_tools.optimise.simplify.fitting import BAND_STEPS
+from csplat_tools.optimise.simplify.fitting import BAND_STEPS, FIT_STEPS
 from csplat_tools.optimise.simplify.simplify import Session
 from csplat_tools.optimise.trials import Trial
 from csplat_tools.views import evenly
@@ -125,8 +125,9 @@ class FittedSplats:
             return draft.coded(self.progress)
         frozen = draft.frozen(session.source, self.progress)
         held = adjust_frozen(
-            frozen, session.taught, session.wanted, session.options, steps=_FILE_STEPS, progress=self.progress
-        )
+            frozen, session.taught, session.wanted, session.options, steps=session.options.steps(_FILE_STEPS),
+            progress=self.progress,
+        )  # fmt: skip
         untuned = frozen.start()
         before, self._check_psnr = (
             session.checked.psnr(replace(start, **vars(frozen.seen(values)), means_double=None))
@@ -151,12 +152,12 @@ class FittedSplats:
 
     @cached_property
     def _fitted(self) -> SplatModel:
-        session, before, steps = self.session, self.before, self.session.options.steps
+        session, before, steps = self.session, self.before, FIT_STEPS
         start, self.before = session.source.select(self.rows), None
         if not session.options.refit:
             return start
         if before is not None:
-            start, steps = _carried(before.model, before.rows, start, self.rows), min(steps, _NEXT_STEPS)
+            start, steps = _carried(before.model, before.rows, start, self.rows), _NEXT_STEPS
         return self._adjusted(start, steps)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
@@ -172,8 +173,9 @@ class FittedSplats:
         """Adjust what may be other than zero."""
         session = self.session
         return adjust(
-            model, session.taught, session.wanted, session.options, steps=steps, free=free, progress=self.progress
-        )
+            model, session.taught, session.wanted, session.options, steps=session.options.steps(steps), free=free,
+            progress=self.progress,
+        )  # fmt: skip
 
     def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
         if graded and most_grades(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):

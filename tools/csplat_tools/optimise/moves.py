@@ -103,7 +103,7 @@ class Moves:
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole) - MENDED
-        for _ in range(_COUNTS):
+        for _ in range(1 if removal.options.is_brief else _COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
                 break
             part = removal.fitted(left, allowed, seen)
@@ -113,7 +113,7 @@ class Moves:
                 left = _more(left)
                 continue
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
-            tries = self.codings.best(solver, part, quality)
+            tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
             trial, before = tries[0], left
             found += tries
             if math.isinf(solver.cost(trial)):

@@ -37,8 +37,9 @@ from csplat_tools.views.timing import picture_seconds
 __all__ = ["check", "expected_seconds", "optimise"]
 
 #: What a target costs, in pictures of 640x480, without removal (380 to 690 of plane3, donut, lego60k and fox120k) and
-#: with it (3,320 and 3,480 of plane3 and donut at 40 dB, 2,410 of lego60k at 34).
-_PICTURES = (520.0, 3000.0)
+#: with it: whatever the effort, and by how much work that is (plane3 at 40 dB at 1, 3 and 7: as 0.6 to 1 to 4).
+_PICTURES = 520.0
+_PICTURES_OF_FEWER = (600.0, 2400.0)
 _INSIDE = (
     "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
     " --data, or --cameras with 40 of them, would decide by yours, --keep-all leaves all"
@@ -107,13 +108,21 @@ def optimise(
 
 
 def expected_seconds(
-    source: SplatModel, encoding: EncodeOptions, target: Target, views: ViewSet, *, keep_all: bool
+    source: SplatModel,
+    encoding: EncodeOptions,
+    target: Target,
+    views: ViewSet,
+    *,
+    keep_all: bool,
+    simplifying: SimplifyOptions | None = None,
 ) -> float:
     """About how long a target takes here, for a person who may choose otherwise.
 
     By how long the views that judge take now: what is done costs so many pictures of them, whatever the machine.
     """
-    pictures = _PICTURES[not _all_stay(target, encoding, keep_all=keep_all)]
+    pictures = _PICTURES
+    if not _all_stay(target, encoding, keep_all=keep_all):
+        pictures = _PICTURES_OF_FEWER[0] + _PICTURES_OF_FEWER[1] * (simplifying or SimplifyOptions()).work
     return pictures * picture_seconds(source, views.judges, threads=encoding.threads)
 
 

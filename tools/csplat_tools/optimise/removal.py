@@ -28,7 +28,7 @@ _USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, wit
 _FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated errors
 _MOST_REMOVED = 0.7  # of the error that a PSNR allows
 _LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
-_MENDED = 8.0  # dB that a fit makes removal err by less, about
+_MENDED, _MENDS_MORE = 8.0, 1.0  # dB that a fit makes removal err by less, about, and with twice the work
 _FAR = 2.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
 _FARTHER = 4.0  # times the error of an order, where that was too little
 _CALIBRATIONS = 3
@@ -136,7 +136,7 @@ class Removal:
         return self._least(_at_size(left, quantised, slope), (left, removed))
 
     def _calibrated(self, cost: Cost, seen: Seen) -> int:
-        mends = error_of_psnr(_MENDED)
+        mends = error_of_psnr(self._mended)
         left = self._least(cost, None)
         for _ in range(_CALIBRATIONS):
             if left == len(self.source):
@@ -157,12 +157,16 @@ class Removal:
         while True:
             errors = self._errors()
             left = len(self.source) - np.arange(len(errors), dtype=np.float64)
-            fitted = error_of_psnr(_MENDED) * errors
+            fitted = error_of_psnr(self._mended) * errors
             if known is not None:
                 fitted = known[1] * np.power(errors / self._error(known[0]), _GROWS)
             best = int(np.argmin(cost(left, fitted)))
             if best < len(errors) - 1 or not self._goes_on():
                 return int(left[best])
+
+    @property
+    def _mended(self) -> float:
+        return _MENDED + _MENDS_MORE * math.log2(self.options.work)
 
     def _goes_on(self) -> bool:
         """Let the order go on until removal errs by several times as much; false where it goes no further."""

@@ -3,11 +3,13 @@
     python -m csplat_bench.distortion plain                       # peers, and files of whole scenes; half an hour
     python -m csplat_bench.distortion simplified                  # files of simplified scenes; two hours
     python -m csplat_bench.distortion simplified --offsets=-4,2   # below and above the PSNR of SPZ, too
+    python -m csplat_bench.distortion simplified --offsets= --psnr 45   # wherever SPZ is
     python -m csplat_bench.distortion tables --markdown           # print what was measured, plot it
 
 Peers are written in the same run, by splat-transform: SPZ, and SOG where that takes minutes at most (one iteration of
 its k-means). PSNR is against the source from the cameras of the data folder (psnr_cameras/NAME.json). What was measured
-is kept scene by scene in out/distortion/NAME.json: an interrupted run goes on where it ended; --again forgets.
+is kept scene by scene in tools/benchmarks/distortion/NAME.json: an interrupted run goes on where it ended; --again
+forgets.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import tell_machine
-from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes, given_cameras, judge_of
+from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes, given_cameras, judge_of
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.distortion.known import GRADED, KeptPoint, Measured, Simplified
 from csplat_bench.distortion.plot import plot as draw
@@ -59,6 +61,7 @@ from csplat_tools.optimise.sensitivity import measured_importance, measuring_vie
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
+_KEPT = ROOT / "tools" / "benchmarks" / "distortion"
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
 _SH_CODINGS: dict[str, ShCoding] = {"scalar": "scalar", "codebook": "codebook"}
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
@@ -81,13 +84,14 @@ def main(
     *,
     scenes: SCENES = _SCENES,
     offsets: Annotated[str, typer.Option(help="dB beside the PSNR of SPZ")] = "0",
+    psnr: Annotated[str, typer.Option(help="dB, wherever SPZ is")] = "",
     views: VIEWS = 160,
     again: AGAIN = False,
     markdown: MARKDOWN = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="draw the curves: tools/study/distortion.svg")
     ] = None,
-    out: OUT = EVERYTHING / "distortion",
+    out: OUT = _KEPT,
     cache: CACHE = MADE,
     peers: PEERS = NPM,
 ) -> None:
@@ -104,11 +108,11 @@ def main(
             bench = _Bench(scene, source, judge_of(scene.name, source), kept)
             kept.values |= {"machine": machine, "splats": len(source), "sh_degree": source.sh_degree}
             kept.values["cameras"] = "given" if given_cameras(scene.name) else "virtual"
-            _peers(bench, command, out / "peers")
+            _peers(bench, command, EVERYTHING / "distortion")
             if what == Part.plain:
                 _plain(bench)
             else:
-                _simplified(bench, numbers(offsets, float), views)
+                _simplified(bench, numbers(offsets, float), numbers(psnr, float), views)
     known = read_kept(out)
     chosen = {name: Measured(known[name]) for name in names if name in known}
     print(tables(chosen, markdown=markdown))
@@ -213,13 +217,12 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
     bracket(plain[name], goal, measure, start=start, limits=_QUALITIES, ceiling=ceiling, most=most)
 
 
-def _simplified(bench: _Bench, offsets: Sequence[float], views: int) -> None:
-    """The smallest files that reach PSNRs beside that of SPZ, where splats may go."""
+def _simplified(bench: _Bench, offsets: Sequence[float], psnrs: Sequence[float], views: int) -> None:
+    """The smallest files that reach some PSNRs, and others beside that of SPZ, where splats may go."""
     spz = bench.goals.get("SPZ")
-    if spz is None:
-        return
-    for offset in offsets:
-        bench.kept.measure("simplified", f"{offset:+g}", partial(_reached, bench, spz + offset, views))
+    goals = {} if spz is None else {f"{offset:+g}": spz + offset for offset in offsets}
+    for name, goal in {**goals, **{f"{psnr:g} dB": psnr for psnr in psnrs}}.items():
+        bench.kept.measure("simplified", name, partial(_reached, bench, goal, views))
 
 
 def _reached(bench: _Bench, goal: float, views: int) -> Simplified:

@@ -74,7 +74,7 @@ class Values(TypedDict, total=False):
 
     Attributes:
         cameras: those that judge.
-        peers: by format. plain: by preset and coding of SH. simplified: by dB beside SPZ.
+        peers: by format. plain: by preset and coding of SH. simplified: by dB beside SPZ, or by dB.
     """
 
     machine: Machine

@@ -17,13 +17,13 @@ from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 
-__all__ = ["BAND_STEPS", "Fit", "fit"]
+__all__ = ["BAND_STEPS", "FIT_STEPS", "Fit", "fit"]
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Of a fit after bands were left out.
-BAND_STEPS = 160
+#: Of a fit, and of one after bands were left out.
+FIT_STEPS, BAND_STEPS = 960, 160
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def fit(
         progress: is told how much is done.
     """
     if options.refit:
-        model = adjust(model, cameras, wanted, options, steps=options.steps, progress=progress)
+        model = adjust(model, cameras, wanted, options, steps=options.steps(FIT_STEPS), progress=progress)
     if not options.bands or not model.sh_degree:
         return Fit(model, None)
     error = 0.0
@@ -74,5 +74,7 @@ def fit(
         model = without(model, stays)
         if options.refit:
             free = free_coefficients(stays)
-            model = adjust(model, cameras, wanted, options, steps=BAND_STEPS, free=free, progress=progress)
+            model = adjust(
+                model, cameras, wanted, options, steps=options.steps(BAND_STEPS), free=free, progress=progress
+            )
     return Fit(model, stays)

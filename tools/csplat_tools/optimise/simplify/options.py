@@ -9,6 +9,8 @@ from csplat_tools.views import VIEW_COUNT, VIEW_SIZE
 
 __all__ = ["SimplifyOptions"]
 
+_USUAL = 3  # effort
+
 
 @dataclass(frozen=True)
 class SimplifyOptions:
@@ -17,7 +19,8 @@ class SimplifyOptions:
     Attributes:
         rounds: how often errors are measured anew on the way, at least 1.
         refit: fit colours, opacities, scales and rotations of what stays to the source's renders.
-        steps: of that fit; each looks at one view.
+        effort: how much work that is, 1 to 9: each one less than 3 takes half of the steps of descent, every two more
+            twice as many; below 3 a target tries fewer things.
         bands: set SH bands to zero that are worth less than their bits.
         keep_unseen: splats that no view shows stay.
         view_size: of the pictures that teach, width and height in pixels.
@@ -32,7 +35,7 @@ class SimplifyOptions:
 
     rounds: int = 4
     refit: bool = True
-    steps: int = 960
+    effort: int = _USUAL
     bands: bool = True
     keep_unseen: bool = True
     view_size: tuple[int, int] = VIEW_SIZE
@@ -42,8 +45,25 @@ class SimplifyOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "steps", "views"):
+        if not 1 <= self.effort <= 9:
+            raise InputError(f"effort is {self.effort}, wanted 1 to 9")
+        for name in ("rounds", "views"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
         if min(self.view_size) < 1:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")
+
+    def steps(self, usual: int) -> int:
+        """Steps of descent in place of so many, which are usual."""
+        return max(1, round(usual * self.work))
+
+    @property
+    def work(self) -> float:
+        """How many times as much work as is usual."""
+        octaves = self.effort - _USUAL
+        return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
+
+    @property
+    def is_brief(self) -> bool:
+        """Whether a target tries fewer things."""
+        return self.effort < _USUAL

@@ -64,7 +64,7 @@ class Session:
         options: how to go about it.
         around: from where it is looked at.
         views: those that teach, and others.
-        taught: those that the others are fitted to; virtual ones are as many again, for a fit follows its views.
+        taught: those that the others are fitted to; virtual ones are as many again at least: a fit follows its views.
         wanted: what the source looks like from these.
         order: of removal.
         checked: judges by views that were not used.
@@ -124,7 +124,8 @@ def prepare(
     draw = renderer(source, around.background, threads=options.threads)
     taught = list(found.used)
     if around.virtual:
-        taught += camera_sequence(source, len(found.used), options.view_size, seed=options.seed + 1)
+        more = round(len(found.used) * max(1.0, options.work))
+        taught += camera_sequence(source, more, options.view_size, seed=options.seed + 1)
     wanted = [draw(camera).rgb for camera in taught]
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
