@@ -28,12 +28,21 @@ from csplat_tools.optimise import optimiser
 from csplat_tools.optimise.optimiser import expected_seconds
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.removal import Removal
+from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trials, spread_of
-from csplat_tools.views import BLACK, ViewSet, camera_sequence, comparison_cameras, find_view_set, with_deciders
+from csplat_tools.views import (
+    BLACK,
+    ViewSet,
+    camera_sequence,
+    comparison_cameras,
+    elsewhere,
+    find_view_set,
+    with_deciders,
+)
 from csplat_tools.views.viewset import pose
 from csplat_trainer.pictures import Picture
 
@@ -494,6 +503,7 @@ def test_the_report_says_what_why_and_how_sure(at_30):
     assert len(report.tried) == report.encodes
     assert 8 == report.views
     assert report.worst_psnr <= report.psnr
+    assert {"beside", "nearer", "farther"} == set(report.elsewhere)
     assert "8 virtual views" in report.sure
     assert any("left out" in line for line in report.why)
     assert report.removal_views > 0
@@ -531,3 +541,19 @@ def test_seconds_of_a_picture_are_measured(scene, monkeypatch):
     assert [640, 640, 640] == drawn  # the first one is not counted
     assert pytest.approx(0.3072) == timing.picture_seconds(scene, cameras, mode="exact")
     assert [80] == drawn[3:]
+
+
+@pytest.mark.parametrize(("beside", "said"), [(39.5, "39.50 beside"), (37.0, "37.00 beside: up to 3.0 dB less")])
+def test_what_nobody_looked_at_is_told_and_a_loss_there_by_name(beside, said):
+    report = Report({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": beside})
+    assert 1 == sum(said in line for line in report.lines())
+
+
+def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
+    centre = scene_frame(scene).centre
+    near, usual, far = (elsewhere(scene)[kind] for kind in ("nearer", "beside", "farther"))
+    for one, other, third in zip(near, usual, far, strict=True):
+        eyes = [np.linalg.inv(camera.viewmat)[:3, 3] - centre for camera in (one, other, third)]
+        np.testing.assert_allclose(eyes[0], 0.6 * eyes[1], atol=1e-9)
+        np.testing.assert_allclose(eyes[2], 2.0 * eyes[1], atol=1e-9)
+        np.testing.assert_array_equal(one.viewmat[:3, :3], third.viewmat[:3, :3])

@@ -31,7 +31,7 @@ from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.solving import Solver
 from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, Whole
-from csplat_tools.views import VIRTUAL, ViewSet, with_deciders
+from csplat_tools.views import VIRTUAL, ViewSet, elsewhere, with_deciders
 from csplat_tools.views.timing import picture_seconds
 
 __all__ = ["check", "expected_seconds", "optimise"]
@@ -102,6 +102,7 @@ def optimise(
         remarks=[_INSIDE] * (inside and found.splats < len(source)), encodes=len(trials.made), seconds=0.0,
         photographs=photo, sensitivity_views=sensitivity_views,
         removal_views=0 if removal is None else removal.view_count,
+        elsewhere=_seen_elsewhere(source, found, views, encoding.threads),
         reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return found, report
@@ -150,6 +151,15 @@ def _is_empty(judge: Judge) -> bool:
     """Whether all pictures that judge are of one colour each."""
     pictures = (judge.look(number).picture for number in range(len(judge.cameras)))
     return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
+
+
+def _seen_elsewhere(source: SplatModel, found: Trial, views: ViewSet, threads: int | None) -> dict[str, float]:
+    """PSNR from views that had no part in the search, by kind."""
+    model, judged = decode(found.result.data), elsewhere(source).items()
+    return {
+        kind: round(Judge.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
+        for kind, cameras in judged
+    }
 
 
 def _photographed(source: SplatModel, found: Trial, views: ViewSet, threads: int | None) -> dict[str, float]:

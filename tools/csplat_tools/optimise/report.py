@@ -11,6 +11,8 @@ from csplat_tools.files.console import format_bytes
 
 __all__ = ["Optimised", "Report"]
 
+_LESS = 1.0  # dB below the PSNR, that are worth a word
+
 
 @dataclass(frozen=True)
 class Report:
@@ -24,6 +26,8 @@ class Report:
         psnr: of the file against the source, dB; `None` where nothing was rendered, as all that follows.
         photographs: PSNR of `file` and `source` by the photographs that judge, where there are some.
         worst_psnr: of the worst view. spread: what other such views would make of the PSNR, one standard deviation, dB.
+        elsewhere: PSNR from virtual views that had no part in the search, dB: `beside` those of `psnr`, and the same
+            `nearer` and `farther`.
         views: that judged. views_of: where they come from. renders: pictures that were judged.
         removal_views, sensitivity_views: small views in which removal and the precision wanted were measured.
         chosen, tried: files, see `Trial.as_json`.
@@ -41,6 +45,7 @@ class Report:
     photographs: dict[str, float] = field(default_factory=dict)
     worst_psnr: float | None = None
     spread: float | None = None
+    elsewhere: dict[str, float] = field(default_factory=dict)
     views: int = 0
     views_of: str = ""
     renders: int = 0
@@ -75,6 +80,7 @@ class Report:
         lines += [f"chosen: {line}" for line in self.why]
         if self.psnr is not None:
             lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
+            lines += self._elsewhere(self.psnr)
         cost = f"{counted(self.encodes, 'file')} tried"
         if self.renders:
             cost += f", {counted(self.renders, 'picture')} judged"
@@ -83,6 +89,14 @@ class Report:
         if self.removal_views:
             cost += f", removal measured in {self.removal_views} small ones"
         return (*lines, cost)
+
+    def _elsewhere(self, psnr: float) -> list[str]:
+        if not self.elsewhere:
+            return []
+        shown = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
+        less = psnr - min(self.elsewhere.values())
+        worse = f": up to {less:.1f} dB less than where it was judged" if less > _LESS else ""
+        return [f"from virtual views that nothing was chosen by, PSNR {shown}{worse}"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
