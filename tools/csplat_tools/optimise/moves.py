@@ -110,7 +110,7 @@ class Moves:
             if allowed is not None and part.fitted_psnr < allowed - _HOPELESS:
                 if found:
                     break
-                left = _more(left)
+                left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
                 continue
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
