@@ -44,7 +44,7 @@ _SPLATS_LOOKED_AT = 1_000_000  # more take longer to render than anybody wants t
 class Goal(Group):
     """What the file is to keep to."""
 
-    one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "keep_all"))
+    one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "keep_all"), ("effort", "keep_all"))
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "max_loss": ("data",),
         "keep_all": ("target_psnr", "target_size", "max_loss", "max_error"),
@@ -60,7 +60,7 @@ class Goal(Group):
     ] = None
     max_loss: Annotated[
         str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Most PSNR lost on photographs of --data."),
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="PSNR that --data's pictures may lose."),
     ] = None
     keep: Annotated[
         float | None,

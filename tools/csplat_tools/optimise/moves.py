@@ -12,7 +12,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.exchange import BYTES_PER_DB, error_of_psnr
 from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.solving import MENDED, Solver, bounded
+from csplat_tools.optimise.solving import TUNING_GAINS, Solver, bounded
 from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
 
 __all__ = ["Moves"]
@@ -102,7 +102,7 @@ class Moves:
         slope, found, seen = self._slope_of_counts(whole), list[Trial](), solver.trials.decider.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
-        start = (whole.quality or 0.0) - solver.about(whole) - MENDED
+        start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
         for _ in range(1 if removal.options.is_brief else _COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
                 break

@@ -11,10 +11,10 @@ from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_
 from csplat_tools.optimise.search import FLATTEST, Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
-__all__ = ["MENDED", "Goal", "Solver", "bounded"]
+__all__ = ["TUNING_GAINS", "Goal", "Solver", "bounded"]
 
-#: dB that an adjustment through the quantisers of a file mends, about: quick files are near the goal so far below it.
-MENDED = 1.1
+#: dB that an adjustment through the quantisers of a file gains, about: quick files are near the goal so far below it.
+TUNING_GAINS = 1.1
 
 _QUALITIES = (24.0, 110.0)  # dB, between which the PSNR that each attribute keeps is looked for
 
@@ -156,7 +156,7 @@ class Solver:
     def expected(self, trial: Trial) -> float:
         """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant."""
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
-        above = trial.decided_psnr + self._mended(trial) - level
+        above = trial.decided_psnr + self._gained(trial) - level
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
         return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
@@ -167,10 +167,10 @@ class Solver:
         """
         if not self.goal.is_judged:
             return self.goal.above(trial)
-        return trial.decided_psnr + self._mended(trial) - self.level(trial.part)
+        return trial.decided_psnr + self._gained(trial) - self.level(trial.part)
 
-    def _mended(self, trial: Trial) -> float:
-        return 0.0 if trial.is_careful or not trial.part.refits else MENDED
+    def _gained(self, trial: Trial) -> float:
+        return 0.0 if trial.is_careful or not trial.part.refits else TUNING_GAINS
 
     def slope(self, trial: Trial) -> float:
         """The share of the bytes that a decibel costs here."""

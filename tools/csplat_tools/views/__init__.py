@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from csplat_tools.views.elsewhere import ELSEWHERE, elsewhere
+from csplat_tools.views.elsewhere import elsewhere
 from csplat_tools.views.finding import DataOptions, comparison_cameras, find_view_set, with_deciders
 from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced
 from csplat_tools.views.showing import showing_cameras
@@ -11,7 +11,6 @@ from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Sp
 __all__ = [
     "BLACK",
     "CHECKS",
-    "ELSEWHERE",
     "SPLITS",
     "VIEW_COUNT",
     "VIEW_SIZE",

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat_render import Camera
+from csplat_render.cameras import relative_to
 from csplat_render.virtual import scene_frame, virtual_cameras
 
-__all__ = ["ELSEWHERE", "elsewhere"]
+__all__ = ["elsewhere"]
 
-#: How many views of each kind, width and height of their pictures.
-ELSEWHERE = (12, 320, 240)
-
+_VIEWS = (12, 320, 240)  # of each kind; width and height of their pictures
 _SEED = 2000  # those that decide have 1000 and more
 _DISTANCES = {"beside": 1.0, "nearer": 0.6, "farther": 2.0}  # from the middle of the scene, times the usual
 
@@ -27,19 +24,15 @@ def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
         source: the scene; its own cameras are not looked at.
 
     Returns:
-        `ELSEWHERE[0]` cameras of each kind: `beside`, `nearer`, `farther`.
+        12 cameras of each kind: `beside`, `nearer`, `farther`.
     """
     centre = scene_frame(source).centre
-    beside = virtual_cameras(source, *ELSEWHERE, seed=_SEED)
+    beside = virtual_cameras(source, *_VIEWS, seed=_SEED)
     return {kind: [_at(camera, centre, times) for camera in beside] for kind, times in _DISTANCES.items()}
 
 
 def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
     """The camera with its distance from a centre multiplied."""
-    if times == 1.0:
-        return camera
-    viewmat = camera.viewmat.copy()
-    turn = viewmat[:3, :3]
-    eye = -turn.T @ viewmat[:3, 3]
-    viewmat[:3, 3] = -turn @ (centre + times * (eye - centre))
-    return replace(camera, viewmat=viewmat)
+    turn = camera.viewmat[:3, :3]
+    eye = -turn.T @ camera.viewmat[:3, 3]
+    return relative_to((1.0 - times) * (eye - centre), camera)

@@ -1,7 +1,7 @@
 """Measure rate against distortion beside SPZ and SOG: bytes at equal PSNR, without and with simplification.
 
     python -m csplat_bench.distortion plain                       # peers, and files of whole scenes; half an hour
-    python -m csplat_bench.distortion simplified                  # files of simplified scenes; two hours
+    python -m csplat_bench.distortion simplified                  # files of simplified scenes; an hour
     python -m csplat_bench.distortion simplified --offsets=-4,2   # below and above the PSNR of SPZ, too
     python -m csplat_bench.distortion simplified --offsets= --psnr 45   # wherever SPZ is
     python -m csplat_bench.distortion tables --markdown           # print what was measured, plot it
