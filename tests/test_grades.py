@@ -15,8 +15,10 @@ from checked import encoded
 import csplat
 from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
 from csplat.encoder.apart import cut_scene
+from csplat.encoder.colour import quantise_colour
 from csplat.encoder.curvature import GRADED, Curvatures, step_errors
 from csplat.encoder.draft import tried_rows
+from csplat.encoder.geometry import quantise_shape
 from csplat.encoder.grades import choose_grades
 from csplat.encoder.importance import trusted
 from csplat.encoder.measure import covariance_entries
@@ -24,6 +26,7 @@ from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
 from csplat.model import normalise_quats
+from csplat_trainer.tuning.rate import cost_slopes
 from csplat_trainer.tuning.state import TunedScene
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -204,11 +207,23 @@ def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
 
 
-def test_bytes_of_several_grades_are_not_counted_together(model):
-    scene = TunedScene(Draft.of(model, importance=important(model)).frozen())
-    seen, _ = scene.seen()
-    with pytest.raises(InputError, match="several grades"):
-        scene.count(seen, 1.0)
+def test_integers_of_each_grade_are_counted_as_they_are_coded(model):
+    """Those of the encoder, whole multiples divided by what they are multiples of."""
+    frozen = Draft.of(model, EncodeOptions(sh_coding="none"), importance=important(model)).frozen()
+    scene, plan, tiles = TunedScene(frozen), frozen.plan, frozen.draft.tiles
+    held, bits = scene.held, 0.0
+    grades = list(dict.fromkeys(tile.coarse for tile in tiles))
+    assert len(grades) > 1
+    for coarse in grades:
+        rows = np.concatenate([tile.rows for tile in tiles if tile.coarse == coarse])
+        shape = quantise_shape(held.quats[rows], held.scales[rows], plan, None, coarse)
+        alpha = opacity_levels(held.opacities[rows], plan.opacity_levels, square=True, multiple=coarse.opacities)
+        colour = quantise_colour(
+            np.ascontiguousarray(held.sh0[rows].T), plan.sh0_step, plan.chroma_shift, coarse.sh0
+        ).columns
+        for columns in (shape.scales, shape.quats // coarse.quats, alpha[None] // coarse.opacities, colour):
+            bits += cost_slopes(columns.T)[1]
+    assert scene.count(scene.seen()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 
 def test_codings_are_tried_on_splats_of_all_grades(model):

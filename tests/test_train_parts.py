@@ -18,7 +18,9 @@ def parameters(make_model):
     return Parameters.starting_at(from_model(make_model(40, 2), 2))
 
 
-def test_adam_is_the_textbook_s(parameters):
+@pytest.mark.parametrize("beta2", [0.999, 0.98])
+def test_adam_is_the_textbook_s(parameters, beta2):
+    parameters.beta2 = beta2
     rng = np.random.default_rng(0)
     gradients = [
         {name: rng.standard_normal(parameters.values[name].shape).astype(np.float32) for name in GROUPS}
@@ -28,8 +30,8 @@ def test_adam_is_the_textbook_s(parameters):
     m, v = np.zeros_like(x), np.zeros_like(x)
     for step, gradient in enumerate(gradients, 1):
         g = gradient["means"].astype(np.float64)
-        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-        x -= 0.01 * (m / (1 - 0.9**step)) / (np.sqrt(v / (1 - 0.999**step)) + 1e-15)
+        m, v = 0.9 * m + 0.1 * g, beta2 * v + (1 - beta2) * g * g
+        x -= 0.01 * (m / (1 - 0.9**step)) / (np.sqrt(v / (1 - beta2**step)) + 1e-15)
         adam_step(parameters, gradient, dict.fromkeys(GROUPS, 0.01))
     assert np.abs(parameters.values["means"] - x).max() <= 1e-6
     assert np.abs(np.linalg.norm(parameters.values["quats"], axis=1) - 1).max() <= 1e-6

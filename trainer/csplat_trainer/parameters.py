@@ -22,7 +22,7 @@ Splats = dict[str, F32]
 #: Names of the arrays of `Splats`, in the order of everything that goes through them.
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
+_BETA1, _EPSILON = 0.9, 1e-15
 _LOGIT_LIMIT = 14.0  # float32 alpha has few digits beyond
 _BLOCK = 1 << 13  # values that one thread takes at a time
 
@@ -37,12 +37,14 @@ class Parameters:
         first: Adam's running mean of the gradients, the same shapes.
         second: Adam's running mean of their squares.
         step: how many steps Adam has made.
+        beta2: share of the mean of squares that a step leaves.
     """
 
     values: Splats
     first: Splats
     second: Splats
     step: int = 0
+    beta2: float = 0.999
 
     @classmethod
     def starting_at(cls, values: Splats) -> Parameters:
@@ -124,7 +126,7 @@ def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]
     """
     parameters.step += 1
     correction1 = 1.0 - _BETA1**parameters.step
-    correction2 = math.sqrt(1.0 - _BETA2**parameters.step)
+    correction2 = math.sqrt(1.0 - parameters.beta2**parameters.step)
     for name, value in parameters.values.items():
         if value.size:
             _adam(
@@ -134,17 +136,30 @@ def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]
                 parameters.second[name].reshape(-1),
                 np.float32(rates[name] / correction1),
                 np.float32(1.0 / correction2),
+                np.float32(parameters.beta2),
+                np.float32(1.0 - parameters.beta2),
             )
     _constrain(parameters.values["quats"], parameters.values["logits"])
 
 
 @parallel_kernel(relaxed=True)
 def _adam(
-    lane: int, lanes: int, value: F32, gradient: F32, first: F32, second: F32, rate: np.float32, over: np.float32
+    lane: int,
+    lanes: int,
+    value: F32,
+    gradient: F32,
+    first: F32,
+    second: F32,
+    rate: np.float32,
+    over: np.float32,
+    b2: np.float32,
+    a2: np.float32,
 ) -> None:
-    """Adam on a flat array; vectorises over its values."""
-    b1, b2 = np.float32(_BETA1), np.float32(_BETA2)
-    a1, a2 = np.float32(1.0 - _BETA1), np.float32(1.0 - _BETA2)
+    """Adam on a flat array; vectorises over its values.
+
+    `a2` is 1 - `b2`, which a compiler that knows of it may turn into a difference of squares: of infinite ones NaN.
+    """
+    b1, a1 = np.float32(_BETA1), np.float32(1.0 - _BETA1)
     epsilon, tiny = np.float32(_EPSILON), np.float32(1e-30)
     blocks = (value.shape[0] + _BLOCK - 1) // _BLOCK
     for block in range(lane, blocks, lanes):

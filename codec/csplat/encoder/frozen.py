@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["DecodedValues", "FreeValues", "Frozen"]
 
 F32 = NDArray[np.float32]
+_MANY = 50_000  # splats; with fewer, threads take longer to start than they save
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
@@ -181,7 +182,7 @@ class Frozen:
     def seen(self, held: FreeValues) -> DecodedValues:
         """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""
         tiles, plan = self.draft.tiles, self.plan
-        if self.draft.options.threads == 1:
+        if self.draft.options.threads == 1 or len(self.draft.model) < _MANY:
             shN, (quats, scales) = self.seen_sh(held.sh), self._seen_shapes(held)
             means, sh0 = seen_means(held.means, tiles, plan), self.seen_sh0(held.sh0)
         else:

@@ -18,6 +18,7 @@ __all__ = ["Codings"]
 _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _SHARE_AT = (38.0, 1 / 64, 0.4)  # dB of a file, entries of its SH codebook per splat, and how many octaves a dB is
 _SHARE_STEP = 4.0
+_FITTED = 2.0  # times as many per splat where others were taken away: those that stay differ more
 _SHARES = (1 / 4096, 1 / 8)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
@@ -57,7 +58,7 @@ class Codings:
             return [Coding("none")]
         coarse = self.gradable and not part.refits and self.encoding.adaptive is None
         scalar = Coding("scalar", adaptive=_ADAPTIVE if coarse else None)
-        kinds = {"scalar": [scalar], "codebook": [Coding("codebook", _share(psnr))]}
+        kinds = {"scalar": [scalar], "codebook": [Coding("codebook", _share(psnr) * (_FITTED if part.refits else 1.0))]}
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
         huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
@@ -87,7 +88,8 @@ class Codings:
             return tried.ordered()
         if self.encoding.codebook_size is None:
             for book in [coding for coding in tried.found if coding.sh == "codebook"]:
-                if tried.add(book) < tried.add(tried.best) + (0.0 if part.refits else _CLOSE) + 1e-9:
+                close = tried.add(book) < tried.add(tried.best) + (0.0 if part.refits else _CLOSE) + 1e-9
+                if close or tried.is_off(book):
                     tried.resize(book)
         if tried.best.adaptive is not None:
             tried.add(replace(tried.best, adaptive=None))
@@ -166,7 +168,7 @@ class _Tried:
                 quality -= _BOOKED
             found[coding] = trial = solver.near(self.part, coding, quality, 1)
             unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
-            if solver.expected(trial) < known + unsure and not (sized and self._is_off(trial)):
+            if solver.expected(trial) < known + unsure and not (sized and self.is_off(coding)):
                 found[coding] = solver.near(self.part, coding, quality, _TRIES)
         return solver.expected(found[coding])
 
@@ -190,19 +192,19 @@ class _Tried:
             best = self.best
             self.found[best] = self.solver.closer(self.found[best])
 
+    def is_off(self, coding: Coding) -> bool:
+        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
+        if coding.share is None:
+            return False
+        above = self.solver.about(self.found[coding])
+        share = coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
+        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
+
     def _quality(self) -> float:
         """The precision at which the best of those tried would meet the goal."""
         known = min(self.found.values(), key=self.solver.cost)
         assert known.quality is not None
         return known.quality - self.solver.about(known)
-
-    def _is_off(self, trial: Trial) -> bool:
-        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
-        if trial.coding.share is None:
-            return False
-        above = self.solver.about(trial)
-        share = trial.coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
-        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
 
 
 def _share(psnr: float) -> float:

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BYTES_PER_DB", "LEAST_QUANTISED", "error_at_size", "error_of_psnr", "log_bytes_at_error"]
+__all__ = ["BYTES_PER_DB", "LEAST_QUANTISED", "error_at_size", "error_of_psnr", "log_bytes_at_error", "price_of_bytes"]
 
 F64 = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def error_at_size(left: F64, removed: F64, quantised: float, slope: float) -> F6
         quantised: mean squared error.
         slope: share of the bytes that a decibel costs.
     """
-    return np.asarray(removed + quantised * left ** (1.0 / _power(slope)))
+    return np.asarray(removed + quantised * left ** (1.0 / price_of_bytes(slope)))
 
 
 def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slope: float) -> F64:
@@ -54,8 +54,13 @@ def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slo
     """
     fits = removed <= most * allowed
     spare = np.where(fits, allowed - removed, 1.0)
-    return np.where(fits, np.log(left) - _power(slope) * np.log(spare), np.inf)
+    return np.where(fits, np.log(left) - price_of_bytes(slope) * np.log(spare), np.inf)
 
 
-def _power(slope: float) -> float:
+def price_of_bytes(slope: float) -> float:
+    """The power k with which bytes grow while the error falls.
+
+    Args:
+        slope: share of the bytes that a decibel costs.
+    """
     return slope * 10.0 / math.log(10.0)

@@ -36,7 +36,6 @@ _GRADED = 4_000  # splats; what is left of smaller scenes is too alike
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
-_NEXT_STEPS = 480  # where another number of splats was fitted before
 _FILE_STEPS = 480  # through the quantisers of a file
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
@@ -152,13 +151,13 @@ class FittedSplats:
 
     @cached_property
     def _fitted(self) -> SplatModel:
-        session, before, steps = self.session, self.before, FIT_STEPS
+        session, before = self.session, self.before
         start, self.before = session.source.select(self.rows), None
         if not session.options.refit:
             return start
         if before is not None:
-            start, steps = _carried(before.model, before.rows, start, self.rows), _NEXT_STEPS
-        return self._adjusted(start, steps)
+            start = _carried(before.model, before.rows, start, self.rows)
+        return self._adjusted(start, FIT_STEPS)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
         """The splats without the bands that are not worth their bits where files err by so much; those that stay."""

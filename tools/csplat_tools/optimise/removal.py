@@ -33,7 +33,8 @@ _FAR = 2.0  # times the error that a PSNR allows: what is removed together mostl
 _FARTHER = 4.0  # times the error of an order, where that was too little
 _CALIBRATIONS = 3
 _AGREED = 0.05  # of the splats
-_GROWS = 0.85  # power of the error of removal with which that of what is left grows, once it is fitted
+_GROWS = 0.85  # power of the error of removal with which that of what is left grows, once it is fitted, about
+_GROW = (0.5, 1.1)  # between which two fits may say what it is
 _NOTHING = 1e-12
 
 
@@ -60,6 +61,7 @@ class Removal:
     left: int | None = None
     _session: Session | None = field(default=None, init=False)
     _fitted: FittedSplats | None = field(default=None, init=False)
+    _before: tuple[int, float] | None = field(default=None, init=False)
 
     @property
     def session(self) -> Session:
@@ -120,7 +122,8 @@ class Removal:
             psnr, slope: as above.
         """
         removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
-        return self._least(_at_psnr(psnr, slope), (left, removed))
+        before, self._before = self._before, (left, removed)
+        return self._least(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
 
     def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
         """How many are likely to make the best file of a size.
@@ -147,19 +150,27 @@ class Removal:
                 break
         return left
 
-    def _least(self, cost: Cost, known: tuple[int, float] | None) -> int:
+    def _growing(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
+        """The power with which errors grow once splats are fitted, by two numbers of them and their errors."""
+        if before is None or before[0] == known[0]:
+            return _GROWS
+        removed = math.log(self._error(known[0]) / self._error(before[0]))
+        return min(max(math.log(known[1] / before[1]) / removed, _GROW[0]), _GROW[1]) if removed else _GROWS
+
+    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> int:
         """Splats left where a cost of their number and of the error of the others is least.
 
         Args:
             cost: of both.
             known: so many splats have this error once they are fitted; `None`: what a fit usually mends.
+            power: with which that grows where more is removed.
         """
         while True:
             errors = self._errors()
             left = len(self.source) - np.arange(len(errors), dtype=np.float64)
             fitted = error_of_psnr(self._mended) * errors
             if known is not None:
-                fitted = known[1] * np.power(errors / self._error(known[0]), _GROWS)
+                fitted = known[1] * np.power(errors / self._error(known[0]), power)
             best = int(np.argmin(cost(left, fitted)))
             if best < len(errors) - 1 or not self._goes_on():
                 return int(left[best])

@@ -8,13 +8,13 @@ back where it shows. Shares are counted anew from time to time.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen
-from csplat.errors import InputError
 from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import Splats
 
@@ -47,7 +47,7 @@ class Costs:
     Attributes:
         frozen: lattices.
         weight: loss per bit and splat.
-        tables: by attribute: slopes in bits per step, [columns, 2 · 128 + 1].
+        tables: by attribute, and grade where there are several: slopes in bits per step, [columns, 2 · 128 + 1].
         bits: of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
     """
 
@@ -64,28 +64,28 @@ class Costs:
             frozen: what was decided.
             stored: what the streams hold.
             weight: loss per bit and splat.
-
-        Raises:
-            InputError: the splats are of several grades: integers of several steps are not counted together.
         """
-        if frozen.draft.grades is not None:
-            raise InputError("the splats are of several grades, wanted one: draft them with graded=False")
         costs = cls(frozen, weight, {})
         plan = frozen.plan
-        columns = {
-            "scales": _integers(stored.scales, plan.scale_step),
-            "sizes": _integers(stored.sizes[:, None], plan.scale_step),
-            "quats": _integers(stored.quats[:, 1:], 1.0 / (_ROOT2 * plan.quat_levels)),
-            "opacities": np.rint(np.sqrt(stored.opacities) * plan.opacity_levels).astype(np.int32)[:, None],
-            "sh0": colour_integers_of(stored.sh0[:, None], plan.sh0_step, plan.chroma_shift).reshape(-1, 3),
-        }
+        for number, grade in enumerate(_grades(frozen)):
+            rows = grade.rows
+            columns = {
+                "scales": _integers(stored.scales[rows], grade.scale_step),
+                "quats": _integers(stored.quats[rows, 1:], grade.quat_step),
+                "opacities": np.rint(np.sqrt(stored.opacities[rows]) * grade.levels).astype(np.int32)[:, None],
+                "sh0": colour_integers_of(stored.sh0[rows, None], grade.sh0_step, plan.chroma_shift).reshape(-1, 3),
+            }
+            for name, values in columns.items():
+                costs._count(_of_grade(name, number), values)
+        costs._count("sizes", _integers(stored.sizes[:, None], plan.scale_step))
         if stored.sh.shape[1]:
             coloured = colour_integers_of(stored.sh, plan.sh_step, plan.chroma_shift)
-            columns["shN"] = coloured.reshape(len(stored.sh), -1)
-        for name, values in columns.items():
-            costs.tables[name], bits = cost_slopes(values)
-            costs.bits += bits
+            costs._count("shN", coloured.reshape(len(stored.sh), -1))
         return costs
+
+    def _count(self, name: str, values: NDArray[Any]) -> None:
+        self.tables[name], bits = cost_slopes(values)
+        self.bits += bits
 
     @property
     def loss(self) -> float:
@@ -101,19 +101,59 @@ class Costs:
         """
         plan, tables = self.frozen.plan, self.tables
         per_bit = np.float32(self.weight / len(stored.opacities))
-        _add_plain(stored.scales, plan.scale_step, 0, tables["scales"], per_bit, steps["scales"])
-        _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
-        unit = 1.0 / (_ROOT2 * plan.quat_levels)
-        _add_plain(stored.quats, unit, 1, tables["quats"], per_bit, steps["quats"])
-        roots = np.sqrt(stored.opacities)
-        levels = np.minimum(np.rint(roots * plan.opacity_levels), _REACH).astype(np.int64)
-        # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
-        chain = np.float32(0.5 * plan.opacity_levels) * roots * (np.float32(1.0) - stored.opacities)
-        steps["logits"] += per_bit * chain * tables["opacities"][0][_REACH + levels]
         shift = plan.chroma_shift
-        _add_colour(stored.sh0[:, None], plan.sh0_step, shift, tables["sh0"], per_bit, steps["sh0"][:, None])
+        for number, grade in enumerate(_grades(self.frozen)):
+            rows = grade.rows
+            scales, quats, opacities, sh0 = (
+                tables[_of_grade(name, number)] for name in ("scales", "quats", "opacities", "sh0")
+            )
+            _add_plain(stored.scales[rows], grade.scale_step, 0, scales, per_bit, steps["scales"][rows])
+            _add_plain(stored.quats[rows], grade.quat_step, 1, quats, per_bit, steps["quats"][rows])
+            roots = np.sqrt(stored.opacities[rows])
+            levels = np.minimum(np.rint(roots * np.float32(grade.levels)), _REACH).astype(np.int64)
+            # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
+            chain = np.float32(0.5 * grade.levels) * roots * (np.float32(1.0) - stored.opacities[rows])
+            steps["logits"][rows] += per_bit * chain * opacities[0][_REACH + levels]
+            _add_colour(stored.sh0[rows, None], grade.sh0_step, shift, sh0, per_bit, steps["sh0"][rows, None])
+        _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
         if stored.sh.shape[1]:
             _add_colour(stored.sh, plan.sh_step, shift, tables["shN"], per_bit, steps["shN"])
+
+
+@dataclass(frozen=True)
+class _Grade:
+    """Rows that have the same steps, one after the other; all of them where there are no grades."""
+
+    rows: slice
+    scale_step: float
+    quat_step: float
+    levels: float
+    sh0_step: float
+
+
+def _grades(frozen: Frozen) -> list[_Grade]:
+    plan, tiles = frozen.plan, frozen.draft.tiles
+    begins = [0] if frozen.draft.grades is None else [
+        number for number, tile in enumerate(tiles) if not number or tile.coarse != tiles[number - 1].coarse
+    ]  # fmt: skip
+    found = []
+    for begin, end in pairwise([*begins, len(tiles)]):
+        coarse = tiles[begin].coarse
+        rows = slice(None) if len(begins) == 1 else slice(tiles[begin].rows[0], tiles[end - 1].rows[-1] + 1)
+        found.append(
+            _Grade(
+                rows,
+                plan.scale_step * 2.0**coarse.scales,
+                coarse.quats / (_ROOT2 * plan.quat_levels),
+                plan.opacity_levels / coarse.opacities,
+                plan.sh0_step * 2.0**coarse.sh0,
+            )
+        )
+    return found
+
+
+def _of_grade(name: str, number: int) -> str:
+    return f"{name} {number}" if number else name
 
 
 def cost_slopes(columns: NDArray[Any]) -> tuple[F32, float]:

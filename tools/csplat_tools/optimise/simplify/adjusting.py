@@ -2,7 +2,7 @@
 
 Where splats have gone, their neighbours have to cover more, and where values are quantised others may make up for it:
 colours, opacities, scales and rotations together. Steps as long as what is wrong is large. Least squares over all views
-at once (colours alone are linear) follow the views that teach and lose on others; this does not: after four looks at
+at once (colours alone are linear) follow the views that teach and lose on others; this does not: after three looks at
 each view it gains as much on views that it never saw. Centres stay: moved as well, scenes with few views lose.
 """
 
@@ -22,8 +22,10 @@ from csplat_render import Camera
 from csplat_render.arrays import Gradients, HasSplats
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.files.console import Progress
+from csplat_tools.optimise.exchange import LEAST_QUANTISED, price_of_bytes
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_trainer.parameters import Parameters, adam_step, from_model
+from csplat_trainer.tuning.rate import Costs
 from csplat_trainer.tuning.state import TunedScene
 
 __all__ = ["adjust", "adjust_frozen"]
@@ -35,7 +37,11 @@ Mask = NDArray[np.bool_]
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
 _SH_FACTOR = 2.0  # so much longer steps without SH, through quantisers as long ones
 _LARGEST_ERROR = 0.04
+_BETA2 = 0.98  # of Adam: errors fall so fast that it may not remember steps for longer
 _LAST_RATE = 0.02  # share of the rates that is left in the last steps
+_SLOPE = 0.07  # share of the bytes that a decibel costs once splats were adjusted, about
+_COUNT_EVERY = 50  # steps between counts of a file's integers
+_CENTRE_BITS = 24.0  # of a splat's centre, about, which does not move
 _SAMPLE = 8  # one view of so many says how large the error is
 
 
@@ -63,9 +69,9 @@ def adjust(
     Returns:
         The scene; splats that no view shows are as they were.
     """
-    scene = _Floats.of(model, free)
+    scene, teaching = _Floats.of(model, free), _Teaching(cameras, wanted, options, model.antialiased)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
-    _descend(scene, _Teaching(cameras, wanted, options, model.antialiased), steps, factor, progress)
+    _descend(scene, teaching, steps, factor * _length(teaching.rms(scene.seen())), progress)
     return scene.model(model)
 
 
@@ -78,7 +84,7 @@ def adjust_frozen(
     steps: int,
     progress: Progress | None = None,
 ) -> FreeValues:
-    """The same through the quantisers of a file: what is seen is what a decoder sees of it.
+    """The same through the quantisers of a file, whose bytes count: what is seen is what a decoder sees of it.
 
     Args:
         frozen: what the encoder decided.
@@ -87,9 +93,16 @@ def adjust_frozen(
     Returns:
         Values that `Frozen.coded` takes.
     """
-    scene = _Quantised(TunedScene(frozen))
-    teaching = _Teaching(cameras, wanted, options, frozen.draft.model.antialiased)
-    _descend(scene, teaching, steps, 1.0, progress)
+    model, scene = frozen.draft.model, _Quantised(TunedScene(frozen))
+    scene.tuned.parameters.beta2 = _BETA2
+    teaching = _Teaching(cameras, wanted, options, model.antialiased)
+    rms, removed = teaching.rms(scene.seen()), teaching.rms(model)
+    quantised = max(rms**2 - removed**2, LEAST_QUANTISED * rms**2)
+    if math.isfinite(quantised):
+        values = sum(picture.size for picture in wanted) / len(wanted)
+        # By how much it grows where a share of the bytes is saved; half of it, as views give half of its gradient.
+        scene.price = 0.5 * quantised * values / price_of_bytes(_SLOPE)
+    _descend(scene, teaching, steps, _length(rms), progress)
     return scene.tuned.held.copy()
 
 
@@ -126,16 +139,20 @@ class _Teaching:
         return math.sqrt(np.mean(errors))
 
 
-def _descend(scene: _Scene, teaching: _Teaching, steps: int, factor: float, progress: Progress | None) -> None:
+def _length(rms: float) -> float:
+    """Of the first steps, where pictures are so wrong."""
+    return min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
+
+
+def _descend(scene: _Scene, teaching: _Teaching, steps: int, length: float, progress: Progress | None) -> None:
     """Move the values of a scene, by Adam."""
-    count, rms = len(teaching.cameras), teaching.rms(scene.seen())
-    scale = factor * min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
+    count = len(teaching.cameras)
     rng = np.random.default_rng(teaching.seed)
     order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
     for step, view in enumerate(order[:steps]):
         gradients = teaching.rasteriser.backward(teaching.wrong(scene.seen(), view))
         share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
-        scene.step(gradients, {name: scale * share * rate for name, rate in _RATES.items()})
+        scene.step(gradients, {name: length * share * rate for name, rate in _RATES.items()})
         if progress is not None:
             progress("adjusting splats", (step + 1) / steps)
 
@@ -153,7 +170,9 @@ class _Floats:
     def of(cls, model: SplatModel, free: Mask | None) -> _Floats:
         start = {name: array for name, array in from_model(model, model.sh_degree).items() if name != "means"}
         moving = {name: array.copy() for name, array in start.items()}
-        return cls(model.means, start, Parameters.starting_at(moving), free)
+        parameters = Parameters.starting_at(moving)
+        parameters.beta2 = _BETA2
+        return cls(model.means, start, parameters, free)
 
     def seen(self) -> Splats:
         v = self.parameters.values
@@ -188,11 +207,13 @@ class _Floats:
 
 @dataclass(eq=False)
 class _Quantised:
-    """Values of a frozen scene."""
+    """Values of a frozen scene; `price`: squared error of a picture that all bits of the file are worth."""
 
     tuned: TunedScene
+    price: float = 0.0
     _alphas: F32 | None = None
     _seen: Any = None
+    _costs: Costs | None = None
 
     def seen(self) -> Splats:
         self._seen, self._alphas = self.tuned.seen()
@@ -201,5 +222,9 @@ class _Quantised:
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
         assert self._alphas is not None
+        if self.tuned.parameters.step % _COUNT_EVERY == 0:
+            costs, splats = self.tuned.count(self._seen, 1.0), len(self._alphas)
+            costs.weight = self.price * splats / (costs.bits + _CENTRE_BITS * splats)
+            self._costs = costs
         rates = {**rates, "means": 0.0, "sizes": rates["scales"]}
-        self.tuned.step(gradients, self._seen, self._alphas, rates, None)
+        self.tuned.step(gradients, self._seen, self._alphas, rates, self._costs if self.price else None)

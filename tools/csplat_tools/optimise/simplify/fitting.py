@@ -45,6 +45,7 @@ def fit(
     wanted: Sequence[F32],
     options: SimplifyOptions,
     *,
+    deciding: int | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Adjust the splats; set bands to zero that are not worth their bits, and adjust the others once more.
@@ -54,6 +55,7 @@ def fit(
         cameras: the views.
         wanted: what the source looks like there.
         options: whether to fit and to choose bands, steps, background.
+        deciding: so many of the views, the first ones, say which bands stay; `None`: all do.
         progress: is told how much is done.
     """
     if options.refit:
@@ -67,7 +69,12 @@ def fit(
         error += float(np.sum(squared_error(wanted[number], picture)))
 
     removal = measure_removal(
-        model, cameras, background=options.background, on_picture=add, threads=options.threads, progress=progress
+        model,
+        cameras[:deciding],
+        background=options.background,
+        on_picture=add,
+        threads=options.threads,
+        progress=progress,
     )
     stays = band_mask(removal, error / max(1, len(model)))
     if not stays.all():

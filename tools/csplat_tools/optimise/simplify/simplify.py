@@ -91,7 +91,8 @@ class Session:
 
     def fitted(self, rows: I64, progress: Progress | None = None) -> Fit:
         """Fit what is left."""
-        return fit(self.source.select(rows), self.taught, self.wanted, self.options, progress=progress)
+        left, deciding = self.source.select(rows), len(self.views.used)
+        return fit(left, self.taught, self.wanted, self.options, deciding=deciding, progress=progress)
 
 
 def prepare(
