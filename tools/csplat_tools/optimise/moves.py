@@ -22,7 +22,7 @@ _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
 _COUNTS = 3  # numbers of splats that are fitted
 _SAME = (0.12, 0.06)  # of the splats that are left: fewer or more by less are not worth another fit
-_HOPELESS = 0.5  # dB below the goal: splats whose fit is worse reach it at no precision
+_SPARE = 0.7  # dB above the goal: splats whose fit is worse leave too little of the error to quantisation
 _FEWER = 0.7  # of the splats, where a size holds none of their files
 _ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
 _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
@@ -107,7 +107,7 @@ class Moves:
             if left > (1.0 - _ALL_BUT) * splats:
                 break
             part = removal.fitted(left, allowed, seen)
-            if allowed is not None and part.fitted_psnr < allowed - _HOPELESS:
+            if allowed is not None and part.fitted_psnr < allowed + _SPARE:
                 if found:
                     break
                 left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
