@@ -17,17 +17,19 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_render.cameras import save_cameras
+from csplat_render.cloud import sample_cloud
 from csplat_render.judge import Judge, renderer
 from csplat_render.removal import Removal, measure_removal
+from csplat_render.virtual import is_clear, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.fitting import Fit
-from csplat_tools.optimise.simplify.order import removal_order
+from csplat_tools.optimise.simplify.order import Side, removal_order, seen_by
 from csplat_tools.study import prune_share
-from csplat_tools.views import camera_sequence, find_view_set, reduced
+from csplat_tools.views import camera_sequence, elsewhere, find_view_set, reduced
 from csplat_tools.views.agreeing import find_views, removal_keys
 from csplat_trainer.evaluate import photograph_judge
 from csplat_trainer.pictures import Picture
@@ -76,6 +78,14 @@ def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
     assert positions[:, 1].min() < 0.0 < positions[:, 1].max()  # from above and from below
 
 
+def test_no_camera_looks_at_a_long_object_from_inside(source):
+    long = replace(source, means=source.means * np.float32([1.0, 12.0, 1.0]))
+    frame, cloud = scene_frame(long), sample_cloud(long, 20_000, np.random.default_rng(0))
+    cameras = [*camera_sequence(long, 40, (40, 30)), *elsewhere(long)["nearer"]]
+    assert frame.kind == "object"
+    assert all(is_clear(frame, cloud, camera) for camera in cameras)
+
+
 def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(source):
     own = camera_sequence(source, 17, (200, 100))
     small = reduced(own, (48, 36))
@@ -106,9 +116,23 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     unseen = ~found.removal.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
     assert (removal_keys(source, found.removal, keep_unseen=False)[unseen] < 0.0).all()
-    order = removal_order(source, found, SMALL, len(source) // 2)
+    order = removal_order(source, [Side(found.used, found.removal)], SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
+
+
+def test_rounds_ask_one_side_after_the_other(source):
+    """What one side last said stays, until it is asked again."""
+    parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
+    sides = [Side(cameras, measure_removal(source, cameras)) for cameras in parts]
+    order = removal_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
+    first = order.rounds[0].removed
+    rows = order.kept(len(source), first)
+    keys = removal_keys(source, seen_by(sides))
+    np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
+    again = measure_removal(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
+    places = np.searchsorted(rows, order.rows[first:])
+    np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
 
 
 def test_exact_errors_choose_better_than_opacity(source):

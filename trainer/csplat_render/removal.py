@@ -8,7 +8,7 @@ behind (at most a transmittance of 1e-4, times 1 / (1 − alpha)); and colours b
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,13 @@ class Removal:
         """[N] bool, which splats any view saw."""
         seen: Array = self.views > 0
         return seen
+
+    def of_rows(self, rows: Array) -> Removal:
+        """The same of some of the splats."""
+        return replace(
+            self, error=self.error[rows], product=self.product[rows], weight=self.weight[rows],
+            squared_weight=self.squared_weight[rows], views=self.views[rows], bands=self.bands[rows],
+        )  # fmt: skip
 
     def __add__(self, other: Removal) -> Removal:
         return Removal(

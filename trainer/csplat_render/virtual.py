@@ -39,6 +39,7 @@ __all__ = [
     "SURROUNDING_DISTANCES",
     "Frame",
     "far_apart",
+    "is_clear",
     "scene_frame",
     "virtual_cameras",
 ]
@@ -124,6 +125,12 @@ def scene_frame(model: SplatModel) -> Frame:
     return Frame("object", (low + high) / 2.0, extent, up)
 
 
+def is_clear(frame: Frame, cloud: Cloud, camera: Camera) -> bool:
+    """Whether next to nothing of a scene is so near to a camera that it would show it as fog, or from inside."""
+    radius = _CLEAR_RADIUS * float(np.linalg.norm(camera.position - frame.centre))
+    return share_within(cloud, camera.position, radius) <= _CLEAR_SHARE
+
+
 def virtual_cameras(
     model: SplatModel, count: int = 8, width: int = 640, height: int = 480, seed: int = 0, every: int = 1
 ) -> list[Camera]:
@@ -205,8 +212,7 @@ def _object_view(views: _Views, cloud: Cloud, angles: list[tuple[float, float]],
             camera = views.at(*angle, distance, offset)
             covers.append(cover(cloud, camera))
             enough = covers[-1] >= needed
-            radius = _CLEAR_RADIUS * distance * views.frame.extent
-            if enough and share_within(cloud, camera.position, radius) <= _CLEAR_SHARE:
+            if enough and is_clear(views.frame, cloud, camera):
                 return camera
             if (enough, covers[-1]) > best_rank:
                 best, best_rank = camera, (enough, covers[-1])

@@ -162,7 +162,7 @@ class FittedSplats:
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
         """The splats without the bands that are not worth their bits where files err by so much; those that stay."""
         session, model = self.session, self.model
-        stays = band_mask(self._removal, error * session.views.removal.value_count / max(1, len(model)))
+        stays = band_mask(self._removal, error * self._removal.value_count / max(1, len(model)))
         banded = without(model, stays)
         if session.options.refit and not stays.all():
             banded = self._adjusted(banded, BAND_STEPS, free_coefficients(stays))

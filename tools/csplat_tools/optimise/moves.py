@@ -21,13 +21,13 @@ _LOSS = (5.0, 8.5)  # dB between what each attribute keeps by itself and what al
 _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
 _COUNTS = 3  # numbers of splats that are fitted
-_SAME = (0.12, 0.06)  # of the splats that are left: fewer or more by less are not worth another fit
+_WORTH = 0.02  # of the bytes: another number of splats that is foreseen to save less is not worth a fit
 _SPARE = 0.7  # dB above the goal: splats whose fit is worse leave too little of the error to quantisation
 _FEWER = 0.7  # of the splats, where a size holds none of their files
 _ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
 _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
 _WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
-_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
+_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less; dear files have to promise as much
 _FAR = 0.03  # of the bytes
 _BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
 _PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
@@ -110,11 +110,11 @@ class Moves:
             if allowed is not None and part.fitted_psnr < allowed + _SPARE:
                 if found:
                     break
-                left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
+                left, _ = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
                 continue
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
-            trial, before = tries[0], left
+            trial = tries[0]
             found += tries
             if math.isinf(solver.cost(trial)):
                 # None of them is small enough for a size, or good enough for a PSNR.
@@ -128,10 +128,10 @@ class Moves:
             if goal.psnr is not None:
                 # What bands that are left out cost is no matter of how many splats there are.
                 wanted = _without(solver.level(part), error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
-                left = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
+                left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
-                left = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
-            if min(found, key=solver.cost).part is not part or -_SAME[0] <= left / before - 1.0 <= _SAME[1]:
+                left, saved = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
+            if min(found, key=solver.cost).part is not part or saved < _WORTH:
                 break
         return found
 
@@ -167,10 +167,11 @@ class Moves:
         best = self.solver.goal.best(found)
         if best is None:
             return True
-        if any(one.part is trial.part for one in found):
-            # Another coding was expected to be better, until its file said what it costs. Fits are too dear to ask.
-            return not trial.part.refits and self.solver.cost(trial) < self.solver.cost(best) - _PAYS
-        return self.solver.cost(trial) < self.solver.cost(best) + _PAYS
+        again = any(one.part is trial.part for one in found)
+        if again and trial.part.refits:
+            return False  # another coding was expected to be better, until its file said what it costs
+        saved = self.solver.cost(best) - self.solver.cost(trial)
+        return saved > (_PAYS if again or trial.part.refits else -_PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:
         """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""

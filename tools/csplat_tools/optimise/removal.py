@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat_tools.files.console import Progress
-from csplat_tools.optimise.exchange import LEAST_QUANTISED, error_at_size, error_of_psnr, log_bytes_at_error
+from csplat_tools.optimise.exchange import (
+    LEAST_QUANTISED,
+    error_at_size,
+    error_of_psnr,
+    log_bytes_at_error,
+    price_of_bytes,
+)
 from csplat_tools.optimise.fitted import FittedSplats
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import removal_order
@@ -113,8 +119,8 @@ class Removal:
             return max(1, min(len(self.source), int(usual)))
         return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), seen)
 
-    def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
-        """How many splats are likely to make the smallest file of a PSNR.
+    def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+        """How many splats are likely to make the smallest file of a PSNR, and the share of the bytes that this saves.
 
         Args:
             left: so many were fitted,
@@ -123,10 +129,10 @@ class Removal:
         """
         removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
         before, self._before = self._before, (left, removed)
-        return self._least(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
+        return self._next(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
 
-    def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> int:
-        """How many are likely to make the best file of a size.
+    def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+        """How many are likely to make the best file of a size, and the share of the bytes that the gain is worth.
 
         Args:
             left: of so many splats there is a file of that size.
@@ -136,16 +142,22 @@ class Removal:
         error = error_of_psnr(psnr)
         removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
         quantised = max(error - removed, LEAST_QUANTISED * error)
-        return self._least(_at_size(left, quantised, slope), (left, removed))
+        return self._next(_at_size(left, quantised, slope), (left, removed), _GROWS)
+
+    def _next(self, cost: Cost, known: tuple[int, float], power: float) -> tuple[int, float]:
+        """Splats left where a cost is least, and by how much it is less than what is known."""
+        left, least = self._least(cost, known, power)
+        return left, float(cost(*map(np.atleast_1d, known))[0]) - least
 
     def _calibrated(self, cost: Cost, seen: Seen) -> int:
         mends = error_of_psnr(self._mended)
-        left = self._least(cost, None)
+        left, _ = self._least(cost, None)
         for _ in range(_CALIBRATIONS):
             if left == len(self.source):
                 break
             rows = self.session.pruned(len(self.source) - left)
-            before, left = left, self._least(cost, (left, mends * error_of_psnr(seen(self.source.select(rows)))))
+            seen_error = mends * error_of_psnr(seen(self.source.select(rows)))
+            before, (left, _) = left, self._least(cost, (left, seen_error))
             if abs(left - before) <= _AGREED * before:
                 break
         return left
@@ -157,8 +169,8 @@ class Removal:
         removed = math.log(self._error(known[0]) / self._error(before[0]))
         return min(max(math.log(known[1] / before[1]) / removed, _GROW[0]), _GROW[1]) if removed else _GROWS
 
-    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> int:
-        """Splats left where a cost of their number and of the error of the others is least.
+    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> tuple[int, float]:
+        """Splats left where a cost of their number and of the error of the others is least, and that cost.
 
         Args:
             cost: of both.
@@ -171,9 +183,10 @@ class Removal:
             fitted = error_of_psnr(self._mended) * errors
             if known is not None:
                 fitted = known[1] * np.power(errors / self._error(known[0]), power)
-            best = int(np.argmin(cost(left, fitted)))
+            costs = cost(left, fitted)
+            best = int(np.argmin(costs))
             if best < len(errors) - 1 or not self._goes_on():
-                return int(left[best])
+                return int(left[best]), float(costs[best])
 
     @property
     def _mended(self) -> float:
@@ -189,7 +202,7 @@ class Removal:
         """Let the order go on, see `removal_order`."""
         session = self.session
         order = removal_order(
-            self.source, session.views, session.options, left, self.progress, enough=enough, start=session.order
+            self.source, session.sides, session.options, left, self.progress, enough=enough, start=session.order
         )
         self._session = replace(session, order=order)
 
@@ -200,7 +213,7 @@ class Removal:
 
     def _errors(self) -> F64:
         session = self.session
-        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.views.removal.value_count
+        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.removal.value_count
         return sums[: len(self.source)]  # one stays
 
 
@@ -209,4 +222,6 @@ def _at_psnr(psnr: float, slope: float) -> Cost:
 
 
 def _at_size(splats: int, quantised: float, slope: float) -> Cost:
-    return lambda left, removed: error_at_size(left / splats, removed, quantised, slope)
+    # In bytes, as at a PSNR.
+    power = price_of_bytes(slope)
+    return lambda left, removed: power * np.log(error_at_size(left / splats, removed, quantised, slope))

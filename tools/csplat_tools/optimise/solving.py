@@ -209,7 +209,12 @@ class Solver:
         fewer = part.refits and self.goal.size_bytes is None
 
         def measured(trial: Trial) -> float:
-            return _quantised(trial, above(trial)) if fewer else above(trial)
+            value = above(trial)
+            if not fewer:
+                return value
+            # Where removal takes most of the error, what is near enough in all is near enough.
+            quantised = _quantised(trial, value)
+            return min(quantised, window.high) if 0.0 <= value <= _ON.high else quantised
 
         def measure(quality: float) -> float:
             return measured(self.trials.make(part, coding, quality, quick=not careful))

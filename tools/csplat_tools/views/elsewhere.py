@@ -8,17 +8,21 @@ from numpy.typing import NDArray
 from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.cameras import relative_to
-from csplat_render.virtual import scene_frame, virtual_cameras
+from csplat_render.cloud import sample_cloud
+from csplat_render.virtual import is_clear, scene_frame, virtual_cameras
 
 __all__ = ["elsewhere"]
 
 _VIEWS = (12, 320, 240)  # of each kind; width and height of their pictures
 _SEED = 2000  # those that decide have 1000 and more
-_DISTANCES = {"beside": 1.0, "nearer": 0.6, "farther": 2.0}  # from the middle of the scene, times the usual
+_NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # from the middle of the scene, times the usual
+_POINTS = 20_000
 
 
 def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
     """Virtual cameras as those of `psnr`, but others, and the same nearer to the scene's middle and farther from it.
+
+    Nearer ones come no nearer than leaves them outside of what they look at.
 
     Args:
         source: the scene; its own cameras are not looked at.
@@ -26,9 +30,15 @@ def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
     Returns:
         12 cameras of each kind: `beside`, `nearer`, `farther`.
     """
-    centre = scene_frame(source).centre
+    frame = scene_frame(source)
     beside = virtual_cameras(source, *_VIEWS, seed=_SEED)
-    return {kind: [_at(camera, centre, times) for camera in beside] for kind, times in _DISTANCES.items()}
+    found = {"beside": beside, "farther": [_at(camera, frame.centre, _FARTHER) for camera in beside]}
+    if not len(source):
+        return {**found, "nearer": beside}
+    cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
+    tried = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in beside]
+    nearer = [next((one for one in those if is_clear(frame, cloud, one)), those[-1]) for those in tried]
+    return {**found, "nearer": nearer}
 
 
 def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:

@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
-from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
+from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, is_clear, scene_frame
 
 __all__ = ["CHECKS", "VIEW_COUNT", "VIEW_SIZE", "camera_sequence", "evenly", "reduced"]
 
@@ -40,7 +40,7 @@ _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
 _OUTWARDS = 5  # one view of so many looks away from the middle of surroundings
 _GOOD_DETAIL = 0.4  # of the best view's; views of walls from behind say nothing
-_CANDIDATES = 3  # for each view in surroundings
+_CANDIDATES = 3  # for each view
 _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
 
 
@@ -54,16 +54,19 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
         seed: where the sequence begins.
 
     Returns:
-        `count` cameras, by a low-discrepancy sequence over directions, distances and what they look at. In
-        surroundings those that show little detail are left out.
+        `count` cameras, by a low-discrepancy sequence over directions, distances and what they look at. Those that an
+        object hides from nearby are left out, and in surroundings those that show little detail.
     """
     frame = scene_frame(model)
     K = intrinsics(*size, FIELD_OF_VIEW)
-    if frame.kind == "object" or not len(model):
-        return [_around_object(frame, point, K, size) for point in _sequence(count, seed)]
     points = _sequence(_CANDIDATES * count, seed)
-    cameras = [_in_surroundings(frame, number, point, K, size) for number, point in enumerate(points)]
+    if not len(model):
+        return [_around_object(frame, point, K, size) for point in points[:count]]
     cloud = sample_cloud(model, _POINTS, np.random.default_rng(seed))
+    if frame.kind == "object":
+        around = [_around_object(frame, point, K, size) for point in points]
+        return sorted(around, key=lambda camera: not is_clear(frame, cloud, camera))[:count]
+    cameras = [_in_surroundings(frame, number, point, K, size) for number, point in enumerate(points)]
     details = np.array([detail(cloud, camera, HIDING * frame.extent) for camera in cameras])
     inwards = np.arange(len(cameras)) % _OUTWARDS != 0
     best = np.where(inwards, details[inwards].max(), details[~inwards].max())

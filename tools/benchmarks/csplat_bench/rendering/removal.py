@@ -35,7 +35,7 @@ from csplat_render.removal import measure_removal
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.fitting import fit
-from csplat_tools.optimise.simplify.order import removal_order
+from csplat_tools.optimise.simplify.order import Side, removal_order
 from csplat_tools.study import prune_share
 from csplat_tools.views import BLACK, VIEW_SIZE, camera_sequence, find_view_set
 from csplat_tools.views.agreeing import find_views
@@ -123,8 +123,8 @@ class _Bench:
         if method in _BY_OPACITY:
             (model, _), timing = timed(prune_share, source, count / len(source), by_area=method == "opacity-area")
         else:
-            rounds = 1 if method == "exact" else options.rounds
-            order, timing = timed(removal_order, source, views, replace(options, rounds=rounds), count)
+            rounds, side = 1 if method == "exact" else options.rounds, Side(views.used, views.removal)
+            order, timing = timed(removal_order, source, [side], replace(options, rounds=rounds), count)
             model = source.select(order.kept(len(source), min(len(source) - count, len(order.rows))))
         result: Left = {"psnr": self._judge.psnr(model), "seconds": timing.wall, "views": len(views.used)}
         if method == "rounds":

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat_render.removal import measure_removal
+from csplat_render import Camera
+from csplat_render.removal import Removal, measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
-from csplat_tools.views.agreeing import AgreedViews, removal_keys
+from csplat_tools.views.agreeing import removal_keys
 
-__all__ = ["Order", "Round", "removal_order"]
+__all__ = ["Order", "Round", "Side", "removal_order", "seen_by"]
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -59,9 +64,26 @@ class Order:
         return np.flatnonzero(stays)
 
 
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Views from which splats are measured together.
+
+    Attributes:
+        cameras: the views.
+        removal: what they say of the splats that are left; the last time they were asked.
+    """
+
+    cameras: Sequence[Camera]
+    removal: Removal
+
+    def of_rows(self, rows: NDArray[Any]) -> Side:
+        """The same of some of the splats."""
+        return replace(self, removal=self.removal.of_rows(rows))
+
+
 def removal_order(
     model: SplatModel,
-    views: AgreedViews,
+    sides: Sequence[Side],
     options: SimplifyOptions,
     left: int | None,
     progress: Progress | None = None,
@@ -73,7 +95,8 @@ def removal_order(
 
     Args:
         model: the source.
-        views: cameras that teach, and what they say of the source.
+        sides: views, and what they say of the source. Rounds ask one side after the other, and what the others said
+            before still counts: twice the views, at the price of one side's.
         options: rounds.
         left: splats that are to stay; None for an order that may be cut anywhere.
         progress: is told how much is done.
@@ -81,18 +104,21 @@ def removal_order(
         start: goes on from there.
     """
     count = len(model)
-    rows, removal = np.arange(count), views.removal
+    rows, sides = np.arange(count), list(sides)
     gone, errors, rounds = list[I64](), list[F64](), list[Round]()
     if start is not None:
         gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
         rows = np.delete(rows, start.rows)
+        sides = [side.of_rows(rows) for side in sides]
     for target in _targets(count, options, left, len(rows)):
         if gone:
+            turn = (len(rounds) - 1) % len(sides)
             removal = measure_removal(
-                model.select(rows), views.used, background=options.background, threads=options.threads,
+                model.select(rows), sides[turn].cameras, background=options.background, threads=options.threads,
                 progress=progress,
             )  # fmt: skip
-        keys = removal_keys(model.select(rows), removal, keep_unseen=options.keep_unseen)
+            sides[turn] = replace(sides[turn], removal=removal)
+        keys = removal_keys(model.select(rows), seen_by(sides), keep_unseen=options.keep_unseen)
         order = np.argsort(keys, kind="stable")[: len(rows) - target]
         order = order[np.isfinite(keys[order])]
         if not len(order):
@@ -101,11 +127,18 @@ def removal_order(
         errors.append(np.maximum(keys[order], 0.0))
         rounds.append(Round(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
         rows = np.delete(rows, order)
+        stays = np.delete(np.arange(len(keys)), order)
+        sides = [side.of_rows(stays) for side in sides]
         if left is None and sum(one.predicted for one in rounds) > enough:
             break
     if not gone:
         return Order(np.zeros(0, np.int64), np.zeros(0), ())
     return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
+
+
+def seen_by(sides: Sequence[Side]) -> Removal:
+    """What all of them say."""
+    return functools.reduce(operator.add, [side.removal for side in sides])
 
 
 def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
+from csplat_render.removal import Removal, measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
 from csplat_tools.optimise.simplify.fitting import Fit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
-from csplat_tools.optimise.simplify.order import Order, removal_order
+from csplat_tools.optimise.simplify.order import Order, Side, removal_order, seen_by
 from csplat_tools.optimise.target import Target
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.agreeing import AgreedViews, find_views
@@ -65,6 +67,7 @@ class Session:
         around: from where it is looked at.
         views: those that teach, and others.
         taught: those that the others are fitted to; virtual ones are as many again at least: a fit follows its views.
+        sides: the same in two parts, and what each says of the source; that of views that are given is one.
         wanted: what the source looks like from these.
         order: of removal.
         checked: judges by views that were not used.
@@ -76,10 +79,16 @@ class Session:
     around: ViewSet
     views: AgreedViews
     taught: list[Camera]
+    sides: list[Side]
     wanted: list[F32]
     order: Order
     checked: Judge
     seconds: dict[str, float]
+
+    @cached_property
+    def removal(self) -> Removal:
+        """What removal of each splat of the source does to what is taught."""
+        return seen_by(self.sides)
 
     def pruned(self, gone: int) -> I64:
         """Source splats that are left when the first `gone` of the order are removed."""
@@ -123,17 +132,23 @@ def prepare(
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
     found = find_views(source, around, gone, size=options.view_size, threads=options.threads, progress=progress)
     draw = renderer(source, around.background, threads=options.threads)
-    taught = list(found.used)
+    sides = [Side(found.used, found.removal)]
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
-        taught += camera_sequence(source, more, options.view_size, seed=options.seed + 1)
+        cameras = camera_sequence(source, more, options.view_size, seed=options.seed + 1)
+        removal = measure_removal(
+            source, cameras, background=around.background, threads=options.threads, progress=progress
+        )
+        sides.append(Side(cameras, removal))
+    taught = [camera for side in sides for camera in side.cameras]
     wanted = [draw(camera).rgb for camera in taught]
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    order = removal_order(source, found, options, left, progress, enough=allowed * found.removal.value_count)
+    values = seen_by(sides).value_count
+    order = removal_order(source, sides, options, left, progress, enough=allowed * values)
     seconds["rounds"] = time.perf_counter() - start
-    return Session(source, options, around, found, taught, wanted, order, checked, seconds)
+    return Session(source, options, around, found, taught, sides, wanted, order, checked, seconds)
 
 
 def simplify(
@@ -291,9 +306,9 @@ def _report(session: Session, result: Simplified, target: Target) -> dict[str, A
     stays = np.zeros(len(source), bool)
     stays[result.source_index] = True
     invisible = source.opacities < ALPHA_MIN
-    unseen = ~views.removal.seen & ~invisible
+    unseen = ~session.removal.seen & ~invisible
     removed_error = float(session.order.errors[: result.report["gone"]].sum())
-    predicted = removed_error / views.removal.value_count
+    predicted = removed_error / session.removal.value_count
     bands = {}
     if result.stays is not None:
         bands = {str(band + 1): int(np.count_nonzero(~result.stays[:, band])) for band in range(result.stays.shape[1])}
