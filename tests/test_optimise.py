@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,8 +33,9 @@ from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.solving import Goal, Solver
 from csplat_tools.optimise.target import Target
-from csplat_tools.optimise.trials import Trials, spread_of
+from csplat_tools.optimise.trials import Coding, Trials, spread_of
 from csplat_tools.views import (
     BLACK,
     ViewSet,
@@ -137,6 +139,19 @@ def test_a_plateau_is_crossed():
 def test_meet_gives_up_where_values_grow_no_more():
     points = meet(lambda q: min(q, 40.0), Window(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 100), tries=9)
     assert len(points) < 6
+
+
+@pytest.mark.parametrize(("fine", "stalls"), [(36.2, True), (37.5, False), (40.5, False)])
+def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
+    part, coding = SimpleNamespace(psnr=45.0, refits=False), Coding("codebook", 1 / 8)
+    alike = {"part": part, "coding": coding, "is_careful": True, "is_judged": False, "psnr": 40.0, "size_bytes": 9}
+    deflate = SimpleNamespace(deflate_level=10)
+    files = [
+        SimpleNamespace(**alike, quality=at, decided_psnr=psnr, options=deflate) for at, psnr in ((50, 36), (54, fine))
+    ]
+    made = [SimpleNamespace(**{**alike, "is_judged": True}, quality=40, decided_psnr=40.0)]
+    solver = Solver(SimpleNamespace(made=made, of=lambda *_: files), Goal(psnr=40.0))
+    assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected(files[1]))
 
 
 def test_spread_is_that_of_the_views():

@@ -144,8 +144,9 @@ class _Tried:
 
     @property
     def best(self) -> Coding:
-        """What is expected to cost least."""
-        return min(self.found, key=lambda coding: self.solver.expected(self.found[coding]))
+        """What is expected to cost least; of a PSNR, among what is near enough for that to be known."""
+        unknown = {coding: self.solver.goal.size_bytes is None and self.is_off(coding) for coding in self.found}
+        return min(self.found, key=lambda coding: (unknown[coding], self.solver.expected(self.found[coding])))
 
     def ordered(self) -> list[Trial]:
         """The files, what costs least first."""
@@ -174,8 +175,8 @@ class _Tried:
 
     def resize(self, book: Coding) -> None:
         """Codebooks of other sizes by steps, as long as it pays; where one is far off, the way that this says."""
-        above = self.solver.about(self.found[book])
-        ways = ((1 / _SHARE_STEP, above < -_OFF), (_SHARE_STEP, above > _OFF))
+        above, stalled = self.solver.about(self.found[book]), self.solver.is_stalled(self.found[book])
+        ways = ((1 / _SHARE_STEP, above < -_OFF or stalled), (_SHARE_STEP, above > _OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
             while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
@@ -198,7 +199,8 @@ class _Tried:
             return False
         above = self.solver.about(self.found[coding])
         share = coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
-        return abs(above) > _OFF and _SHARES[0] <= share <= _SHARES[1]
+        is_far = abs(above) > _OFF or self.solver.is_stalled(self.found[coding])
+        return is_far and _SHARES[0] <= share <= _SHARES[1]
 
     def _quality(self) -> float:
         """The precision at which the best of those tried would meet the goal."""

@@ -31,6 +31,7 @@ _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
 _PLATEAU = 1.5  # dB below the goal
 _EVEN = 0.5  # of the slope that is expected: what quantisation does is hardly less steep
+_STALLED = (2.0, 0.25)  # dB of precision that have to gain as much of each, or no precision reaches the goal
 _GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
 
 
@@ -154,7 +155,12 @@ class Solver:
         return math.inf if far else self.expected(trial)
 
     def expected(self, trial: Trial) -> float:
-        """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant."""
+        """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant.
+
+        Infinitely much where no precision of its kind gets there.
+        """
+        if self.is_stalled(trial):
+            return math.inf
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
         above = trial.decided_psnr + self._gained(trial) - level
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
@@ -168,6 +174,18 @@ class Solver:
         if not self.goal.is_judged:
             return self.goal.above(trial)
         return trial.decided_psnr + self._gained(trial) - self.level(trial.part)
+
+    def is_stalled(self, trial: Trial) -> bool:
+        """Whether its kind is below a PSNR, and more precision hardly makes it better: a codebook is too small."""
+        made = [one for one in self.trials.of(trial.part, trial.coding) if one.is_careful == trial.is_careful]
+        if self.goal.size_bytes is not None or len(made) < 2:
+            return False
+        coarse, fine = sorted(made, key=lambda one: one.quality or 0.0)[-2:]
+        apart, above = (fine.quality or 0.0) - (coarse.quality or 0.0), [self.about(one) for one in (coarse, fine)]
+        if apart < _STALLED[0] or max(above) >= 0.0:
+            return False
+        gained = _quantised(fine, above[1]) - _quantised(coarse, above[0])
+        return gained < _STALLED[1] * apart
 
     def _gained(self, trial: Trial) -> float:
         return 0.0 if trial.is_careful or not trial.part.refits else TUNING_GAINS
