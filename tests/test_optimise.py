@@ -173,6 +173,13 @@ def test_a_psnr_is_reached_and_hardly_exceeded(sample_path):
     assert len(found.result.data) == found.report.size_bytes
 
 
+def test_where_all_splats_stay_they_are_adjusted_all_the_same(scene):
+    found = within(scene, psnr=55.0, simplifying=SimplifyOptions(effort=3, rounds=2))
+    assert found.report.splats == len(scene)
+    assert found.result.report.options["simplified"]["splats"] == len(scene)
+    assert found.report.psnr >= 55.0
+
+
 def test_splats_that_nobody_needs_are_left_out(crowded, at_30):
     kept = within(crowded, psnr=30.0, keep_all=True)
     assert 900 == len(decode(kept.result.data))

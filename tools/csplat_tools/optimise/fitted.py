@@ -153,7 +153,7 @@ class FittedSplats:
     def _fitted(self) -> SplatModel:
         session, before = self.session, self.before
         start, self.before = session.source.select(self.rows), None
-        if not session.options.refit:
+        if not (session.options.refit and self.gone):
             return start
         if before is not None:
             start = _carried(before.model, before.rows, start, self.rows)

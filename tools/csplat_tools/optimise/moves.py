@@ -105,7 +105,9 @@ class Moves:
         start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
         for _ in range(1 if removal.options.is_brief else _COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
-                break
+                if found or removal.options.is_brief:
+                    break
+                left = splats  # through the quantisers of their files they are adjusted all the same
             part = removal.fitted(left, allowed, seen)
             if allowed is not None and part.fitted_psnr < allowed + _SPARE:
                 if found:
@@ -116,6 +118,8 @@ class Moves:
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
             trial = tries[0]
             found += tries
+            if left == splats:
+                break
             if math.isinf(solver.cost(trial)):
                 # None of them is small enough for a size, or good enough for a PSNR.
                 if goal.size_bytes is None:
