@@ -103,7 +103,7 @@ class Moves:
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
-        for _ in range(1 if removal.options.is_brief else _COUNTS):
+        for _ in range(_COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
                 if found or removal.options.is_brief:
                     break
@@ -118,7 +118,7 @@ class Moves:
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
             trial = tries[0]
             found += tries
-            if left == splats:
+            if left == splats or removal.options.is_brief:
                 break
             if math.isinf(solver.cost(trial)):
                 # None of them is small enough for a size, or good enough for a PSNR.
@@ -131,7 +131,8 @@ class Moves:
                 continue
             if goal.psnr is not None:
                 # What bands that are left out cost is no matter of how many splats there are.
-                wanted = _without(solver.level(part), error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
+                allowed = solver.level(part)
+                wanted = _without(allowed, error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
                 left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
                 left, saved = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)

@@ -82,8 +82,8 @@ class Removal:
         """Small views in which removal was measured, pass by pass; 0 where it was not."""
         if self._session is None:
             return 0
-        views = self._session.views
-        return len(views.used) * len(self._session.order.rounds) + len(views.check)
+        views, later = self._session.views, max(0, len(self._session.order.rounds) - 1)
+        return len(self._session.taught) + len(views.used) * later + len(views.check)
 
     def fitted(self, left: int, allowed: float | None, seen: Seen) -> FittedSplats:
         """So many splats, or those that no view saw if they are more; see `FittedSplats`."""
