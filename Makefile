@@ -74,6 +74,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).distortion plain
 	$(BENCH).distortion.grades
 	$(BENCH).distortion.operating
+	$(BENCH).distortion.ablation
 	$(BENCH).study
 
 wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,10 +16,13 @@ from csplat_bench.common.command import run as command
 from csplat_bench.common.curves import Point, Rate, bracket, front, psnr_at, rate_at
 from csplat_bench.common.kept import Kept
 from csplat_bench.distortion import __main__ as distortion
+from csplat_bench.distortion import ablation
 from csplat_bench.distortion import plot as distortion_plot
 from csplat_bench.distortion import tables as distortion_tables
 from csplat_bench.distortion.known import Measured
+from csplat_tools.optimise import fitted, moves
 from csplat_tools.optimise.report import Optimised, Report
+from csplat_tools.optimise.simplify import adjusting
 
 SCALAR = (Point(38.0, 1000), Point(42.0, 4000))
 CODEBOOK = (Point(39.0, 1500), Point(41.0, 6000))
@@ -194,6 +198,27 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
     assert 1 == Kept(path).measure("kind", "key", call)
     assert {"kind": {"key": 1}} == json.loads(path.read_text())
     assert 2 == Kept(path, again=True).measure("kind", "key", call)
+
+
+def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, monkeypatch, capsys):
+    parts = []
+
+    def encode_to(source, *, psnr, options, keep_all, simplifying):
+        tunes = fitted.adjust_frozen is adjusting.adjust_frozen and moves.TUNING_GAINS > 0.0
+        prices = math.isfinite(adjusting.price_of_bytes(0.05))
+        has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not keep_all)
+        parts.append(has)
+        report = Report({"psnr": psnr}, 1000, 9, len(source), 3, 1.0, chosen={"psnr": psnr, "splats": 9})
+        return SimpleNamespace(data=bytes(1000 + 100 * has.count(False)), report=report)
+
+    monkeypatch.setattr(ablation, "encode_to", encode_to)
+    words = ["--scenes", "sample", "--psnr", "34", "--out", str(tmp_path)]
+    assert 0 == command(ablation.main, words)
+    assert [True] * 6 == list(parts[0])
+    assert sorted([tuple(at != part for at in range(6)) for part in range(6)]) == sorted(parts[1:])
+    assert "1.1 (+10%)" in capsys.readouterr().out
+    assert 0 == command(ablation.main, words)  # all is known
+    assert 7 == len(parts)
 
 
 @pytest.mark.benchmark
