@@ -42,7 +42,7 @@ class FinetuneOptions:
     iterations: int = 1_000
     seed: int = 0
     loss: Loss = "inria"
-    lr_means: float = 0.2
+    lr_means: float = 0.1
     lr_quats: float = 8e-3
     lr_scales: float = 2e-2
     lr_opacities: float = 0.1
