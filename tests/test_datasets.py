@@ -13,7 +13,7 @@ pytest.importorskip("scipy", reason="undistortion needs scipy: pip install 'cspl
 Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
 # Importing them needs what is looked for above.
-from PIL import ImageFile  # noqa: E402
+from PIL import ExifTags, ImageFile  # noqa: E402
 from posed_sets import (  # noqa: E402
     COLOURS,
     POINTS,
@@ -330,6 +330,23 @@ def test_nothing_is_decoded_before_it_is_asked_for(request, monkeypatch, kind, s
     assert 1 == len(decoded)  # a picture with another camera shares what was read
     data.read()
     assert len(data.train) + len(data.test) == len(decoded)
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_a_picture_on_its_side_is_turned_where_its_lens_is_that_of_the_upright_one(ngp, orientation):
+    for path in sorted((ngp / "images").glob("*.png")):
+        with Image.open(path) as shown:
+            lying = shown.transpose(Image.Transpose.ROTATE_90 if orientation == 6 else Image.Transpose.ROTATE_270)
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        lying.save(path, exif=exif)
+    data = load(ngp)
+    assert {(W, H)} == {(picture.camera.W, picture.camera.H) for picture in data.train}
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+    document = json.loads((ngp / "transforms.json").read_text())
+    (ngp / "transforms.json").write_text(json.dumps({**document, "w": H, "h": W, "cx": H / 2, "cy": W / 2}))
+    as_stored = load(ngp).train[0]
+    assert (H, W) == (as_stored.camera.W, as_stored.camera.H) == as_stored.pixels.shape[1::-1]
 
 
 def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import map_coordinates
 
 from csplat.errors import InputError
@@ -26,6 +26,7 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 _ZOOM_STEP = 0.005
 _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
+_ON_ITS_SIDE = (5, 6, 7, 8)  # orientations of EXIF that swap width and height
 
 
 def picture_of(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture:
@@ -40,10 +41,12 @@ def picture_of(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture
         InputError: the file does not begin as an image, or its lens cannot be undone.
     """
     with _opened(shot.path) as image:
-        (width, height), has_alpha = image.size, _has_alpha(image)
+        (width, height), has_alpha, turned = image.size, _has_alpha(image), _turned(image, shot.lens)
+    if turned:
+        width, height = height, width
     lens = shot.lens.scaled(width, height)
     straight = undistorted_lens(lens) if lens.distorts else lens
-    read = partial(_read, shot.path, lens, straight, size)
+    read = partial(_read, shot.path, lens, straight, size, turned=turned)
     width, height = size or (width, height)
     seen = straight.scaled(width, height)
     K = np.array([[seen.fx, 0.0, seen.cx], [0.0, seen.fy, seen.cy], [0.0, 0.0, 1.0]])
@@ -83,10 +86,20 @@ def undistorted_lens(lens: Lens) -> Lens:
     raise InputError(f"the distortion {lens.distortion} cannot be undone over the whole picture")
 
 
-def _read(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> U8:
-    """Pixels of a file, straight, in the size that is wanted."""
-    with _opened(path) as image:
-        # As they are stored: poses know nothing of EXIF rotation.
+def _turned(image: Image.Image, lens: Lens) -> bool:
+    """Whether EXIF lays a picture on its side, and its lens is that of the picture as it is shown.
+
+    Programs that find poses read pixels as they are stored, or as they are shown: the size that they state tells which.
+    """
+    width, height = image.size
+    stored, shown = abs(lens.width * height - lens.height * width), abs(lens.width * width - lens.height * height)
+    return shown < stored and image.getexif().get(ExifTags.Base.Orientation) in _ON_ITS_SIDE
+
+
+def _read(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool) -> U8:
+    """Pixels of a file, straight, in the size that is wanted; turned as EXIF says, or as they are stored."""
+    with _opened(path) as stored:
+        image = ImageOps.exif_transpose(stored) if turned else stored
         pixels: U8 = np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"))
     if lens.distorts:
         pixels = _undistort(pixels, lens, straight)
