@@ -349,6 +349,47 @@ def test_a_picture_on_its_side_is_turned_where_its_lens_is_that_of_the_upright_o
     assert (H, W) == (as_stored.camera.W, as_stored.camera.H) == as_stored.pixels.shape[1::-1]
 
 
+def _hide(path, size):
+    """A mask: black on the left third."""
+    width, height = size
+    values = np.full((height, width), 255, np.uint8)
+    values[:, : width // 3] = 0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).save(path)
+
+
+@pytest.mark.parametrize("kind", ["ngp", "colmap"])
+@pytest.mark.parametrize(("size", "sides"), [(None, (W, H)), ((24, 16), (W, H)), (None, (2 * W, 2 * H))])
+def test_a_mask_says_which_pixels_count(request, kind, size, sides):
+    folder = request.getfixturevalue("ngp" if kind == "ngp" else "colmap_set")
+    if kind == "ngp":
+        document = json.loads((folder / "transforms.json").read_text())
+        document["frames"][1]["mask_path"] = "masks/one.png"
+        (folder / "transforms.json").write_text(json.dumps(document))
+        _hide(folder / "masks" / "one.png", sides)
+    else:
+        _hide(folder / "masks" / "im 001.png.png", sides)
+    data = load(folder, size)
+    assert "masks hide parts of 1 picture: they do not count" in data.report
+    first, *others = data.train
+    width, height = size or (W, H)
+    assert (width // 3) * height == (~first.mask).sum()
+    assert not first.mask[:, : width // 3].any()
+    assert all(picture.mask is None for picture in (*others, *data.test))
+
+
+def test_a_mask_that_is_not_there_or_hides_all_is_refused(ngp):
+    document = json.loads((ngp / "transforms.json").read_text())
+    document["frames"][1]["mask_path"] = "masks/one.png"
+    (ngp / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"frame 1: there is no mask 'masks/one\.png'"):
+        load(ngp)
+    (ngp / "masks").mkdir()
+    Image.fromarray(np.zeros((H, W), np.uint8)).save(ngp / "masks" / "one.png")
+    with pytest.raises(InputError, match=r"the mask of images/0001\.png hides all of it"):
+        load(ngp).read()
+
+
 def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):
     path = blender / "train" / "r_0.png"
     with Image.open(path) as image:

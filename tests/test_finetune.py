@@ -29,6 +29,7 @@ from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.training.report import ply_splat_bytes
 from csplat_trainer.loss import PhotometricLoss
+from csplat_trainer.pictures import Picture
 from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
 from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
@@ -95,6 +96,25 @@ def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(sou
     after = frozen.coded(tuned.held).write().data
     assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 1.0
     assert len(after) < 1.1 * len(before)
+
+
+def test_pixels_that_do_not_count_teach_nothing(source, views):
+    frozen, taken = Draft.of(source, COARSE).frozen(), [one.camera for one in views.train]
+    mask = np.ones((taken[0].H, taken[0].W), bool)
+    mask[:, ::3] = False
+
+    def hidden(value):
+        shown = []
+        for one in views.train:
+            buffer = np.empty((*mask.shape, 3), np.float32)
+            pixels = np.rint(255.0 * np.clip(one.picture(BLACK, buffer), 0.0, 1.0)).astype(np.uint8)
+            pixels[~mask] = value
+            shown.append(View(one.camera, Picture(one.camera, pixels, mask)))
+        return Views(shown, shown[:2], BLACK)
+
+    first, second = (tune(frozen, hidden(value), QUICK) for value in (0, 250))
+    assert np.array_equal(first.held.sh0, second.held.sh0)
+    assert first.log["looks"] == second.log["looks"]
 
 
 def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):

@@ -174,6 +174,24 @@ def test_a_photograph_is_shown_in_front_of_the_background():
     assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
 
 
+def test_pixels_that_do_not_count_are_not_judged(scene):
+    taken = cameras(2)
+    seen = [np.clip(render(scene, camera).rgb, 0.0, 1.0) for camera in taken]
+    wanted = [np.rint(255.0 * np.clip(one + 0.1, 0.0, 1.0)).astype(np.uint8) for one in seen]
+    mask = np.zeros((H, W), bool)
+    mask[:, : W // 4] = True
+    wanted[0][~mask] = 255
+    judge = photograph_judge([Picture(taken[0], wanted[0], mask), Picture(taken[1], wanted[1])], (0.0, 0.0, 0.0))
+    squares = [np.square(one - two / 255.0) for one, two in zip(seen, wanted, strict=True)]
+    errors = np.array([squares[0][mask].mean(), squares[1].mean()])
+    expected = np.average(errors, weights=[mask.sum(), H * W])
+    assert np.allclose(errors, judge.errors(scene), rtol=1e-4)
+    scores = judge.scores(scene)
+    assert judge.psnr(scene) == pytest.approx(scores.psnr) == pytest.approx(-10.0 * np.log10(expected), abs=1e-3)
+    assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
+    assert judge.some([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
+
+
 def test_an_origin_moves_the_camera_the_other_way():
     camera = cameras(1)[0]
     moved = relative_to((1.0, 2.0, 3.0), camera)

@@ -53,6 +53,25 @@ def make_data():
     return make
 
 
+def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
+    data = make_data(make_model, alpha=False)
+    mask = np.ones((SIZE, SIZE), bool)
+    mask[10:30, :20] = False
+
+    def hidden(value: int) -> DataSet:
+        def shown(picture: Picture) -> Picture:
+            pixels = np.where(mask[..., None], picture.pixels, np.uint8(value))
+            return Picture(picture.camera, pixels, mask)
+
+        return DataSet("masked", [shown(one) for one in data.train], [shown(one) for one in data.test])
+
+    first, second = (train(hidden(value), TrainOptions(**QUICK, init="box")) for value in (0, 200))
+    assert np.array_equal(first.model.means, second.model.means)
+    assert np.array_equal(first.model.shN, second.model.shN)
+    assert first.metrics == second.metrics
+    assert first.log["entries"][-1]["psnr"] == second.log["entries"][-1]["psnr"]
+
+
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
 def test_training_brings_the_loss_down(make_data, make_model, strategy):
     data = make_data(make_model)

@@ -53,3 +53,18 @@ def test_the_next_call_does_not_remember_the_last():
     first = loss(x, y)[1].copy()
     loss(y, x)
     assert np.array_equal(first, loss(x, y)[1])
+
+
+@pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
+def test_pixels_that_do_not_count_change_nothing(weights):
+    x, y = pictures(32, 24)
+    mask = np.ones((32, 24), bool)
+    mask[5:20, 3:12] = False
+    other = np.where(mask[..., None], y, 1.0 - y)
+    value, gradient = PhotometricLoss(32, 24, *weights)(x, y.copy(), mask)
+    again, slope = PhotometricLoss(32, 24, *weights)(x, other, mask)
+    assert again == value or np.isnan(value.ssim)
+    assert np.array_equal(gradient, slope)
+    assert not gradient[~mask].any()
+    assert gradient[mask].all()
+    assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)

@@ -54,11 +54,13 @@ class Look:
         picture: [H, W, 3] floats.
         covered: [H, W], which pixels show more than the background; `None`: not known.
         ignored: splats that it does not show because they hold NaN or infinities.
+        counts: [H, W], which pixels count; `None`: all of them.
     """
 
     picture: F32
     covered: NDArray[np.bool_] | None = None
     ignored: int = 0
+    counts: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,7 @@ class Judge:
         mode: of the renderer.
         threads: how many; `None` for all. No score depends on it.
         origin: what the cameras are relative to; `None`: the origin of whatever is judged.
+        pixels: how many count in each view; `None`: all of them.
 
     Raises:
         InputError: there is no view, or not one look for each.
@@ -83,6 +86,7 @@ class Judge:
     mode: Mode = "standard"
     threads: int | None = None
     origin: Sequence[float] | None = None
+    pixels: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -128,16 +132,16 @@ class Judge:
 
     def errors(self, model: SplatModel) -> F64:
         """[V] mean squared error by view."""
-        draw = self._renderer(model)
-        squares = [
-            metrics.squared_error(self.look(number).picture, draw(camera).rgb)
-            for number, camera in enumerate(self.cameras)
-        ]
-        return np.array([np.mean(one) for one in squares], np.float64)
+        draw, errors = self._renderer(model), np.empty(len(self.cameras), np.float64)
+        for number, camera in enumerate(self.cameras):
+            look = self.look(number)
+            squares = metrics.squared_error(look.picture, draw(camera).rgb)
+            errors[number] = np.mean(squares if look.counts is None else squares[look.counts])
+        return errors
 
     def pooled(self, errors: F64) -> float:
         """The mean squared error over all pixels, of those by view."""
-        return metrics.pooled(errors, [camera.W * camera.H for camera in self.cameras])
+        return metrics.pooled(errors, self.pixels or [camera.W * camera.H for camera in self.cameras])
 
     def psnr(self, model: SplatModel) -> float:
         """PSNR of the error pooled over views, pixels and channels, dB."""
@@ -145,7 +149,9 @@ class Judge:
 
     def some(self, places: Sequence[int]) -> Judge:
         """A judge by some of the views."""
-        return replace(self, cameras=[self.cameras[i] for i in places], looks=[self.looks[i] for i in places])
+        pixels = None if self.pixels is None else [self.pixels[i] for i in places]
+        cameras, looks = [self.cameras[i] for i in places], [self.looks[i] for i in places]
+        return replace(self, cameras=cameras, looks=looks, pixels=pixels)
 
     def score(
         self, number: int, seen: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
@@ -153,7 +159,9 @@ class Judge:
         """Score what is seen in a view, [H, W, 3], whoever made it."""
         look = self.look(number)
         image = self.cameras[number].image
-        return metrics.score_view(look.picture, seen, look.covered, image=image, with_ssim=ssim, lpips=lpips)
+        return metrics.score_view(
+            look.picture, seen, look.covered, look.counts, image=image, with_ssim=ssim, lpips=lpips
+        )
 
     def scores(
         self,
@@ -180,7 +188,7 @@ class Judge:
             look, result = self.look(number), draw(camera)
             ignored = max(ignored, result.ignored)
             one = metrics.score_view(
-                look.picture, result.rgb, look.covered, image=camera.image, with_ssim=ssim, lpips=lpips
+                look.picture, result.rgb, look.covered, look.counts, image=camera.image, with_ssim=ssim, lpips=lpips
             )
             each.append(one)
             if on_view is not None:

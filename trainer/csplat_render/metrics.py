@@ -61,8 +61,8 @@ class ViewScore:
 
     Attributes:
         image: name of the camera's photograph, if it has one.
-        pixels: of the picture.
-        mse: mean squared error over pixels and channels.
+        pixels: of the picture that count.
+        mse: mean squared error over these and channels.
         psnr: the same in dB.
         covered_mse: over covered pixels only; `None` where cover is not known or 0.
         cover: share of the pixels that are covered; `None` where not known.
@@ -144,6 +144,7 @@ def score_view(
     wanted: NDArray[Any],
     seen: NDArray[Any],
     covered: NDArray[np.bool_] | None = None,
+    counts: NDArray[np.bool_] | None = None,
     *,
     image: str | None = None,
     with_ssim: bool = True,
@@ -155,6 +156,8 @@ def score_view(
         wanted: [H, W, 3], floating.
         seen: [H, W, 3], floating.
         covered: [H, W], which pixels of what is wanted are covered; `None`: not known.
+        counts: [H, W], which pixels count, at least one: SSIM and LPIPS take the others for wanted as they are
+            seen. `None`: all.
         image: name of the photograph.
         with_ssim: whether to compute it; it takes about as long as rendering.
         lpips: computes it, if wanted.
@@ -163,13 +166,17 @@ def score_view(
         InputError: the pictures cannot be compared.
     """
     squares = squared_error(wanted, seen)
+    for name, pixels in (("cover", covered), ("mask", counts)):
+        if pixels is not None and pixels.shape != squares.shape[:2]:
+            raise InputError(f"the {name} has shape {list(pixels.shape)}, wanted {list(squares.shape[:2])}")
+    if counts is not None:
+        wanted, squares = np.where(counts[..., None], wanted, seen), squares[counts]
+        covered = None if covered is None else covered[counts]
     mse = float(np.mean(squares))
-    if covered is not None and covered.shape != squares.shape[:2]:
-        raise InputError(f"the cover has shape {list(covered.shape)}, wanted {list(squares.shape[:2])}")
     inside = None if covered is None else squares[covered]
     return ViewScore(
         image=image,
-        pixels=squares.shape[0] * squares.shape[1],
+        pixels=squares.size // 3,
         mse=mse,
         psnr=psnr_of_mse(mse),
         covered_mse=float(np.mean(inside)) if inside is not None and len(inside) else None,

@@ -100,6 +100,9 @@ class CudaEngine:
         rendered, info = self._draw(camera, background, degree)
         if self.screen is not None:
             info["means2d"].retain_grad()
+        if picture.mask is not None:  # what does not count is taken for what is seen
+            counts = torch.from_numpy(picture.mask).to(photograph.device)[..., None]
+            photograph = torch.where(counts, photograph, rendered.detach())
         total, value = self._loss(rendered, photograph)
         total.backward()  # type: ignore[no-untyped-call]  # torch leaves it so
         if self.screen is not None:

@@ -95,7 +95,7 @@ class CpuEngine:
         loss, photograph = self._loss_for(camera)
         compose(picture, background, photograph)
         rgb = self._forward(camera, background, degree)
-        value, slope = loss(rgb, photograph)
+        value, slope = loss(rgb, photograph, picture.mask)
         if self._perceptual is not None:
             slope += self._perceptual.gradient(rgb, photograph, options.lpips_weight)
         gradients = self._rasteriser.backward(slope)

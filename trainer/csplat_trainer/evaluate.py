@@ -37,7 +37,9 @@ def photograph_judge(
     """
     colour = np.asarray(background, np.float32)
     cameras = [picture.camera for picture in pictures]
-    return Judge(cameras, [partial(_look, one, colour) for one in pictures], colour, mode, threads, origin)
+    looks = [partial(_look, one, colour) for one in pictures]
+    masked = any(one.masked is not None for one in pictures)
+    return Judge(cameras, looks, colour, mode, threads, origin, [_count(one) for one in pictures] if masked else None)
 
 
 def evaluate(
@@ -65,4 +67,9 @@ def evaluate(
 def _look(picture: Picture, background: F32) -> Look:
     shown = compose(picture, background, np.empty((picture.camera.H, picture.camera.W, 3), np.float32))
     covered = picture.pixels[..., 3] >= COVERED_ALPHA * 255.0 if picture.has_alpha else None
-    return Look(shown, covered)
+    return Look(shown, covered, counts=picture.mask)
+
+
+def _count(picture: Picture) -> int:
+    """How many pixels count."""
+    return picture.camera.W * picture.camera.H if picture.mask is None else int(picture.mask.sum())

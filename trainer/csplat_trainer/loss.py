@@ -37,7 +37,7 @@ class LossValue:
         loss: the weighted sum.
         l1: mean absolute difference.
         ssim: mean SSIM.
-        mse: mean squared difference.
+        mse: mean squared difference, of the pixels that count.
     """
 
     loss: float
@@ -66,18 +66,21 @@ class PhotometricLoss:
         self._sums = np.zeros((height, 3), np.float64)
         self._gradient = np.empty(self._shape, np.float32)
 
-    def __call__(self, rendered: F32, photograph: F32) -> tuple[LossValue, F32]:
+    def __call__(self, rendered: F32, photograph: F32, mask: NDArray[np.bool_] | None = None) -> tuple[LossValue, F32]:
         """Compare two pictures.
 
         Args:
             rendered: [H, W, 3], C-contiguous.
             photograph: [H, W, 3], C-contiguous.
+            mask: [H, W], pixels that count; where others are, `photograph` is made what is rendered. `None`: all.
 
         Returns:
             The figures, and the gradient of `loss` by `rendered`, [H, W, 3]: a buffer that the next
-            call overwrites.
+            call overwrites. It is 0 where pixels do not count.
         """
         assert rendered.shape == self._shape == photograph.shape
+        if mask is not None:
+            np.copyto(photograph, rendered, where=~mask[..., None])
         flat = (self._shape[0], 3 * self._shape[1])
         x, y = rendered.reshape(flat), photograph.reshape(flat)
         gradient = self._gradient.reshape(flat)
@@ -91,6 +94,9 @@ class PhotometricLoss:
         else:
             _l1_alone(x, y, l1_step, gradient, self._sums)
         l1, ssim, mse = (float(value) / count for value in self._sums.sum(axis=0))
+        if mask is not None:
+            gradient.reshape(self._shape)[~mask] = np.float32(0.0)
+            mse /= float(np.mean(mask))
         loss = self.l1_weight * l1 + (self.ssim_weight * (1.0 - ssim) if self.ssim_weight != 0.0 else 0.0)
         return LossValue(loss, l1, ssim, mse), self._gradient
 

@@ -13,11 +13,12 @@ from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_render.jit import parallel_kernel
 
-__all__ = ["Picture", "UnreadPixels", "compose"]
+__all__ = ["Picture", "UnreadMask", "UnreadPixels", "compose"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,22 @@ class UnreadPixels:
 
 
 @dataclass(frozen=True, eq=False)
+class UnreadMask:
+    """A mask that is read when it is first asked for, and then kept.
+
+    Attributes:
+        read: makes the array that `Picture` wants.
+    """
+
+    read: Callable[[], Mask]
+
+    @cached_property
+    def mask(self) -> Mask:
+        """As `read` returns it; raises what it raises."""
+        return self.read()
+
+
+@dataclass(frozen=True, eq=False)
 class Picture:
     """One view of a data set.
 
@@ -46,13 +63,16 @@ class Picture:
         camera: where it was taken; its W and H are the picture's.
         source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
             premultiplied) alpha; or such pixels that are not read yet.
+        masked: [H, W], which pixels count: nobody learns from the others, or is judged by them; or a mask that is not
+            read yet. `None`: all count.
 
     Raises:
-        InputError: the pixels have another shape or dtype.
+        InputError: the pixels or the mask have another shape or dtype.
     """
 
     camera: Camera
     source: U8 | UnreadPixels
+    masked: Mask | UnreadMask | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.source, UnreadPixels):
@@ -69,6 +89,20 @@ class Picture:
             return self.source
         self._check(self.source.pixels)
         return self.source.pixels
+
+    @property
+    def mask(self) -> Mask | None:
+        """Which pixels count; `None`: all of them. A mask that is not read yet is read.
+
+        Raises:
+            InputError: the file is damaged, or no pixel counts.
+        """
+        mask = self.masked.mask if isinstance(self.masked, UnreadMask) else self.masked
+        if mask is not None and (mask.dtype != np.bool_ or mask.shape != (self.camera.H, self.camera.W)):
+            raise InputError(f"a mask is {mask.dtype} {list(mask.shape)}, wanted bool, of its picture's size")
+        if mask is not None and not mask.any():
+            raise InputError(f"the mask of {self.camera.image} hides all of it: leave the picture out")
+        return mask
 
     @property
     def has_alpha(self) -> bool:

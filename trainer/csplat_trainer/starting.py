@@ -181,6 +181,8 @@ def _pixels_at(picture: Picture, points: F64) -> tuple[NDArray[np.int64], F64]:
     depth = np.where(ahead, z, 1.0)
     u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
     inside = np.flatnonzero(ahead & (u >= 0) & (u < camera.W) & (v >= 0) & (v < camera.H))
+    if picture.mask is not None:
+        inside = inside[picture.mask[v[inside].astype(np.int64), u[inside].astype(np.int64)]]
     return inside, picture.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
 
 

@@ -71,7 +71,9 @@ def train(
 
     DATA is a NeRF-synthetic folder, an instant-ngp transforms.json or its
     folder, or a COLMAP folder with its pictures. Test pictures are held out:
-    those that the data set names, or every eighth.
+    those that the data set names, or every eighth. Where masks are black
+    (`mask_path`, or a folder `masks` beside COLMAP's pictures), nothing is
+    learnt and nothing judged.
 
     What is behind the splats is white where pictures have an alpha channel
     and black where they have none. A comment in OUT.ply says so, and which

@@ -135,7 +135,7 @@ class ViewSet:
             InputError: a file is no image, or is cut short.
         """
         for photograph in self.photographs:
-            _ = photograph.pixels
+            _ = photograph.pixels, photograph.mask
 
     def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Judge:
         from csplat_trainer.evaluate import photograph_judge

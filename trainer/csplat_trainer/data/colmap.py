@@ -3,7 +3,8 @@
     images/ images_2/ images_4/ images_8/     the same pictures, smaller and smaller
     sparse/0/{cameras,images,points3D}.{bin,txt}
 
-A `test.txt` beside the model, one name a line, names the test pictures.
+A `test.txt` beside the model, one name a line, names the test pictures. A folder `masks` holds masks, black where a
+picture does not count, called like it, with or without `.png` at the end.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
         if path is None:
             missing.append(image.name)
         else:
-            shots.append(Shot(image.name, path, cameras[image.camera], image.viewmat))
+            mask = find_image(folder / "masks" / image.name)
+            shots.append(Shot(image.name, path, cameras[image.camera], image.viewmat, mask))
     if missing:
         shown = ", ".join(missing[:_NAMED_MISSING]) + (", …" if len(missing) > _NAMED_MISSING else "")
         report.append(f"{len(missing)} of {len(registered)} pictures are missing and left out: {shown}")

@@ -75,7 +75,7 @@ class DataSet:
             InputError: a file is no image, or is cut short.
         """
         for picture in (*self.train, *self.test):
-            _ = picture.pixels
+            _ = picture.pixels, picture.mask
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,14 @@ class Shot:
         path: the file.
         lens: how it was taken.
         viewmat: [4, 4] float64, world to camera, OpenCV axes.
+        mask: a file that is black where the picture does not count.
     """
 
     name: str
     path: Path
     lens: Lens
     viewmat: F64
+    mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

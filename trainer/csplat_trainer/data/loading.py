@@ -68,6 +68,9 @@ def load(
     points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
     counts = f"{len(found.train)} training and {counted(len(found.test), 'test picture')}"
     report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
+    masked = sum(shot.mask is not None for shot in shots)
+    if masked:
+        report.append(f"masks hide parts of {counted(masked, 'picture')}: they do not count")
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
         report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")

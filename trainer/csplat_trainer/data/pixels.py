@@ -15,22 +15,24 @@ from scipy.ndimage import map_coordinates
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_trainer.data.dataset import Lens, Shot
-from csplat_trainer.pictures import Picture, UnreadPixels
+from csplat_trainer.pictures import Picture, UnreadMask, UnreadPixels
 
 __all__ = ["find_image", "image_size", "picture_of", "undistorted_lens"]
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 _ZOOM_STEP = 0.005
 _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
+_COUNTS = 128  # of a mask's grey values, and more
 _ON_ITS_SIDE = (5, 6, 7, 8)  # orientations of EXIF that swap width and height
 
 
 def picture_of(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture:
-    """The picture of a shot, undistorted, RGBA where the file has transparency; its pixels are not read yet.
+    """The picture of a shot, undistorted, RGBA where the file has transparency; pixels and mask are not read yet.
 
     Args:
         shot: which.
@@ -47,10 +49,11 @@ def picture_of(shot: Shot, size: tuple[int, int] | None, near: float) -> Picture
     lens = shot.lens.scaled(width, height)
     straight = undistorted_lens(lens) if lens.distorts else lens
     read = partial(_read, shot.path, lens, straight, size, turned=turned)
+    mask = None if shot.mask is None else UnreadMask(partial(_read_mask, shot.mask, lens, straight, size))
     width, height = size or (width, height)
     seen = straight.scaled(width, height)
     K = np.array([[seen.fx, 0.0, seen.cx], [0.0, seen.fy, seen.cy], [0.0, 0.0, 1.0]])
-    return Picture(Camera(K, shot.viewmat, width, height, near, shot.name), UnreadPixels(has_alpha, read))
+    return Picture(Camera(K, shot.viewmat, width, height, near, shot.name), UnreadPixels(has_alpha, read), mask)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -108,6 +111,19 @@ def _read(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, 
         method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
         pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
     return np.ascontiguousarray(pixels)
+
+
+def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
+    """Which pixels of a picture count: where its mask, which may be larger or smaller, is brighter than half."""
+    sides = int(lens.width), int(lens.height)
+    with _opened(path) as stored:
+        image = (ImageOps.exif_transpose(stored) if _turned(stored, lens) else stored).convert("L")
+        values: U8 = np.asarray(image if image.size == sides else image.resize(sides, Image.Resampling.NEAREST))
+    if lens.distorts:
+        values = _undistort(values[..., None], lens, straight)[..., 0]
+    if size is not None and size != sides:
+        values = np.asarray(Image.fromarray(values).resize(size, Image.Resampling.BOX))
+    return values >= _COUNTS
 
 
 @contextmanager

@@ -90,13 +90,24 @@ def _shots(path: Path, report: list[str]) -> list[Shot]:
             continue
         lens = _lens({**document, **frame}, image, where)
         viewmat = _viewmat(frame.get("transform_matrix"), where)
-        shots.append(Shot(_plain(name, image), image, lens, viewmat))
+        shots.append(Shot(_plain(name, image), image, lens, viewmat, _mask(frame, path.parent, where)))
     if missing:
         shown = ", ".join(missing[:_NAMED_MISSING]) + (", …" if len(missing) > _NAMED_MISSING else "")
         report.append(f"{path.name}: {len(missing)} of {len(frames)} pictures are missing and left out: {shown}")
     if not shots:
         raise InputError(f"{path}: none of its {len(frames)} pictures is there ({missing[0]}, …)")
     return shots
+
+
+def _mask(frame: Mapping[str, Any], folder: Path, where: str) -> Path | None:
+    """The mask of a frame, as nerfstudio names it: black where the picture does not count."""
+    name = frame.get("mask_path")
+    if name is None:
+        return None
+    mask = find_image(folder / name) if isinstance(name, str) else None
+    if mask is None:
+        raise InputError(f"{where}: there is no mask {name!r}")
+    return mask
 
 
 def _plain(name: str, image: Path) -> str:

@@ -200,7 +200,7 @@ class _Run:
             self._costs = self._scene.count(seen, self._options.byte_cost)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
-        value, slope = buffers.loss(rendered, view.picture(self._views.background, buffers.wanted))
+        value, slope = buffers.loss(rendered, view.picture(self._views.background, buffers.wanted), view.mask)
         if not math.isfinite(value.loss):
             if self._iteration == 1:  # before anything has moved
                 raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
@@ -237,9 +237,9 @@ class _Run:
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
             wanted = view.picture(self._views.background, buffers.wanted)
-            loss += buffers.loss(rendered, wanted)[0].loss / len(self._views.validation)
+            loss += buffers.loss(rendered, wanted, view.mask)[0].loss / len(self._views.validation)
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
-            count += rendered.size
+            count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
         score, psnr = loss + costs.loss, psnr_of_mse(error / count)
         self._log["looks"].append(

@@ -44,6 +44,11 @@ class View:
         if not isinstance(self.wanted, Picture) and self.wanted.shape != shape:
             raise InputError(f"a wanted picture has shape {list(self.wanted.shape)}, wanted {list(shape)}")
 
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Which pixels count, [H, W]; `None`: all of them."""
+        return self.wanted.mask if isinstance(self.wanted, Picture) else None
+
     def picture(self, background: F32, out: F32) -> F32:
         """The wanted picture, [H, W, 3] float32; `out` may be overwritten and returned."""
         if isinstance(self.wanted, Picture):
