@@ -103,7 +103,8 @@ def main(
                     if source.sh_degree or not without.sh:
                         kept.measure(f"{goal:g} dB", name, partial(_found, source, goal, without))
     known = {name: one for name, one in read_kept(out).items() if name in listed(scenes)}
-    print(laid_out([_table(known, goal) for goal in numbers(psnr, float)], markdown=markdown))
+    whats = [(goal, what) for goal in numbers(psnr, float) for what in ("kB", "splats")]
+    print(laid_out([_table(known, goal, what) for goal, what in whats], markdown=markdown))
 
 
 def _found(source: SplatModel, goal: float, without: _Without) -> Found:
@@ -125,20 +126,22 @@ def _found(source: SplatModel, goal: float, without: _Without) -> Found:
     }
 
 
-def _table(known: Mapping[str, Mapping[str, Any]], goal: float) -> Table:
-    """Bytes of each scene's file at a PSNR, without each part."""
+def _table(known: Mapping[str, Mapping[str, Any]], goal: float, what: str) -> Table:
+    """Kilobytes or splats of each scene's file at a PSNR, without each part."""
     measured: dict[str, Mapping[str, Found]] = {name: one.get(f"{goal:g} dB", {}) for name, one in known.items()}
     measured = {name: files for name, files in measured.items() if files}
     rows = []
     for without in _WITHOUT if measured else ():
-        cells = [_cell(files.get(without), files.get("nothing")) for files in measured.values()]
+        cells = [_cell(files.get(without), files.get("nothing"), what) for files in measured.values()]
         rows.append((without, *cells))
-    return Table((f"kB at {goal:g} dB without", *measured), rows)
+    return Table((f"{what} at {goal:g} dB without", *measured), rows)
 
 
-def _cell(found: Found | None, whole: Found | None) -> str:
+def _cell(found: Found | None, whole: Found | None, what: str) -> str:
     if found is None:
         return "–"
+    if what == "splats":
+        return f"{found['splats']:,}"
     beside = "" if whole is None or found is whole else f" ({found['size_bytes'] / whole['size_bytes'] - 1.0:+.0%})"
     return f"{found['size_bytes'] / 1e3:.1f}{beside}"
 
