@@ -25,7 +25,7 @@ from csplat_conformance.stated import Source, prove
 from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
-from csplat_tools.optimise import optimiser
+from csplat_tools.optimise import fitted, optimiser
 from csplat_tools.optimise.optimiser import expected_seconds
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.removal import Removal
@@ -33,6 +33,7 @@ from csplat_tools.optimise.report import Report
 from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.simplify.adjusting import adjust_frozen
 from csplat_tools.optimise.solving import Goal, Solver
 from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Coding, Trials, spread_of
@@ -173,10 +174,18 @@ def test_a_psnr_is_reached_and_hardly_exceeded(sample_path):
     assert len(found.result.data) == found.report.size_bytes
 
 
-def test_where_all_splats_stay_they_are_adjusted_all_the_same(scene):
+def test_where_all_splats_stay_they_are_adjusted_all_the_same(scene, monkeypatch):
+    adjusted = []
+
+    def noted(frozen, *arguments, **options):
+        adjusted.append(len(frozen.draft.model))
+        return adjust_frozen(frozen, *arguments, **options)
+
+    monkeypatch.setattr(fitted, "adjust_frozen", noted)
     found = within(scene, psnr=55.0, simplifying=SimplifyOptions(effort=3, rounds=2))
+    # Whether one of them is the smallest is chance: files of so few splats jump from one precision to the next.
+    assert {len(scene)} == set(adjusted)
     assert found.report.splats == len(scene)
-    assert found.result.report.options["simplified"]["splats"] == len(scene)
     assert found.report.psnr >= 55.0
 
 
