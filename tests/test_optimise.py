@@ -26,8 +26,6 @@ from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
 from csplat_tools.optimise import fitted, optimiser
-from csplat_tools.optimise.coding import _Tried
-from csplat_tools.optimise.moves import Moves
 from csplat_tools.optimise.optimiser import expected_seconds
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.removal import Removal
@@ -606,57 +604,3 @@ def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
     print(shares)
     assert 0.599 < min(shares) < 0.601
     assert max(shares) <= 1.0 + 1e-9
-
-
-# what is tried, in which order
-
-
-def test_codebooks_that_no_precision_helps_grow_to_the_largest_there_may_be():
-    """A smaller one of which there is one file seems to cost less than one that is known to stall."""
-
-    class Books:
-        goal = Goal(psnr=34.0)
-
-        def near(self, _part, book, quality, _tries):
-            return SimpleNamespace(coding=book, quality=quality)
-
-        def about(self, _trial):
-            return -2.0
-
-        def is_stalled(self, trial):
-            return 1 / 512 < trial.coding.share < 1 / 8
-
-        def expected(self, trial):
-            return math.inf if self.is_stalled(trial) else 1.0 - trial.coding.share
-
-        cost = expected
-
-    tried = _Tried(Books(), SimpleNamespace(refits=True), 40.0)
-    small = Coding("codebook", share=1 / 512)
-    tried.add(small)
-    tried.resize(small)
-    assert [1 / 512, 1 / 128, 1 / 32, 1 / 8] == [book.share for book in tried.found]
-
-
-def test_where_so_many_splats_fail_more_of_them_are_tried_before_other_codings():
-    few, more, whole = (SimpleNamespace(refits=refits) for refits in (True, True, False))
-    asked = []
-
-    class Asked:
-        goal = Goal(psnr=34.0)
-
-        def cost(self, trial):
-            return trial.cost
-
-        def on(self, part, coding):
-            asked.append((part, coding))
-            return None if part is few else tried[2]
-
-    rows = ((few, "a", 10, 1.0), (few, "b", 10, 1.1), (more, "a", 20, 1.2), (whole, "a", 99, 9.0))
-    report = SimpleNamespace(errors={})
-    said = {"size_bytes": 100, "psnr": 34.1, "result": SimpleNamespace(report=report)}
-    tried = [
-        SimpleNamespace(part=part, coding=name, splats=splats, cost=cost, **said) for part, name, splats, cost in rows
-    ]
-    assert [tried[2]] == Moves(Asked(), None, whole, None)._on_goal(tried)
-    assert [(few, "a"), (more, "a")] == asked

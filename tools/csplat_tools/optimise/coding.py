@@ -29,8 +29,7 @@ _GRADED = 1.0  # dB that grades are worth, about
 _BOOKED = 0.7  # dB by which a codebook's file is better than one of values one by one, at the same precision
 _UNSURE = (0.02, 0.04)  # of the bytes: what a file says of the cost on the goal, and for every dB that it lies beside
 _OFF = 1.5  # dB: a codebook that is so much worse than values one by one is too small, one so much better too large
-# Of the bytes, of all splats and of some: a codebook that costs so much more than values may win in another size.
-_CLOSE = (0.1, 0.05)
+_CLOSE = 0.1  # of the bytes: a codebook that costs so much more than values one by one may win in another size
 
 
 @dataclass(eq=False)
@@ -89,7 +88,7 @@ class Codings:
             return tried.ordered()
         if self.encoding.codebook_size is None:
             for book in [coding for coding in tried.found if coding.sh == "codebook"]:
-                close = tried.add(book) < tried.add(tried.best) + _CLOSE[part.refits]
+                close = tried.add(book) < tried.add(tried.best) + (0.0 if part.refits else _CLOSE) + 1e-9
                 if close or tried.is_off(book):
                     tried.resize(book)
         if tried.best.adaptive is not None:
@@ -180,12 +179,11 @@ class _Tried:
         ways = ((1 / _SHARE_STEP, above < -_OFF or stalled), (_SHARE_STEP, above > _OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
-            while (after := _resized(coding, factor)) is not None:
-                # Where one is too small for any precision, smaller ones are, too, though no file of theirs says so yet.
-                pays = self.add(after) < self.add(coding)
-                if not pays and not (factor > 1.0 and self.solver.is_stalled(self.found[after])):
+            while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
+                after = replace(coding, share=(coding.share or 0.0) * factor)
+                if self.add(after) >= self.add(coding):
                     break
-                coding, gained = after, gained or pays
+                coding, gained = after, True
             if gained:
                 break
 
@@ -209,13 +207,6 @@ class _Tried:
         known = min(self.found.values(), key=self.solver.cost)
         assert known.quality is not None
         return known.quality - self.solver.about(known)
-
-
-def _resized(book: Coding, factor: float) -> Coding | None:
-    """A codebook of so many times the entries, or as many as there may be; `None` where it has these."""
-    before = book.share or 0.0
-    share = min(max(before * factor, _SHARES[0]), _SHARES[1])
-    return replace(book, share=share) if abs(math.log2(share / before)) >= 1.0 else None
 
 
 def _share(psnr: float) -> float:

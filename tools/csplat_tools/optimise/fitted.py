@@ -34,7 +34,7 @@ Seen = Callable[[SplatModel], float]
 
 _GRADED = 4_000  # splats; what is left of smaller scenes is too alike
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
-_MOST_BANDS = 0.4  # of what the fit leaves, that bands which are left out may take
+_MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
 _FILE_STEPS = 480  # through the quantisers of a file
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH

@@ -29,7 +29,7 @@ _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantis
 _WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
 _PAYS = 0.01  # of the bytes: what is expected to take so much more may take less; dear files have to promise as much
 _FAR = 0.03  # of the bytes
-_WITH_SH = 2.2  # times as much as precision alone says a decibel costs where it decides how many splats stay
+_BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
 _PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
 
 
@@ -69,7 +69,12 @@ class Moves:
             if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
                 tried = self.codings.best(self.solver, self.whole, tried[0].quality or 0.0)
             tried += fitted
-        found = self._on_goal(tried)
+        found: list[Trial] = []
+        for trial in sorted(tried, key=self.solver.cost):
+            if self._pays(trial, found):
+                on = self.solver.on(trial.part, trial.coding)
+                on = self._of_more(trial) if on is None else on
+                found += [] if on is None else [on]
         if found:
             self.solver.try_beside(min(found, key=lambda trial: trial.size_bytes))
         self._presets(tried)
@@ -77,21 +82,6 @@ class Moves:
         if best is None:
             raise InputError(self._out_of_reach())
         return best
-
-    def _on_goal(self, tried: Sequence[Trial]) -> list[Trial]:
-        """Files on the goal, of what is expected to be best there; of more splats where all tried are too few."""
-        found, failed = list[Trial](), list[Trial]()
-        for trial in sorted(tried, key=self.solver.cost):
-            others = [one for one in tried if one.part.refits and one.splats > trial.splats]
-            if any(one.part is trial.part for one in failed) and others:
-                continue  # what more splats make of it first
-            if self._pays(trial, found):
-                on = self.solver.on(trial.part, trial.coding)
-                (failed if on is None else found).append(on or trial)
-        if failed and not any(one.part.refits for one in found):
-            on = self._of_more(max(failed, key=lambda trial: trial.splats))
-            found += [] if on is None else [on]
-        return found
 
     def _may_be_written(self, trial: Trial) -> bool:
         """Whether it is no draft; where views that judge set the level, of what they looked at."""
@@ -109,11 +99,9 @@ class Moves:
     def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
         """Files near the goal of some numbers of splats, each of which says which to try next."""
         solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
-        found, seen, slope = list[Trial](), solver.trials.decider.psnr, solver.slope(whole)
+        slope, found, seen = self._slope_of_counts(whole), list[Trial](), solver.trials.decider.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
-        # Of the error that is left to a file SH takes its part: bands that are left out, codebooks instead of values.
-        slope *= _WITH_SH if whole.coding.sh != "none" else 1.0
         start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
         for _ in range(_COUNTS):
             if left > (1.0 - _ALL_BUT) * splats:
@@ -142,13 +130,24 @@ class Moves:
                     left = int(left * _FEWER)
                 continue
             if goal.psnr is not None:
+                # What bands that are left out cost is no matter of how many splats there are.
                 allowed = solver.level(part)
-                left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
+                wanted = _without(allowed, error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
+                left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
                 left, saved = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
             if min(found, key=solver.cost).part is not part or saved < _WORTH:
                 break
         return found
+
+    def _slope_of_counts(self, whole: Trial) -> float:
+        """What a decibel costs where it decides how many splats stay.
+
+        The more of SH a file needs, the less the next splat takes beside those that matter more: it has fewer bands.
+        """
+        above = (self.solver.goal.psnr or whole.decided_psnr) - _BANDS_GROW[0]
+        has_sh = whole.coding.sh != "none"
+        return self.solver.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
 
     def _of_more(self, trial: Trial) -> Trial | None:
         """A file on the goal of more splats, where those of a trial turned out to be too few for any precision."""
