@@ -26,6 +26,8 @@ from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
 from csplat_render.virtual import scene_frame
 from csplat_tools.optimise import fitted, optimiser
+from csplat_tools.optimise.coding import _Tried
+from csplat_tools.optimise.moves import Moves
 from csplat_tools.optimise.optimiser import expected_seconds
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.removal import Removal
@@ -604,3 +606,83 @@ def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
     print(shares)
     assert 0.599 < min(shares) < 0.601
     assert max(shares) <= 1.0 + 1e-9
+
+
+# what is tried, in which order
+
+
+def test_codebooks_that_no_precision_helps_grow_to_the_largest_there_may_be():
+    """A smaller one of which there is one file seems to cost less than one that is known to stall."""
+
+    class Books:
+        goal = Goal(psnr=34.0)
+
+        def near(self, _part, book, quality, _tries):
+            return SimpleNamespace(coding=book, quality=quality)
+
+        def about(self, _trial):
+            return -2.0
+
+        def is_stalled(self, trial):
+            return 1 / 512 < trial.coding.share < 1 / 4
+
+        def expected(self, trial):
+            return math.inf if self.is_stalled(trial) else 1.0 - trial.coding.share
+
+        cost = expected
+
+    tried = _Tried(Books(), SimpleNamespace(refits=True), 40.0)
+    small = Coding("codebook", share=1 / 512)
+    tried.add(small)
+    tried.resize(small)
+    assert [1 / 512, 1 / 128, 1 / 32, 1 / 8, 1 / 4] == [book.share for book in tried.found]
+
+
+def test_where_so_many_splats_fail_more_of_them_are_tried_before_other_codings():
+    few, more, whole = (SimpleNamespace(refits=refits) for refits in (True, True, False))
+    asked = []
+
+    class Asked:
+        goal = Goal(psnr=34.0)
+
+        def cost(self, trial):
+            return trial.cost
+
+        def on(self, part, coding):
+            asked.append((part, coding))
+            return None if part is few else tried[2]
+
+    rows = ((few, "a", 10, 1.0), (few, "b", 10, 1.1), (more, "a", 20, 1.2), (whole, "a", 99, 9.0))
+    report = SimpleNamespace(errors={})
+    said = {"size_bytes": 100, "psnr": 34.1, "result": SimpleNamespace(report=report)}
+    tried = [
+        SimpleNamespace(part=part, coding=name, splats=splats, cost=cost, **said) for part, name, splats, cost in rows
+    ]
+    assert [tried[2]] == Moves(Asked(), None, whole, None)._on_goal(tried)
+    assert [(few, "a"), (more, "a")] == asked
+
+
+def test_what_adjustment_does_to_one_number_of_splats_is_expected_of_others():
+    """Views that decide gain more by it than those that judge: 0.5 dB here."""
+    one, other = (SimpleNamespace(refits=True) for _ in range(2))
+    rows = ((one, False, 34.5, 34.0), (one, True, 35.0, 34.0), (other, False, 34.2, 34.0))
+    made = [
+        SimpleNamespace(part=part, is_careful=careful, decided_psnr=decided, psnr=judged, is_judged=True)
+        for part, careful, decided, judged in rows
+    ]
+    solver = Solver(SimpleNamespace(made=made), Goal(psnr=34.0))
+    assert solver.level(one) == pytest.approx(35.0)
+    assert solver.level(other) == pytest.approx(34.2 + 0.5)
+    assert Solver(SimpleNamespace(made=made[2:]), Goal(psnr=34.0)).level(other) == pytest.approx(34.2)
+
+
+def test_near_what_removal_took_a_decibel_is_dear():
+    """Two files as far below the goal as each other: the one whose splats err more needs more precision."""
+    part, better = (SimpleNamespace(refits=True, psnr=psnr) for psnr in (34.5, 40.0))
+    packed = SimpleNamespace(deflate_level=12)
+    said = {"coding": Coding("scalar"), "quality": 40.0, "options": packed, "is_careful": True, "is_judged": True}
+    seen = {"psnr": 33.8, "decided_psnr": 33.8, "size_bytes": 1000}
+    made = [SimpleNamespace(part=one, **said, **seen) for one in (part, better)]
+    trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.part is part])
+    solver = Solver(trials, Goal(psnr=34.0))
+    assert solver.expected(made[0]) > solver.expected(made[1]) > math.log(1000)

@@ -29,7 +29,7 @@ from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, w
 from csplat_tools.optimise.simplify.fitting import Fit
 from csplat_tools.optimise.simplify.order import Side, removal_order, seen_by
 from csplat_tools.study import prune_share
-from csplat_tools.views import camera_sequence, elsewhere, find_view_set, reduced
+from csplat_tools.views import VIEW_COUNT, VIEW_SIZE, camera_sequence, elsewhere, find_view_set, reduced, usual_views
 from csplat_tools.views.agreeing import find_views, removal_keys
 from csplat_trainer.evaluate import photograph_judge
 from csplat_trainer.pictures import Picture
@@ -358,3 +358,13 @@ def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path
 def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
     write_ply(tmp_path / "scene.ply", source)
     assert invoke("simplify", tmp_path / "scene.ply", tmp_path / "out.ply", *words).exit_code == 2
+
+
+def test_views_of_many_splats_are_larger_and_fewer_and_steps_as_well():
+    assert usual_views(100_000) == (VIEW_COUNT, VIEW_SIZE)
+    assert usual_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
+    assert SimplifyOptions().pictures(100) == usual_views(100)
+    assert SimplifyOptions(views=3, view_size=(20, 10)).pictures(10_000_000) == (3, (20, 10))
+    usual = SimplifyOptions().steps(400)
+    assert SimplifyOptions(view_size=(480, 360)).steps(400) == usual // 2
+    assert SimplifyOptions(view_size=(24, 18)).steps(400) == usual

@@ -171,8 +171,9 @@ class _Derivatives(Rasteriser):
         """Divide by the pixels, and take the largest of each group."""
         pixels = max(1, self._pixel_count)
         self._metric /= np.float32(pixels)
-        bends, squares = _finite(self._bends / pixels), _finite(self._squares / pixels)
-        net, sizes = _finite(self._net / pixels), _finite(self._sizes / pixels)
+        bends, squares, net, sizes = (
+            _over(sums, pixels) for sums in (self._bends, self._squares, self._net, self._sizes)
+        )
         return Sensitivity(
             colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels,
             opacity=sizes[:, 0],
@@ -191,7 +192,8 @@ class _Derivatives(Rasteriser):
         )
 
 
-def _finite(sums: F64) -> F64:
-    """The array, made to fit float32; sums that have left float64 say nothing, and become 0."""
+def _over(sums: F64, pixels: int) -> F64:
+    """The array itself, divided and made to fit float32; sums that have left float64 say nothing, and become 0."""
+    sums /= pixels
     np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     return np.clip(sums, -_LARGEST, _LARGEST, out=sums)

@@ -202,10 +202,11 @@ def _packed(metric: NDArray[np.float32]) -> NDArray[np.float16]:
 def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np.float32]:
     """Triangles over the mean of their diagonals; the plain norm serves what no view saw."""
     seen = mean > 0.0
-    scaled = triangles / np.where(seen, mean, 1.0)[:, None]
+    scaled = np.empty(triangles.shape, np.float32)
+    np.divide(triangles, np.where(seen, mean, 1.0)[:, None], out=scaled, casting="same_kind")
     rows, columns = np.triu_indices(_order(triangles))
     scaled[~seen] = rows == columns
-    return scaled.astype(np.float32)
+    return scaled
 
 
 def _order(triangles: NDArray[Any]) -> int:

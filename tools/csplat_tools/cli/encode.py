@@ -305,8 +305,9 @@ def _reach(
         from csplat_tools.optimise.optimiser import expected_seconds
         from csplat_tools.optimise.simplify import SimplifyOptions
 
-        simplifying = SimplifyOptions(effort=goal.effort)
-        around = views.find(model, out, **virtual.given())
+        given = virtual.given()
+        simplifying = SimplifyOptions(effort=goal.effort, view_size=given.get("size"))
+        around = views.find(model, out, **given)
         if len(model) and around.judges:
             may_keep_all = not goal.keep_all and goal.keep is None
             out.foretell(

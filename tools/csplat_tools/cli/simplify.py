@@ -87,12 +87,12 @@ def simplify(
     check_name(output, ".ply", "simplify", source)
     model = upright.upright().applied(load_model(source).model)
     prepare_renderer(quiet=out.quiet, simplify=True)
-    given = {"size": options.view_size, **virtual.given()}
+    given = virtual.given()
     around = views.find(model, out, seed=seed, **given)
-    options = replace(options, view_size=given["size"])
+    options = replace(options, view_size=given.get("size"))
     passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
     out.foretell(
-        lambda: passes * pictures_seconds(model, reduced(around.teaches, given["size"])),
+        lambda: passes * pictures_seconds(model, reduced(around.teaches, options.pictures(len(model))[1])),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:

@@ -19,7 +19,7 @@ _LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
 _SHARE_AT = (38.0, 1 / 64, 0.4)  # dB of a file, entries of its SH codebook per splat, and how many octaves a dB is
 _SHARE_STEP = 4.0
 _FITTED = 2.0  # times as many per splat where others were taken away: those that stay differ more
-_SHARES = (1 / 4096, 1 / 8)
+_SHARES = (1 / 4096, 1 / 4)
 _ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
 _DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
 _NONE_DROPPED = 1.0  # the same without any: a file of no SH is the quickest to try
@@ -179,11 +179,12 @@ class _Tried:
         ways = ((1 / _SHARE_STEP, above < -_OFF or stalled), (_SHARE_STEP, above > _OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
-            while _SHARES[0] <= (coding.share or 0.0) * factor <= _SHARES[1]:
-                after = replace(coding, share=(coding.share or 0.0) * factor)
-                if self.add(after) >= self.add(coding):
+            while (after := _resized(coding, factor)) is not None:
+                # Where one is too small for any precision, smaller ones are, too, though no file of theirs says so yet.
+                pays = self.add(after) < self.add(coding)
+                if not pays and not (factor > 1.0 and self.solver.is_stalled(self.found[after])):
                     break
-                coding, gained = after, True
+                coding, gained = after, gained or pays
             if gained:
                 break
 
@@ -207,6 +208,13 @@ class _Tried:
         known = min(self.found.values(), key=self.solver.cost)
         assert known.quality is not None
         return known.quality - self.solver.about(known)
+
+
+def _resized(book: Coding, factor: float) -> Coding | None:
+    """A codebook of so many times the entries, or as many as there may be; `None` where it has these."""
+    before = book.share or 0.0
+    share = min(max(before * factor, _SHARES[0]), _SHARES[1])
+    return replace(book, share=share) if abs(math.log2(share / before)) >= 1.0 else None
 
 
 def _share(psnr: float) -> float:

@@ -36,6 +36,7 @@ _GRADED = 4_000  # splats; what is left of smaller scenes is too alike
 _LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
 _MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
 _BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
+_CARRIED_STEPS = 480  # of a fit that begins where another ended
 _FILE_STEPS = 480  # through the quantisers of a file
 _SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
 
@@ -155,9 +156,9 @@ class FittedSplats:
         start, self.before = session.source.select(self.rows), None
         if not (session.options.refit and self.gone):
             return start
-        if before is not None:
-            start = _carried(before.model, before.rows, start, self.rows)
-        return self._adjusted(start, FIT_STEPS)
+        if before is None:
+            return self._adjusted(start, FIT_STEPS)
+        return self._adjusted(_carried(before.model, before.rows, start, self.rows), _CARRIED_STEPS)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
         """The splats without the bands that are not worth their bits where files err by so much; those that stay."""

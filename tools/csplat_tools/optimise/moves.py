@@ -22,12 +22,14 @@ _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
 _COUNTS = 3  # numbers of splats that are fitted
 _WORTH = 0.02  # of the bytes: another number of splats that is foreseen to save less is not worth a fit
+_CLOSE = 0.04  # of the splats: a number that is no farther from one that was tried is not worth a fit either
 _SPARE = 0.7  # dB above the goal: splats whose fit is worse leave too little of the error to quantisation
 _FEWER = 0.7  # of the splats, where a size holds none of their files
 _ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
 _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
 _WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
-_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less; dear files have to promise as much
+_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
+_PAYS_DEARLY = 0.03  # of the bytes: what other splats have to promise, whose files are adjusted before they are judged
 _FAR = 0.03  # of the bytes
 _BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
 _PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
@@ -69,12 +71,7 @@ class Moves:
             if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
                 tried = self.codings.best(self.solver, self.whole, tried[0].quality or 0.0)
             tried += fitted
-        found: list[Trial] = []
-        for trial in sorted(tried, key=self.solver.cost):
-            if self._pays(trial, found):
-                on = self.solver.on(trial.part, trial.coding)
-                on = self._of_more(trial) if on is None else on
-                found += [] if on is None else [on]
+        found = self._on_goal(tried)
         if found:
             self.solver.try_beside(min(found, key=lambda trial: trial.size_bytes))
         self._presets(tried)
@@ -82,6 +79,21 @@ class Moves:
         if best is None:
             raise InputError(self._out_of_reach())
         return best
+
+    def _on_goal(self, tried: Sequence[Trial]) -> list[Trial]:
+        """Files on the goal, of what is expected to be best there; of more splats where all tried are too few."""
+        found, failed = list[Trial](), list[Trial]()
+        for trial in sorted(tried, key=self.solver.cost):
+            others = [one for one in tried if one.part.refits and one.splats > trial.splats]
+            if any(one.part is trial.part for one in failed) and others:
+                continue  # what more splats make of it first
+            if self._pays(trial, found):
+                on = self.solver.on(trial.part, trial.coding)
+                (failed if on is None else found).append(on or trial)
+        if failed and not any(one.part.refits for one in found):
+            on = self._of_more(max(failed, key=lambda trial: trial.splats))
+            found += [] if on is None else [on]
+        return found
 
     def _may_be_written(self, trial: Trial) -> bool:
         """Whether it is no draft; where views that judge set the level, of what they looked at."""
@@ -117,6 +129,8 @@ class Moves:
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
             trial = tries[0]
+            if goal.is_judged:
+                trial.let_judge()
             found += tries
             if left == splats or removal.options.is_brief:
                 break
@@ -136,7 +150,8 @@ class Moves:
                 left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
             else:
                 left, saved = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
-            if min(found, key=solver.cost).part is not part or saved < _WORTH:
+            saved -= solver.cost(trial) - min(map(solver.cost, found))
+            if saved < _WORTH or any(abs(one.splats - left) < _CLOSE * left for one in found):
                 break
         return found
 
@@ -176,7 +191,7 @@ class Moves:
         if again and trial.part.refits:
             return False  # another coding was expected to be better, until its file said what it costs
         saved = self.solver.cost(best) - self.solver.cost(trial)
-        return saved > (_PAYS if again or trial.part.refits else -_PAYS)
+        return saved > (_PAYS_DEARLY if trial.part.refits else _PAYS if again else -_PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:
         """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""

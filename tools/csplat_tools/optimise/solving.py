@@ -164,6 +164,7 @@ class Solver:
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
         above = trial.decided_psnr + self._gained(trial) - level
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
+        above = _quantised(trial, above)
         return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
     def about(self, trial: Trial) -> float:
@@ -191,10 +192,11 @@ class Solver:
         return 0.0 if trial.is_careful or not trial.part.refits else TUNING_GAINS
 
     def slope(self, trial: Trial) -> float:
-        """The share of the bytes that a decibel costs here."""
+        """The share of the bytes that a decibel of what quantisation does costs here."""
         for other in self.trials.of(trial.part, trial.coding):
-            apart = other.decided_psnr - trial.decided_psnr
-            if abs(apart) > _APART and other.options.deflate_level == trial.options.deflate_level:
+            apart = _quantised(other, other.decided_psnr - trial.decided_psnr)
+            alike = (other.is_careful, other.options.deflate_level) == (trial.is_careful, trial.options.deflate_level)
+            if abs(apart) > _APART and alike:
                 return min(max(math.log(other.size_bytes / trial.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
         return BYTES_PER_DB
 
@@ -207,8 +209,23 @@ class Solver:
             return self.goal.psnr or 0.0
         made = [trial for trial in self.trials.made if trial.part is part]
         judged = [trial for trial in made if trial.is_judged] or made[:1]
-        nearest = min(judged, key=lambda trial: abs(trial.psnr - (self.goal.psnr or 0.0)))
-        return (self.goal.psnr or 0.0) + nearest.decided_psnr - nearest.psnr
+        nearest = self._nearest_judged(judged)
+        shift = 0.0 if nearest.is_careful or not part.refits else self._shift()
+        return (self.goal.psnr or 0.0) + _beside(nearest) + shift
+
+    def _shift(self) -> float:
+        """By how much adjustment through the quantisers changed how views that decide and that judge differ, dB."""
+        shifts = []
+        for part in {id(trial.part): trial.part for trial in self.trials.made if trial.part.refits}.values():
+            made = [trial for trial in self.trials.made if trial.part is part and trial.is_judged]
+            kinds = [[trial for trial in made if trial.is_careful == careful] for careful in (True, False)]
+            if all(kinds):
+                careful, quick = (_beside(self._nearest_judged(kind)) for kind in kinds)
+                shifts.append(careful - quick)
+        return sum(shifts) / len(shifts) if shifts else 0.0
+
+    def _nearest_judged(self, judged: Sequence[Trial]) -> Trial:
+        return min(judged, key=lambda trial: abs(trial.psnr - (self.goal.psnr or 0.0)))
 
     def _level_of_size(self) -> float:
         return min(self.trials.made, key=lambda trial: abs(self.goal.above(trial))).decided_psnr
@@ -259,6 +276,11 @@ def _quantised(trial: Trial, above: float) -> float:
     total, goal = error_of_psnr(trial.decided_psnr), error_of_psnr(trial.decided_psnr - above)
     removed = min(error_of_psnr(trial.part.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
     return 10.0 * math.log10((goal - removed) / (total - removed))
+
+
+def _beside(trial: Trial) -> float:
+    """By how many dB views that decide see a file better than those that judge."""
+    return trial.decided_psnr - trial.psnr
 
 
 def _jumps(trials: Sequence[Trial]) -> bool:

@@ -22,7 +22,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.files.extras import need_photographs
-from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly
+from csplat_tools.views.placing import CHECKS, camera_sequence, evenly, usual_views
 from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, pose
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ def find_view_set(
     cameras: str | None = None,
     data: DataOptions | None = None,
     background: Colour | None = None,
-    count: int = VIEW_COUNT,
-    size: tuple[int, int] = VIEW_SIZE,
+    count: int | None = None,
+    size: tuple[int, int] | None = None,
     seed: int = 0,
     aside: int | None = None,
     split: Split = "test",
@@ -84,7 +84,7 @@ def find_view_set(
         background: behind everything; `None`: what the scene says it was trained in front of, else black.
         count: virtual views that teach; 16 more do, too, which a removal keeps apart to check what the others taught.
             0: no virtual ones teach or decide.
-        size, seed: of virtual views.
+        size, seed: of virtual views. `None`, and for the count: as is usual for so many splats (`usual_views`).
         aside: how many views decide; `None`: as many as the table says.
         split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
         every: how many splats of the scene each of the source's stands for, where it is a part of them: for views that
@@ -98,6 +98,8 @@ def find_view_set(
         raise InputError("wanted cameras of a file or of a data set, not both")
     if split not in SPLITS:
         raise InputError(f"the split is {split!r}, wanted one of {', '.join(SPLITS)}")
+    usual = usual_views(every * len(source))
+    count, size = usual[0] if count is None else count, size or usual[1]
     if data is not None:
         return _of_data(source, data, background, aside, split)
     if cameras is None:

@@ -72,7 +72,7 @@ def adjust(
     scene, teaching = _Floats.of(model, free), _Teaching(cameras, wanted, options, model.antialiased)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     _descend(scene, teaching, steps, factor * _length(teaching.rms(scene.seen())), progress)
-    return scene.model(model)
+    return scene.moved(model)
 
 
 def adjust_frozen(
@@ -162,17 +162,14 @@ class _Floats:
     """Values that nothing quantises."""
 
     means: F32
-    start: dict[str, F32]
     parameters: Parameters
     free: Mask | None
 
     @classmethod
     def of(cls, model: SplatModel, free: Mask | None) -> _Floats:
-        start = {name: array for name, array in from_model(model, model.sh_degree).items() if name != "means"}
-        moving = {name: array.copy() for name, array in start.items()}
-        parameters = Parameters.starting_at(moving)
+        parameters = Parameters.starting_at(_moving(model))
         parameters.beta2 = _BETA2
-        return cls(model.means, start, parameters, free)
+        return cls(model.means, parameters, free)
 
     def seen(self) -> Splats:
         v = self.parameters.values
@@ -183,15 +180,16 @@ class _Floats:
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
         slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
         if self.free is not None:
-            slopes["shN"] = slopes["shN"] * self.free[:, :, None]
+            gradients.shN[:] *= self.free[:, :, None]  # the rasteriser's, until its next
         adam_step(self.parameters, slopes, rates)
 
-    def model(self, before: SplatModel) -> SplatModel:
-        """What moved; the rest bit for bit as it was, and what is beyond float32 too."""
-        values, alphas = self.parameters.values, self.parameters.alphas
+    def moved(self, before: SplatModel) -> SplatModel:
+        """What moved; the rest bit for bit as it was, and what is beyond float32 too. No step may follow."""
+        self.parameters.first, self.parameters.second = {}, {}  # as large as the scene, each
+        values, alphas, start = self.parameters.values, self.parameters.alphas, _moving(before)
         moved = np.zeros(len(before), bool)
         for name in ("logits", "scales", "sh0", "shN"):
-            moved |= (values[name] != self.start[name]).reshape(len(before), -1).any(axis=1)
+            moved |= (values[name] != start[name]).reshape(len(before), -1).any(axis=1)
         for array in values.values():
             moved &= np.isfinite(array).reshape(len(before), -1).all(axis=1)
         rows = moved[:, None]
@@ -203,6 +201,13 @@ class _Floats:
             sh0=np.where(rows, values["sh0"], before.sh0),
             shN=np.where(rows[:, :, None], values["shN"], before.shN),
         )
+
+
+def _moving(model: SplatModel) -> dict[str, F32]:
+    """Values of a scene that move."""
+    values = from_model(model, model.sh_degree)
+    del values["means"]
+    return values
 
 
 @dataclass(eq=False)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from csplat.errors import InputError
-from csplat_tools.views import VIEW_COUNT, VIEW_SIZE
+from csplat_tools.views import VIEW_SIZE, usual_views
 
 __all__ = ["SimplifyOptions"]
 
@@ -23,8 +24,8 @@ class SimplifyOptions:
             twice as many; below 3 a target tries fewer things.
         bands: set SH bands to zero that are worth less than their bits.
         keep_unseen: splats that no view shows stay.
-        view_size: of the pictures that teach, width and height in pixels.
-        views: virtual views at most, where no views are given.
+        view_size: of the pictures that teach, width and height in pixels; `None`: as is usual for so many splats.
+        views: virtual views at most, where no views are given; `None`: likewise.
         background: red, green, blue behind those; of views that are given theirs counts.
         seed: of those, and of the order in which views are looked at.
         threads: how many; None for all. The result does not depend on it.
@@ -38,8 +39,8 @@ class SimplifyOptions:
     effort: int = _USUAL
     bands: bool = True
     keep_unseen: bool = True
-    view_size: tuple[int, int] = VIEW_SIZE
-    views: int = VIEW_COUNT
+    view_size: tuple[int, int] | None = None
+    views: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
     threads: int | None = None
@@ -48,14 +49,21 @@ class SimplifyOptions:
         if not 1 <= self.effort <= 9:
             raise InputError(f"effort is {self.effort}, wanted 1 to 9")
         for name in ("rounds", "views"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}, wanted 1 or more")
-        if min(self.view_size) < 1:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name} is {value}, wanted 1 or more")
+        if self.view_size is not None and min(self.view_size) < 1:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")
 
+    def pictures(self, splats: int) -> tuple[int, tuple[int, int]]:
+        """How many views teach at most, and the width and height of their pictures, of a scene of so many splats."""
+        views, size = usual_views(splats)
+        return self.views or views, self.view_size or size
+
     def steps(self, usual: int) -> int:
-        """Steps of descent in place of so many, which are usual."""
-        return max(1, round(usual * self.work))
+        """Steps of descent in place of so many, which are usual: fewer, where pictures are larger and views fewer."""
+        larger = math.sqrt(math.prod(self.view_size or VIEW_SIZE) / math.prod(VIEW_SIZE))
+        return max(1, round(usual * self.work / max(1.0, larger)))
 
     @property
     def work(self) -> float:

@@ -125,17 +125,16 @@ def prepare(
     """
     seconds = {}
     start = time.perf_counter()
-    around = views or find_view_set(
-        source, background=options.background, count=options.views, size=options.view_size, seed=options.seed
-    )
-    options = replace(options, background=around.background)
+    count, size = options.pictures(len(source))
+    around = views or find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
+    options = replace(options, background=around.background, view_size=size)
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
-    found = find_views(source, around, gone, size=options.view_size, threads=options.threads, progress=progress)
+    found = find_views(source, around, gone, size=size, threads=options.threads, progress=progress)
     draw = renderer(source, around.background, threads=options.threads)
     sides = [Side(found.used, found.removal)]
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
-        cameras = camera_sequence(source, more, options.view_size, seed=options.seed + 1)
+        cameras = camera_sequence(source, more, size, seed=options.seed + 1)
         removal = measure_removal(
             source, cameras, background=around.background, threads=options.threads, progress=progress
         )
