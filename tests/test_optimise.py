@@ -24,9 +24,11 @@ from csplat.model import SplatModel
 from csplat_conformance.stated import Source, prove
 from csplat_render.cameras import intrinsics, look_at, resized
 from csplat_render.judge import Judge, renderer
+from csplat_render.metrics import psnr_of_mse
 from csplat_render.virtual import scene_frame
 from csplat_tools.optimise import fitted, optimiser
 from csplat_tools.optimise.coding import _Tried
+from csplat_tools.optimise.exchange import error_of_psnr
 from csplat_tools.optimise.moves import Moves
 from csplat_tools.optimise.optimiser import expected_seconds
 from csplat_tools.optimise.reaching import encode_to
@@ -36,7 +38,7 @@ from csplat_tools.optimise.search import Window, meet
 from csplat_tools.optimise.sensitivity import measured_importance
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.simplify.adjusting import adjust_frozen
-from csplat_tools.optimise.solving import Goal, Solver
+from csplat_tools.optimise.solving import TUNING_GAINS, Goal, Solver
 from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Coding, Trials, spread_of
 from csplat_tools.views import (
@@ -662,18 +664,19 @@ def test_where_so_many_splats_fail_more_of_them_are_tried_before_other_codings()
     assert [(few, "a"), (more, "a")] == asked
 
 
-def test_what_adjustment_does_to_one_number_of_splats_is_expected_of_others():
-    """Views that decide gain more by it than those that judge: 0.5 dB here."""
-    one, other = (SimpleNamespace(refits=True) for _ in range(2))
-    rows = ((one, False, 34.5, 34.0), (one, True, 35.0, 34.0), (other, False, 34.2, 34.0))
-    made = [
-        SimpleNamespace(part=part, is_careful=careful, decided_psnr=decided, psnr=judged, is_judged=True)
-        for part, careful, decided, judged in rows
-    ]
-    solver = Solver(SimpleNamespace(made=made), Goal(psnr=34.0))
-    assert solver.level(one) == pytest.approx(35.0)
-    assert solver.level(other) == pytest.approx(34.2 + 0.5)
-    assert Solver(SimpleNamespace(made=made[2:]), Goal(psnr=34.0)).level(other) == pytest.approx(34.2)
+def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
+    """Removal errs by 0.45 of what is allowed for those that decide: what those that judge leave is added."""
+    allowed, gains = error_of_psnr(34.0), TUNING_GAINS
+    part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
+
+    def solver(judged):
+        trials = SimpleNamespace(made=[], judged_psnr=lambda _: psnr_of_mse(judged * allowed) - gains)
+        return Solver(trials, Goal(psnr=34.0))
+
+    assert solver(0.8).level(part) == pytest.approx(psnr_of_mse((0.45 + 0.2) * allowed))
+    assert solver(0.45).level(part) == pytest.approx(34.0)
+    assert [False, True] == [solver(share).is_hopeless(part) for share in (0.85, 0.95)]
+    assert not Solver(solver(0.95).trials, Goal(size_bytes=1000)).is_hopeless(part)
 
 
 def test_near_what_removal_took_a_decibel_is_dear():

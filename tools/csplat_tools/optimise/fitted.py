@@ -108,6 +108,11 @@ class FittedSplats:
         return banded, stays
 
     @property
+    def shown(self) -> SplatModel:
+        """What is quantised."""
+        return self.banded[0]
+
+    @property
     def psnr(self) -> float:
         """Of what is quantised by the views that decide, dB."""
         return self._banded_psnr  # a cached property of this name would not be the protocol's for pyright
@@ -128,13 +133,10 @@ class FittedSplats:
             frozen, session.taught, session.wanted, session.options, steps=session.options.steps(_FILE_STEPS),
             progress=self.progress,
         )  # fmt: skip
-        untuned = frozen.start()
-        before, self._check_psnr = (
-            session.checked.psnr(replace(start, **vars(frozen.seen(values)), means_double=None))
-            for values in (untuned, held)
-        )
-        if self._check_psnr < before:  # a handful of splats may be too few for steps so long
-            self._check_psnr, held = before, untuned
+        shown = [replace(start, **vars(frozen.seen(values)), means_double=None) for values in (frozen.start(), held)]
+        if self.seen(shown[1]) < self.seen(shown[0]):  # a handful of splats may be too few for steps so long
+            held, shown = frozen.start(), shown[:1]
+        self._check_psnr = session.checked.psnr(shown[-1])
         return frozen.coded(held, self.progress)
 
     def said(self, trial: Trial | None) -> Mapping[str, Any]:

@@ -20,7 +20,7 @@ __all__ = ["Moves"]
 _LOSS = (5.0, 8.5)  # dB between what each attribute keeps by itself and what all keep at 30 dB, without and with SH
 _LOSS_GROWS = (0.0, 0.22)  # with every dB above
 _USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
-_COUNTS = 3  # numbers of splats that are fitted
+_COUNTS = 3  # numbers of splats that are fitted; twice as many, if need be, until there is a file
 _WORTH = 0.02  # of the bytes: another number of splats that is foreseen to save less is not worth a fit
 _CLOSE = 0.04  # of the splats: a number that is no farther from one that was tried is not worth a fit either
 _SPARE = 0.7  # dB above the goal: splats whose fit is worse leave too little of the error to quantisation
@@ -115,7 +115,9 @@ class Moves:
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
-        for _ in range(_COUNTS):
+        for number in range(2 * _COUNTS):
+            if number >= _COUNTS and found:
+                break
             if left > (1.0 - _ALL_BUT) * splats:
                 if found or removal.options.is_brief:
                     break
@@ -126,11 +128,12 @@ class Moves:
                     break
                 left, _ = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
                 continue
+            if solver.is_hopeless(part):
+                left = _more(left)
+                continue
             quality = start if goal.psnr is None else _finer(start, goal.psnr, part.psnr)
             tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
             trial = tries[0]
-            if goal.is_judged:
-                trial.let_judge()
             found += tries
             if left == splats or removal.options.is_brief:
                 break

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_of_psnr
 from csplat_tools.optimise.search import FLATTEST, Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
@@ -207,25 +208,28 @@ class Solver:
         """
         if not self.goal.is_judged:
             return self.goal.psnr or 0.0
+        goal = self.goal.psnr or 0.0
         made = [trial for trial in self.trials.made if trial.part is part]
-        judged = [trial for trial in made if trial.is_judged] or made[:1]
-        nearest = self._nearest_judged(judged)
-        shift = 0.0 if nearest.is_careful or not part.refits else self._shift()
-        return (self.goal.psnr or 0.0) + _beside(nearest) + shift
+        judged = [trial for trial in made if trial.is_judged and (trial.is_careful or not part.refits)]
+        if part.refits and not judged:
+            return self._level_of_fit(part, error_of_psnr(goal))
+        nearest = min(judged or made[:1], key=lambda trial: abs(trial.psnr - goal))
+        return goal + nearest.decided_psnr - nearest.psnr
 
-    def _shift(self) -> float:
-        """By how much adjustment through the quantisers changed how views that decide and that judge differ, dB."""
-        shifts = []
-        for part in {id(trial.part): trial.part for trial in self.trials.made if trial.part.refits}.values():
-            made = [trial for trial in self.trials.made if trial.part is part and trial.is_judged]
-            kinds = [[trial for trial in made if trial.is_careful == careful] for careful in (True, False)]
-            if all(kinds):
-                careful, quick = (_beside(self._nearest_judged(kind)) for kind in kinds)
-                shifts.append(careful - quick)
-        return sum(shifts) / len(shifts) if shifts else 0.0
+    def _level_of_fit(self, part: Part, allowed: float) -> float:
+        """The same of fitted splats before a file of theirs was adjusted: what removal leaves to quantisation.
 
-    def _nearest_judged(self, judged: Sequence[Trial]) -> Trial:
-        return min(judged, key=lambda trial: abs(trial.psnr - (self.goal.psnr or 0.0)))
+        That errs alike in all views, and removal does not: both see what it costs, less what adjustment mends of it.
+        """
+        decided, judged = (error_of_psnr(psnr + TUNING_GAINS) for psnr in (part.psnr, self.trials.judged_psnr(part)))
+        return psnr_of_mse(decided + max(allowed - judged, LEAST_QUANTISED * allowed))
+
+    def is_hopeless(self, part: Part) -> bool:
+        """Whether views that judge see that removal took nearly all of the error that a PSNR allows."""
+        if not (self.goal.is_judged and part.refits):
+            return False
+        judged = error_of_psnr(self.trials.judged_psnr(part) + TUNING_GAINS)
+        return judged > (1.0 - LEAST_QUANTISED) * error_of_psnr(self.goal.psnr or 0.0)
 
     def _level_of_size(self) -> float:
         return min(self.trials.made, key=lambda trial: abs(self.goal.above(trial))).decided_psnr
@@ -276,11 +280,6 @@ def _quantised(trial: Trial, above: float) -> float:
     total, goal = error_of_psnr(trial.decided_psnr), error_of_psnr(trial.decided_psnr - above)
     removed = min(error_of_psnr(trial.part.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
     return 10.0 * math.log10((goal - removed) / (total - removed))
-
-
-def _beside(trial: Trial) -> float:
-    """By how many dB views that decide see a file better than those that judge."""
-    return trial.decided_psnr - trial.psnr
 
 
 def _jumps(trials: Sequence[Trial]) -> bool:

@@ -68,6 +68,11 @@ class Part(Protocol):
         ...
 
     @property
+    def shown(self) -> SplatModel:
+        """What of them is quantised: SH bands may be missing."""
+        ...
+
+    @property
     def psnr(self) -> float:
         """Of these by the views that decide, dB; infinite where they are the source's."""
         ...
@@ -108,6 +113,11 @@ class Whole:
     psnr: float = math.inf
     refits: bool = False
     gradable: bool = True
+
+    @property
+    def shown(self) -> SplatModel:
+        """All of it."""
+        return self.model
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:  # noqa: ARG002  # the protocol's
         """Code them."""
@@ -225,11 +235,20 @@ class Trials:
     photographs: Judge | None = None
     made: list[Trial] = field(default_factory=list)
     progress: Progress | None = None
+    _judged: list[tuple[Part, float]] = field(default_factory=list, init=False)
 
     @property
     def renders(self) -> int:
         """How many pictures were rendered of them."""
         return sum(len(self.decider.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
+
+    def judged_psnr(self, part: Part) -> float:
+        """Of what a part quantises by the views that judge, dB: how much of the error that they allow removal took."""
+        for other, psnr in self._judged:
+            if other is part:
+                return psnr
+        self._judged.append((part, self.judge.psnr(part.shown)))
+        return self._judged[-1][1]
 
     def make(
         self, part: Part, coding: Coding, quality: float | None, *, quick: bool, encoding: EncodeOptions | None = None

@@ -1,4 +1,7 @@
-"""The scenes that benchmarks run on: what ships, what the data folder has, what is made of it; and their cameras."""
+"""The scenes that benchmarks run on: what ships, what the data folder has, what is made of it; and their cameras.
+
+A scene that is none of these is looked for as NAME.ply in the folder of made scenes: what was trained here lies there.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +112,7 @@ def _path(name: str, cache: Path) -> Path | None:
         return made if made.exists() else None
     source = _SAMPLE if name == "sample" else DATA / "ply" / f"{_made_of(name)}.ply"
     if not source.exists():
-        return None
+        return made if made.exists() else None
     if name in _BLOWN_UP and not made.exists():
         write_ply(made, blow_up(read_ply(source), _BLOWN_UP[name][1]))
     elif name in _CROWDS and not made.exists():
