@@ -191,9 +191,9 @@ class Moves:
         if best is None:
             return True
         again = any(one.part is trial.part for one in found)
-        if again and trial.part.refits:
-            return False  # another coding was expected to be better, until its file said what it costs
-        saved = self.solver.cost(best) - self.solver.cost(trial)
+        # What lies on a PSNR costs its bytes, whatever may be foreseen of fewer.
+        known = math.log(best.size_bytes) if self.solver.goal.size_bytes is None else self.solver.cost(best)
+        saved = known - self.solver.cost(trial)
         return saved > (_PAYS_DEARLY if trial.part.refits else _PAYS if again else -_PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:

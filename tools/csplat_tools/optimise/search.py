@@ -39,6 +39,7 @@ def meet(
     tries: int,
     known: Sequence[tuple[float, float]] = (),
     flattest: float = FLATTEST,
+    patience: int = 2,
 ) -> list[tuple[float, float]]:
     """Try places until a value that grows with them lies in a window.
 
@@ -51,6 +52,7 @@ def meet(
         tries: how many at most.
         known: places and values from before; where there are some, `start` says nothing.
         flattest: how much less steep than `slope` two trials may say that the value is.
+        patience: after so many long steps one after the other that gained next to nothing no more are tried.
 
     Returns:
         Places and values in the order in which they were tried, those known first; the last one lies in the window
@@ -62,7 +64,7 @@ def meet(
     for _ in range(tries):
         place: float | None = min(max(start, bounds[0]), bounds[1])
         if points:
-            place = _next(points, window, slope, flattest * slope, bounds)
+            place = _next(points, window, slope, flattest * slope, bounds, patience)
         if place is None:
             break
         value = measure(place)
@@ -73,7 +75,12 @@ def meet(
 
 
 def _next(
-    points: list[tuple[float, float]], window: Window, slope: float, least: float, bounds: tuple[float, float]
+    points: list[tuple[float, float]],
+    window: Window,
+    slope: float,
+    least: float,
+    bounds: tuple[float, float],
+    patience: int,
 ) -> float | None:
     """Where to try next, by a slope that is expected and the least; None where a bound was tried, or nothing grows."""
     below = max((point for point in points if point[1] < window.low), default=None)
@@ -85,7 +92,9 @@ def _next(
     place, value = points[-1]
     if len(points) > 1 and points[-2][0] != place:
         seen = (value - points[-2][1]) / (place - points[-2][0])
-        if value < window.low and all(_stalled(points[: len(points) - back], slope, bounds) for back in (0, 1)):
+        if value < window.low and all(
+            _stalled(points[: len(points) - back], slope, bounds) for back in range(patience)
+        ):
             return None  # it grows no more
         slope = min(max(seen, least), _STEEPEST * slope)
     wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])

@@ -31,6 +31,7 @@ _BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was f
 _APART = 0.5  # dB between two files that say what a decibel costs
 _SLOPES = (0.02, 0.1)
 _PLATEAU = 1.5  # dB below the goal
+_FORESEEN = 2.0  # dB by which what quantisation does may be better than it has to be, for that to be believed
 _EVEN = 0.5  # of the slope that is expected: what quantisation does is hardly less steep
 _STALLED = (2.0, 0.25)  # dB of precision that have to gain as much of each, or no precision reaches the goal
 _GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
@@ -165,7 +166,7 @@ class Solver:
         level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
         above = trial.decided_psnr + self._gained(trial) - level
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
-        above = _quantised(trial, above)
+        above = min(_quantised(trial, above), max(above, _FORESEEN))
         return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
     def about(self, trial: Trial) -> float:
@@ -265,7 +266,7 @@ class Solver:
         slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
         meet(
             measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known,
-            flattest=_EVEN if fewer else FLATTEST,
+            flattest=_EVEN if fewer else FLATTEST, patience=1 if fewer and careful else 2,
         )  # fmt: skip
 
     def _nearest(self, part: Part, coding: Coding) -> Trial:
