@@ -30,6 +30,7 @@ _LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantis
 _WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
 _PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
 _PAYS_DEARLY = 0.03  # of the bytes: what other splats have to promise, whose files are adjusted before they are judged
+_COMMON = 0.1  # of the bytes: by so much all files may be dearer that are adjusted, if one was; more was its own fault
 _FAR = 0.03  # of the bytes
 _BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
 _PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
@@ -82,13 +83,15 @@ class Moves:
 
     def _on_goal(self, tried: Sequence[Trial]) -> list[Trial]:
         """Files on the goal, of what is expected to be best there; of more splats where all tried are too few."""
-        found, failed = list[Trial](), list[Trial]()
+        found, failed, dearer = list[Trial](), list[Trial](), 0.0
         for trial in sorted(tried, key=self.solver.cost):
             others = [one for one in tried if one.part.refits and one.splats > trial.splats]
             if any(one.part is trial.part for one in failed) and others:
                 continue  # what more splats make of it first
-            if self._pays(trial, found):
-                on = self.solver.on(trial.part, trial.coding)
+            if self._pays(trial, found, dearer):
+                expected, on = self.solver.cost(trial), self.solver.on(trial.part, trial.coding)
+                if on is not None and trial.part.refits:
+                    dearer = max(dearer, min(math.log(on.size_bytes) - expected, _COMMON))
                 (failed if on is None else found).append(on or trial)
         if failed and not any(one.part.refits for one in found):
             on = self._of_more(max(failed, key=lambda trial: trial.splats))
@@ -185,15 +188,15 @@ class Moves:
         near = None if math.isinf(self.solver.cost(whole)) else (whole.splats, whole.decided_psnr)
         return removal.first_at_size(goal.size_bytes or 0, near, slope, seen)
 
-    def _pays(self, trial: Trial, found: list[Trial]) -> bool:
-        """Whether a file near the goal may be better on it than those that are there."""
+    def _pays(self, trial: Trial, found: list[Trial], dearer: float) -> bool:
+        """Whether a file near the goal may be better on it than those there, of which one was so much dearer."""
         best = self.solver.goal.best(found)
         if best is None:
             return True
         again = any(one.part is trial.part for one in found)
         # What lies on a PSNR costs its bytes, whatever may be foreseen of fewer.
         known = math.log(best.size_bytes) if self.solver.goal.size_bytes is None else self.solver.cost(best)
-        saved = known - self.solver.cost(trial)
+        saved = known - self.solver.cost(trial) - dearer * trial.part.refits
         return saved > (_PAYS_DEARLY if trial.part.refits else _PAYS if again else -_PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:
