@@ -207,9 +207,9 @@ class Solver:
 
         Errors of removal more so than others: so it is not the same for all splats and for some.
         """
-        if not self.goal.is_judged:
-            return self.goal.psnr or 0.0
         goal = self.goal.psnr or 0.0
+        if not self.goal.is_judged:
+            return goal
         made = [trial for trial in self.trials.made if trial.part is part]
         judged = [trial for trial in made if trial.is_judged and (trial.is_careful or not part.refits)]
         if part.refits and not judged:

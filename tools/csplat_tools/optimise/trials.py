@@ -235,7 +235,7 @@ class Trials:
     photographs: Judge | None = None
     made: list[Trial] = field(default_factory=list)
     progress: Progress | None = None
-    _judged: list[tuple[Part, float]] = field(default_factory=list, init=False)
+    _judged: dict[Part, float] = field(default_factory=dict, init=False)
 
     @property
     def renders(self) -> int:
@@ -244,11 +244,9 @@ class Trials:
 
     def judged_psnr(self, part: Part) -> float:
         """Of what a part quantises by the views that judge, dB: how much of the error that they allow removal took."""
-        for other, psnr in self._judged:
-            if other is part:
-                return psnr
-        self._judged.append((part, self.judge.psnr(part.shown)))
-        return self._judged[-1][1]
+        if part not in self._judged:
+            self._judged[part] = self.judge.psnr(part.shown)
+        return self._judged[part]
 
     def make(
         self, part: Part, coding: Coding, quality: float | None, *, quick: bool, encoding: EncodeOptions | None = None
