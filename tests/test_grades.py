@@ -222,7 +222,7 @@ def test_integers_of_each_grade_are_counted_as_they_are_coded(model):
             np.ascontiguousarray(held.sh0[rows].T), plan.sh0_step, plan.chroma_shift, coarse.sh0
         ).columns
         for columns in (shape.scales, shape.quats // coarse.quats, alpha[None] // coarse.opacities, colour):
-            bits += cost_slopes(columns.T)[1]
+            bits += cost_slopes([columns.T])[1]
     assert scene.count(scene.seen()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 

@@ -111,11 +111,11 @@ def test_views_are_added_until_others_agree(source):
 
 def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     found = find_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
-    keys = removal_keys(source, found.removal)
+    keys = removal_keys(source.opacities, found.removal)
     assert (keys[:10] == -1.0).all()
     unseen = ~found.removal.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
-    assert (removal_keys(source, found.removal, keep_unseen=False)[unseen] < 0.0).all()
+    assert (removal_keys(source.opacities, found.removal, keep_unseen=False)[unseen] < 0.0).all()
     order = removal_order(source, [Side(found.used, found.removal)], SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
@@ -124,11 +124,11 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
 def test_rounds_ask_one_side_after_the_other(source):
     """What one side last said stays, until it is asked again."""
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
-    sides = [Side(cameras, measure_removal(source, cameras)) for cameras in parts]
+    sides = [Side(cameras, measure_removal(source, cameras, bands=False)) for cameras in parts]
     order = removal_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
     first = order.rounds[0].removed
     rows = order.kept(len(source), first)
-    keys = removal_keys(source, seen_by(sides))
+    keys = removal_keys(source.opacities, seen_by(sides))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
     again = measure_removal(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
@@ -260,7 +260,7 @@ def test_the_result_does_not_depend_on_threads(source):
 def test_bands_that_are_worth_less_than_their_bits_go():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
-    removal = Removal(zeros, zeros, zeros, zeros, np.array([1, 0, 2]), bands, 1)
+    removal = Removal(zeros, zeros, np.array([True, False, True]), bands, 1)
     stays = band_mask(removal, 1.0)
     np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
     free = free_coefficients(stays)

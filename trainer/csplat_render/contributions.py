@@ -50,13 +50,16 @@ class Contributions(Rasteriser):
         super().__init__("standard", dtype, gradients=True, threads=threads)
         self._limits[2] = transmittance_min
 
-    def draw(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> DrawnView:
+    def draw(
+        self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
+    ) -> DrawnView:
         """Project splats, sort them into the tiles of a picture, and forget what it does not show.
 
         Args:
             splats: the scene.
             camera: the view.
             antialiased: scale opacities by what the dilation added.
+            basis: whether spherical harmonics by splat are wanted for what is asked of the view.
 
         Raises:
             LimitError: there are too many pairs of splat and tile.
@@ -83,8 +86,8 @@ class Contributions(Rasteriser):
             starts, _ = self._sort_into_tiles(order, near, extent, box, tiles_x, tiles_x * tiles_y)
             # In the order of the scene, not of depth: what is read and written per splat then lies in a row.
             rows = np.flatnonzero(near > 0.0).astype(np.int32)
-            basis = np.empty((len(rows), (degree + 1) ** 2), np.float32)
-            basis_of_view(arrays.means, rows, view, degree, basis)
+            harmonics = np.empty((len(rows), (degree + 1) ** 2 if basis else 0), np.float32)
+            basis_of_view(arrays.means, rows, view, degree, harmonics)
         offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         drawn = np.take(shape, rows, axis=0)
@@ -94,7 +97,7 @@ class Contributions(Rasteriser):
             rows=rows,
             shape=drawn,
             box=np.take(box, rows, axis=0),
-            basis=basis,
+            basis=harmonics,
             starts=starts.copy(),
             ids=np.take(place, self._buffers["ids"]),
             slots=self._buffers["slots"].copy(),
@@ -106,7 +109,7 @@ class Contributions(Rasteriser):
     def removal(
         self,
         drawn: DrawnView,
-        coefficients: Array,
+        shN: Array,
         totals: Array,
         bands: Array,
         *,
@@ -117,10 +120,11 @@ class Contributions(Rasteriser):
 
         Args:
             drawn: the view, its shape holding the splats' colours.
-            coefficients: [N, B, 3] float32, spherical harmonics of all splats.
+            shN: [N, K, 3] float32, spherical harmonics of all splats beyond the first.
             totals: [N, 5] float64, added to: squared change of the picture if the splat were not there, product of
                 that change with (picture − reference), weight, squared weight, and 1 where the splat was seen.
-            bands: [N, d] float64, added to: squared change of the picture if its band 1, … d were zero.
+            bands: [N, d] float64, added to: squared change of the picture if its band 1, … d were zero; [N, 0] for
+                views without a basis.
             background: [3], behind everything.
             reference: [H, W, 3], the picture that is wanted; None for this one.
 
@@ -129,7 +133,7 @@ class Contributions(Rasteriser):
         """
         rgb, records = self._removal(drawn, background, reference)
         with thread_count(self.threads):
-            add_removal(drawn.rows, drawn.first, records, drawn.basis, coefficients, totals, bands)
+            add_removal(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
         return rgb
 
     def colours(

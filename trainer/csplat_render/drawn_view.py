@@ -24,7 +24,8 @@ class DrawnView:
         shape: [V, 10] float64, see `project`, but for the last column: the exponent of 2 below which nothing is drawn.
             Columns 6 to 8 are colours and may be replaced.
         box: [V, 4] int32, see `project`.
-        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)².
+        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)²; [V, 0] where
+            nothing asks for them.
         starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
         ids: [intersections] int32, places in `rows`, tile by tile, nearest first.
         slots: [intersections] int32, the record of each of `ids`.
@@ -102,17 +103,17 @@ def set_colours(
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
-            r, g, b = _shown(basis[j], coefficients[i], 0, basis.shape[1])
+            r, g, b = _shown(basis[j], coefficients[i])
             shape[j, 6] = offset + r if active[j, 0] else 0.0
             shape[j, 7] = offset + g if active[j, 1] else 0.0
             shape[j, 8] = offset + b if active[j, 2] else 0.0
 
 
 @inline
-def _shown(basis: Any, coefficients: Any, first: int, end: int) -> tuple[float, float, float]:
+def _shown(basis: Any, coefficients: Any) -> tuple[float, float, float]:
     """Red, green, blue of some coefficients, [B, 3], in the direction of a basis, [B]; float64."""
     r, g, b = 0.0, 0.0, 0.0
-    for k in range(first, end):
+    for k in range(basis.shape[0]):
         y = np.float64(basis[k])
         r += y * coefficients[k, 0]
         g += y * coefficients[k, 1]
@@ -122,7 +123,7 @@ def _shown(basis: Any, coefficients: Any, first: int, end: int) -> tuple[float, 
 
 @parallel_kernel()
 def add_removal(
-    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, coefficients: Any, totals: Any, bands: Any
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, shN: Any, totals: Any, bands: Any
 ) -> None:
     """Add the records of one view up, splat by splat, see `Contributions.removal`; parallel over blocks of splats."""
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
@@ -142,7 +143,8 @@ def add_removal(
             totals[i, 3] += squares
             totals[i, 4] += 1.0
             for band in range(1, bands.shape[1] + 1):
-                r, g, b = _shown(basis[j], coefficients[i], band * band, (band + 1) * (band + 1))
+                begin, end = band * band, (band + 1) * (band + 1)
+                r, g, b = _shown(basis[j, begin:end], shN[i, begin - 1 : end - 1])
                 bands[i, band - 1] += squares * (r * r + g * g + b * b)
 
 

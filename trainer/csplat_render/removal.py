@@ -33,45 +33,37 @@ class Removal:
 
     Attributes:
         error: [N] float64, squared change of the pictures if the splat were not there.
-        product: [N] float64, that change times what the pictures have too much of the wanted ones: removal adds
-            `error + 2 · product` to the squared error of the pictures. 0 where the pictures themselves are wanted.
-        weight: [N] float64, the share of pixels that is the splat's, summed.
-        squared_weight: [N] float64, the same of its square.
-        views: [N] int64, how many views saw the splat.
-        bands: [N, d] float64, squared change of the pictures if the splat's SH band 1, … d were zero.
+        squared_weight: [N] float64, the square of the share of a pixel that is the splat's.
+        seen: [N] bool, which splats any view saw.
+        bands: [N, d] float64, squared change of the pictures if the splat's SH band 1, … d were zero; [N, 0] where
+            that was not asked.
         value_count: pixels times channels of all views.
+        product: [N] float64, the change times what the pictures have too much of the wanted ones: removal adds
+            `error + 2 · product` to the squared error of the pictures. `None` where the pictures themselves are wanted.
     """
 
     error: Array
-    product: Array
-    weight: Array
     squared_weight: Array
-    views: Array
+    seen: Array
     bands: Array
     value_count: int
-
-    @property
-    def seen(self) -> Array:
-        """[N] bool, which splats any view saw."""
-        seen: Array = self.views > 0
-        return seen
+    product: Array | None = None
 
     def of_rows(self, rows: Array) -> Removal:
         """The same of some of the splats."""
         return replace(
-            self, error=self.error[rows], product=self.product[rows], weight=self.weight[rows],
-            squared_weight=self.squared_weight[rows], views=self.views[rows], bands=self.bands[rows],
+            self, error=self.error[rows], squared_weight=self.squared_weight[rows], seen=self.seen[rows],
+            bands=self.bands[rows], product=None if self.product is None else self.product[rows],
         )  # fmt: skip
 
     def __add__(self, other: Removal) -> Removal:
         return Removal(
             self.error + other.error,
-            self.product + other.product,
-            self.weight + other.weight,
             self.squared_weight + other.squared_weight,
-            self.views + other.views,
+            self.seen | other.seen,
             self.bands + other.bands,
             self.value_count + other.value_count,
+            None if self.product is None or other.product is None else self.product + other.product,
         )
 
 
@@ -80,6 +72,7 @@ def measure_removal(
     cameras: Sequence[Camera],
     *,
     background: ArrayLike = (0.0, 0.0, 0.0),
+    bands: bool = True,
     references: Sequence[Array] | None = None,
     on_picture: Callable[[int, Array], object] | None = None,
     dtype: Any = np.float32,
@@ -93,6 +86,7 @@ def measure_removal(
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue behind everything.
+        bands: whether what SH bands are worth is wanted, too.
         references: the wanted pictures, [H, W, 3] each; None for those of the scene itself.
         on_picture: is shown each picture, [H, W, 3], and its number.
         dtype: of pixels, float32 or float64 (which is for tests).
@@ -109,20 +103,19 @@ def measure_removal(
     if references is not None and len(references) != len(cameras):
         raise InputError(f"{len(references)} reference pictures for {len(cameras)} cameras")
     drawing = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
-    coefficients = np.concatenate([model.sh0[:, None], model.shN], axis=1)
-    totals, bands = np.zeros((len(model), 5)), np.zeros((len(model), model.sh_degree))
+    totals, by_band = np.zeros((len(model), 5)), np.zeros((len(model), model.sh_degree if bands else 0))
     behind = np.asarray(background, np.float64)
     for number, camera in enumerate(cameras):
-        drawn = drawing.draw(model, camera, antialiased=model.antialiased)
+        drawn = drawing.draw(model, camera, antialiased=model.antialiased, basis=bands)
         reference = None if references is None else references[number]
-        picture = drawing.removal(drawn, coefficients, totals, bands, background=behind, reference=reference)
+        picture = drawing.removal(drawn, model.shN, totals, by_band, background=behind, reference=reference)
         if on_picture is not None:
             on_picture(number, picture)
         if progress is not None:
             progress("measuring splats", (number + 1) / len(cameras))
-    error, product, weight, squares, views = totals.T.copy()
+    error, product, squares = (totals[:, k].copy() for k in (0, 1, 3))
     count = sum(3 * camera.W * camera.H for camera in cameras)
-    return Removal(error, product, weight, squares, views.astype(np.int64), bands, count)
+    return Removal(error, squares, totals[:, 4] > 0.0, by_band, count, None if references is None else product)
 
 
 def removal_exact(

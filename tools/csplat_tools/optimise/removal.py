@@ -213,7 +213,7 @@ class Removal:
 
     def _errors(self) -> F64:
         session = self.session
-        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.removal.value_count
+        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.value_count
         return sums[: len(self.source)]  # one stays
 
 

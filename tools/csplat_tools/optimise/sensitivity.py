@@ -109,7 +109,7 @@ def measure_scene(
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
-        elsewhere = measure_removal(model, check, background=views.background, threads=threads).seen
+        elsewhere = measure_removal(model, check, background=views.background, bands=False, threads=threads).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
     return MeasuredSensitivity(model, measured, source, missed)
 
@@ -218,4 +218,6 @@ def measured_for(
         found = replace(importance, curvatures=found.curvatures)
     elif importance is not None:
         found = replace(found, sh=np.asarray(importance))
+    if not encoding.shape_codebook_size:
+        found = replace(found, shape_metric=None)  # half of what it takes in memory
     return found, len(seen_from)

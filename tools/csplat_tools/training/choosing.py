@@ -98,7 +98,9 @@ def choose_splats(
     if found is not None and not (prune and len(measuring) < len(looking)):
         seen = found.seen
     else:
-        seen = measure_removal(source, looking, background=views.background, threads=threads, progress=progress).seen
+        seen = measure_removal(
+            source, looking, background=views.background, bands=False, threads=threads, progress=progress
+        ).seen
     if not seen.any():
         raise InputError("no view shows any splat: scene and cameras do not belong together")
     rows = np.flatnonzero(seen) if prune else np.arange(len(source))

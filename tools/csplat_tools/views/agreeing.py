@@ -75,7 +75,9 @@ def find_views(
     """
 
     def measured(cameras: Sequence[Camera]) -> Removal:
-        return measure_removal(model, cameras, background=views.background, threads=threads, progress=progress)
+        return measure_removal(
+            model, cameras, background=views.background, bands=False, threads=threads, progress=progress
+        )
 
     if not views.teaches or not views.decides:
         found = len(views.teaches) + len(views.decides)
@@ -106,12 +108,12 @@ def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     return [one for i, one in enumerate(cameras) if i not in aside], [cameras[i] for i in sorted(aside)]
 
 
-def removal_keys(model: SplatModel, removal: Removal, *, keep_unseen: bool = True) -> F64:
+def removal_keys(opacities: NDArray[np.float32], removal: Removal, *, keep_unseen: bool = True) -> F64:
     """By what splats go, the smallest first.
 
     Args:
-        model: the scene.
-        removal: of the scene.
+        opacities: [N], of a scene.
+        removal: of the same.
         keep_unseen: what no view saw goes last, instead of first.
 
     Returns:
@@ -119,14 +121,15 @@ def removal_keys(model: SplatModel, removal: Removal, *, keep_unseen: bool = Tru
         removal; infinity for what no view saw.
     """
     keys = np.where(removal.seen, removal.error, np.inf if keep_unseen else -0.5)
-    keys[model.opacities < ALPHA_MIN] = -1.0
+    keys[opacities < ALPHA_MIN] = -1.0
     return keys
 
 
 def _gap(model: SplatModel, used: Removal, check: Removal, gone: float) -> float:
     """How much larger, in dB, the predicted error is where it was not looked at."""
-    order = np.argsort(removal_keys(model, used), kind="stable")[: int(gone * len(model))]
-    order = order[np.isfinite(removal_keys(model, used)[order])]
+    keys = removal_keys(model.opacities, used)
+    order = np.argsort(keys, kind="stable")[: int(gone * len(model))]
+    order = order[np.isfinite(keys[order])]
     there = float(np.sum(used.error[order])) / used.value_count
     elsewhere = float(np.sum(check.error[order])) / check.value_count
     return 10.0 * math.log10(elsewhere / there) if there > 0.0 and elsewhere > 0.0 else 0.0

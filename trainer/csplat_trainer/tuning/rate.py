@@ -7,6 +7,7 @@ back where it shows. Shares are counted anew from time to time.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -24,6 +25,7 @@ F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 
 _REACH = 128  # integers beyond ± this cost as much as the last ones
+_ROWS = 1 << 15  # rows of SH that are counted at a time: their integers take several times the memory of the values
 _STEEPEST = 4.0  # bits per step; rare integers are counted too badly for more
 _ROOT2 = np.sqrt(2.0)
 
@@ -76,15 +78,17 @@ class Costs:
                 "sh0": colour_integers_of(stored.sh0[rows, None], grade.sh0_step, plan.chroma_shift).reshape(-1, 3),
             }
             for name, values in columns.items():
-                costs._count(_of_grade(name, number), values)
-        costs._count("sizes", _integers(stored.sizes[:, None], plan.scale_step))
-        if stored.sh.shape[1]:
-            coloured = colour_integers_of(stored.sh, plan.sh_step, plan.chroma_shift)
-            costs._count("shN", coloured.reshape(len(stored.sh), -1))
+                costs._count(_of_grade(name, number), [values])
+        costs._count("sizes", [_integers(stored.sizes[:, None], plan.scale_step)])
+        width = 3 * stored.sh.shape[1]
+        if width:
+            parts = (stored.sh[at : at + _ROWS] for at in range(0, max(1, len(stored.sh)), _ROWS))
+            coloured = (colour_integers_of(part, plan.sh_step, plan.chroma_shift) for part in parts)
+            costs._count("shN", (part.reshape(-1, width) for part in coloured))
         return costs
 
-    def _count(self, name: str, values: NDArray[Any]) -> None:
-        self.tables[name], bits = cost_slopes(values)
+    def _count(self, name: str, parts: Iterable[NDArray[Any]]) -> None:
+        self.tables[name], bits = cost_slopes(parts)
         self.bits += bits
 
     @property
@@ -156,19 +160,23 @@ def _of_grade(name: str, number: int) -> str:
     return f"{name} {number}" if number else name
 
 
-def cost_slopes(columns: NDArray[Any]) -> tuple[F32, float]:
+def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
     """Slope of the cost of integers in bits per step, and the cost of all of them.
 
     Args:
-        columns: [n, C] integers.
+        parts: [n, C] integers each, one part at least: rows of the same C columns.
 
     Returns:
         [C, 257] float32, for the integers −128 to 128, and bits.
     """
-    count, width = columns.shape
-    places = np.clip(columns, -_REACH, _REACH) + _REACH
     size = 2 * _REACH + 1
-    counts = np.bincount((places + np.arange(width) * size).reshape(-1), minlength=width * size).reshape(width, size)
+    counts: NDArray[Any] = np.zeros((0, size), np.int64)
+    for columns in parts:
+        width = columns.shape[1]
+        places = np.clip(columns, -_REACH, _REACH) + (_REACH + size * np.arange(width))
+        found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
+        counts = counts + found if len(counts) else found
+    count = int(counts.sum(axis=1).max(initial=0))
     # One more of each and a narrow blur: an integer that happens not to occur is no more than rare.
     padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")
     blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]

@@ -42,7 +42,7 @@ class TunedScene:
         values, book, shapes = self.parameters.values, frozen.book, frozen.shapes
         self._users = None if book is None else _users(book.index, book.size)
         self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
-        self._rows_gradient = np.zeros_like(values["shN"])
+        self._rows_gradient = np.zeros_like(values["shN"] if book else values["shN"][:0])
         self._shape_users = None if shapes is None else _users(shapes.index, shapes.size)
         self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
 

@@ -221,6 +221,7 @@ class _Quantised:
     _costs: Costs | None = None
 
     def seen(self) -> Splats:
+        self._seen = None  # as large as the scene
         self._seen, self._alphas = self.tuned.seen()
         s = self._seen
         return Splats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)

@@ -114,11 +114,11 @@ def removal_order(
         if gone:
             turn = (len(rounds) - 1) % len(sides)
             removal = measure_removal(
-                model.select(rows), sides[turn].cameras, background=options.background, threads=options.threads,
-                progress=progress,
+                model.select(rows), sides[turn].cameras, background=options.background, bands=False,
+                threads=options.threads, progress=progress,
             )  # fmt: skip
             sides[turn] = replace(sides[turn], removal=removal)
-        keys = removal_keys(model.select(rows), seen_by(sides), keep_unseen=options.keep_unseen)
+        keys = removal_keys(model.opacities[rows], seen_by(sides), keep_unseen=options.keep_unseen)
         order = np.argsort(keys, kind="stable")[: len(rows) - target]
         order = order[np.isfinite(keys[order])]
         if not len(order):

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.removal import Removal, measure_removal
+from csplat_render.removal import measure_removal
 from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
@@ -85,10 +84,10 @@ class Session:
     checked: Judge
     seconds: dict[str, float]
 
-    @cached_property
-    def removal(self) -> Removal:
-        """What removal of each splat of the source does to what is taught."""
-        return seen_by(self.sides)
+    @property
+    def value_count(self) -> int:
+        """Pixels times channels of what is taught."""
+        return sum(side.removal.value_count for side in self.sides)
 
     def pruned(self, gone: int) -> I64:
         """Source splats that are left when the first `gone` of the order are removed."""
@@ -136,7 +135,7 @@ def prepare(
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)
         removal = measure_removal(
-            source, cameras, background=around.background, threads=options.threads, progress=progress
+            source, cameras, background=around.background, bands=False, threads=options.threads, progress=progress
         )
         sides.append(Side(cameras, removal))
     taught = [camera for side in sides for camera in side.cameras]
@@ -144,7 +143,7 @@ def prepare(
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    values = seen_by(sides).value_count
+    values = sum(side.removal.value_count for side in sides)
     order = removal_order(source, sides, options, left, progress, enough=allowed * values)
     seconds["rounds"] = time.perf_counter() - start
     return Session(source, options, around, found, taught, sides, wanted, order, checked, seconds)
@@ -305,9 +304,9 @@ def _report(session: Session, result: Simplified, target: Target) -> dict[str, A
     stays = np.zeros(len(source), bool)
     stays[result.source_index] = True
     invisible = source.opacities < ALPHA_MIN
-    unseen = ~session.removal.seen & ~invisible
+    unseen = ~seen_by(session.sides).seen & ~invisible
     removed_error = float(session.order.errors[: result.report["gone"]].sum())
-    predicted = removed_error / session.removal.value_count
+    predicted = removed_error / session.value_count
     bands = {}
     if result.stays is not None:
         bands = {str(band + 1): int(np.count_nonzero(~result.stays[:, band])) for band in range(result.stays.shape[1])}
