@@ -50,9 +50,7 @@ class Contributions(Rasteriser):
         super().__init__("standard", dtype, gradients=True, threads=threads)
         self._limits[2] = transmittance_min
 
-    def draw(
-        self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
-    ) -> DrawnView:
+    def draw(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True) -> DrawnView:
         """Project splats, sort them into the tiles of a picture, and forget what it does not show.
 
         Args:

@@ -47,7 +47,7 @@ class Sensitivity:
         opacity: [N] float64, S of alpha, magnitudes added pixel by pixel and channel by channel.
         shape: [N] float64, S of the covariance divided by its trace, the largest of 6 entries, added likewise.
         opacity_net: [N] float64, S of alpha as published: pixels of a view cancel.
-        shape_net: [N] float64, the same of the covariance.
+        shape_net: [N] float64, the same of the covariance. All five are `None` if they were not asked for.
         colour_squares: [N] float64, squared derivatives of a pixel's channel towards the splat's colour in that
             channel, summed over pixels and views, per pixel.
         opacity_squares: [N] float64, the same of all three channels towards alpha.
@@ -64,11 +64,11 @@ class Sensitivity:
         pixel_count: of all views together.
     """
 
-    colour: F64
-    opacity: F64
-    shape: F64
-    opacity_net: F64
-    shape_net: F64
+    colour: F64 | None
+    opacity: F64 | None
+    shape: F64 | None
+    opacity_net: F64 | None
+    shape_net: F64 | None
     colour_squares: F64
     opacity_squares: F64
     shape_squares: F64
@@ -97,6 +97,7 @@ def measure_sensitivity(
     *,
     background: ArrayLike = (0.0, 0.0, 0.0),
     metric: bool = False,
+    magnitudes: bool = True,
     dtype: Any = np.float32,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -108,6 +109,7 @@ def measure_sensitivity(
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue behind everything.
         metric: the matrices of SH coefficients too: 2 B (B + 1) bytes per splat.
+        magnitudes: sensitivities themselves; else only sums of squares, for a third of the memory per splat.
         dtype: of pixels, float32 or float64 (which is for tests).
         threads: how many; None for all. The result does not depend on it.
         progress: is told how much is done.
@@ -118,7 +120,7 @@ def measure_sensitivity(
     """
     if not cameras:
         raise InputError("measuring sensitivity wants a camera at least")
-    drawing = _Derivatives(model, metric=metric, dtype=dtype, threads=threads)
+    drawing = _Derivatives(model, metric=metric, magnitudes=magnitudes, dtype=dtype, threads=threads)
     for number, camera in enumerate(cameras):
         drawing.add(camera, background)
         if progress is not None:
@@ -129,16 +131,17 @@ def measure_sensitivity(
 class _Derivatives(Rasteriser):
     """Renders views and adds up what each of them says. Owns the sums."""
 
-    def __init__(self, model: SplatModel, *, metric: bool, dtype: Any, threads: int | None) -> None:
+    def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, threads: int | None) -> None:
         super().__init__("standard", dtype, gradients=True, threads=threads)
         n, count = len(model), 1 + model.shN.shape[1]
         self._model = model
-        self._colour = np.zeros((n, count, 3), np.float32)
-        self._net, self._sizes = np.zeros((n, 7)), np.zeros((n, 7))
+        rows = n if magnitudes else 0
+        self._colour = np.zeros((rows, count, 3), np.float32)
+        self._net, self._sizes = np.zeros((rows, 7)), np.zeros((rows, 7))
         self._squares, self._bends = np.zeros((n, 3)), np.zeros((n, 21))
         self._metric = np.zeros((n if metric else 0, count * (count + 1) // 2), np.float32)
         self._views = np.zeros(n, np.int64)
-        self._wanted = metric
+        self._wanted, self._magnitudes = metric, magnitudes
         self._view_count = self._pixel_count = 0
 
     def add(self, camera: Camera, background: ArrayLike) -> None:
@@ -174,12 +177,13 @@ class _Derivatives(Rasteriser):
         bends, squares, net, sizes = (
             _over(sums, pixels) for sums in (self._bends, self._squares, self._net, self._sizes)
         )
+        kept = self._magnitudes
         return Sensitivity(
-            colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels,
-            opacity=sizes[:, 0],
-            shape=sizes[:, 1:].max(axis=1),
-            opacity_net=net[:, 0],
-            shape_net=net[:, 1:].max(axis=1),
+            colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels if kept else None,
+            opacity=sizes[:, 0] if kept else None,
+            shape=sizes[:, 1:].max(axis=1) if kept else None,
+            opacity_net=net[:, 0] if kept else None,
+            shape_net=net[:, 1:].max(axis=1) if kept else None,
             colour_squares=squares[:, 0],
             opacity_squares=squares[:, 1],
             shape_squares=bends[:, _DIAGONAL].sum(axis=1),

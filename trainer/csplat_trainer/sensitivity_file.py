@@ -42,7 +42,7 @@ class StoredSensitivity:
     """What a file holds.
 
     Attributes:
-        groups: [N] float32 by name, see `GROUPS`.
+        groups: [N] float32 by name, see `GROUPS`; of a file all of them.
         views: [N] int32, how many views saw each splat.
         source: where the views came from, one of `SOURCES`.
         view_count: how many there were.
@@ -74,7 +74,7 @@ class StoredSensitivity:
             missed_share: as the attribute.
         """
         return cls(
-            {name: getattr(found, name).astype(np.float32) for name in GROUPS},
+            {name: group.astype(np.float32) for name in GROUPS if (group := getattr(found, name)) is not None},
             found.views.astype(np.int32),
             source,
             found.view_count,

@@ -220,7 +220,8 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
         near: [N] float32, above 0 for what is drawn.
         offsets: [N + 1] int64, where the records of each splat begin.
         records: [intersections, SUMS].
-        colour: [N, B, 3] float32, added to: |derivative of the picture's sum towards a coefficient|.
+        colour: [N, B, 3] float32, added to: |derivative of the picture's sum towards a coefficient|; [0, …] if neither
+            this nor the next two are wanted.
         net: [N, 7] float64, added to: the same towards alpha and the six entries of the covariance over its trace.
         sizes: [N, 7] float64, added to: the same with magnitudes taken pixel by pixel and channel by channel.
         squares: [N, 3] float64, added to: squared derivatives of the pixels' channels towards a colour (one channel of
@@ -234,6 +235,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
     n = means.shape[0]
     count = (degree + 1) * (degree + 1)
     basis, sums = np.empty(16, np.float64), np.empty(SUMS, np.float64)
+    with_magnitudes = colour.shape[0] > 0
     for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             if not (near[i] > 0.0 and offsets[i + 1] > offsets[i]):
@@ -247,7 +249,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
             views[i] += 1
             x, y, z, _ = direction(view, means[i])
             sh_basis(degree, x, y, z, basis)
-            for c in range(3):
+            for c in range(3 if with_magnitudes else 0):
                 if shape[i, 6 + c] > 0.0:
                     for k in range(count):
                         colour[i, k, c] += abs(basis[k]) * sums[0]
@@ -258,9 +260,10 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
                         metric[i, place] += basis[k] * basis[m] * sums[1]
                         place += 1
             alpha = np.float64(opacities[i])
-            net[i, 0] += abs(sums[2]) / alpha
-            sizes[i, 0] += sums[3] / alpha
-            for e in range(6):
+            if with_magnitudes:
+                net[i, 0] += abs(sums[2]) / alpha
+                sizes[i, 0] += sums[3] / alpha
+            for e in range(6 if with_magnitudes else 0):
                 twice = 1.0 if e < 3 else 2.0  # an entry beside the diagonal stands twice in the covariance
                 net[i, 1 + e] += twice * abs(sums[5 + e])
                 sizes[i, 1 + e] += twice * sums[11 + e]

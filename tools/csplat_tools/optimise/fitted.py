@@ -199,7 +199,7 @@ class FittedSplats:
         """How much they depend on all else, too."""
         session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
-            self.model, evenly(session.views.used, count), background=session.options.background,
+            self.model, evenly(session.views.used, count), background=session.options.background, magnitudes=False,
             threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
         return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)

@@ -120,6 +120,7 @@ def measure_views(
     background: Colour,
     *,
     matrices: bool,
+    magnitudes: bool = True,
     threads: int | None,
     progress: Progress | None = None,
 ) -> Sensitivity:
@@ -129,6 +130,7 @@ def measure_views(
         model: the scene. cameras: relative to its origin.
         background: behind everything.
         matrices: whether those of SH coefficients are measured too.
+        magnitudes: whether sensitivities are wanted beside the squares that weights are made of.
         threads: how many; `None` for all.
         progress: is told the stages.
 
@@ -139,11 +141,12 @@ def measure_views(
         raise InputError(_NOTHING)
     if progress is not None:
         progress("compiling", 0.0)  # the first time takes some seconds
-        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices)
+        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
         progress("compiling", 1.0)
     found = measure_sensitivity(
-        model, cameras, background=background, metric=matrices, threads=threads, progress=progress
-    )
+        model, cameras, background=background, metric=matrices, magnitudes=magnitudes, threads=threads,
+        progress=progress,
+    )  # fmt: skip
     if not found.seen.any():
         raise InputError("no view shows any splat: scene and cameras do not belong together")
     return found
@@ -165,7 +168,9 @@ def measured_importance(
     Raises:
         InputError: as `measure_views`.
     """
-    found = measure_views(model, cameras, background, matrices=False, threads=threads, progress=progress)
+    found = measure_views(
+        model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
+    )
     weights = StoredSensitivity.of(model, found).importance()
     return replace(weights, sh=trusted(weights.sh, model))
 

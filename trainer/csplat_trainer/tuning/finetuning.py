@@ -160,7 +160,13 @@ def _measured(
     """How much the views that teach depend on each splat."""
     cameras = [one.camera for one in views.train]
     found = measure_sensitivity(
-        model, cameras, background=views.background, metric=True, threads=encoding.threads, progress=progress
+        model,
+        cameras,
+        background=views.background,
+        metric=True,
+        magnitudes=False,
+        threads=encoding.threads,
+        progress=progress,
     )
     return StoredSensitivity.of(model, found).importance()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -129,7 +129,6 @@ def prepare(
     options = replace(options, background=around.background, view_size=size)
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
     found = find_views(source, around, gone, size=size, threads=options.threads, progress=progress)
-    draw = renderer(source, around.background, threads=options.threads)
     sides = [Side(found.used, found.removal)]
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
@@ -139,7 +138,7 @@ def prepare(
         )
         sides.append(Side(cameras, removal))
     taught = [camera for side in sides for camera in side.cameras]
-    wanted = [draw(camera).rgb for camera in taught]
+    wanted = _pictures(source, taught, options)
     checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
@@ -147,6 +146,12 @@ def prepare(
     order = removal_order(source, sides, options, left, progress, enough=allowed * values)
     seconds["rounds"] = time.perf_counter() - start
     return Session(source, options, around, found, taught, sides, wanted, order, checked, seconds)
+
+
+def _pictures(source: SplatModel, cameras: Sequence[Camera], options: SimplifyOptions) -> list[F32]:
+    """What the source looks like; the renderer's memory ends with it."""
+    draw = renderer(source, options.background, threads=options.threads)
+    return [draw(camera).rgb for camera in cameras]
 
 
 def simplify(
