@@ -104,6 +104,7 @@ class FittedSplats:
             if error_of_psnr(self.seen(banded)) <= most:
                 break
             error /= _FEWER_BANDS
+            del banded  # as large as the scene
             banded, stays = self._left_out(error)
         return banded, stays
 
@@ -154,13 +155,14 @@ class FittedSplats:
 
     @cached_property
     def _fitted(self) -> SplatModel:
-        session, before = self.session, self.before
-        start, self.before = session.source.select(self.rows), None
+        session, steps = self.session, FIT_STEPS
+        start = session.source.select(self.rows)
         if not (session.options.refit and self.gone):
             return start
-        if before is None:
-            return self._adjusted(start, FIT_STEPS)
-        return self._adjusted(_carried(before.model, before.rows, start, self.rows), _CARRIED_STEPS)
+        if self.before is not None:
+            start, steps = _carried(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
+        self.before = None  # as large as the scene, and nobody else may need it
+        return self._adjusted(start, steps)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
         """The splats without the bands that are not worth their bits where files err by so much; those that stay."""

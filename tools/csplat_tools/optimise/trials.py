@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,7 +236,7 @@ class Trials:
     photographs: Judge | None = None
     made: list[Trial] = field(default_factory=list)
     progress: Progress | None = None
-    _judged: dict[Part, float] = field(default_factory=dict, init=False)
+    _judged: WeakKeyDictionary[Part, float] = field(default_factory=WeakKeyDictionary, init=False)
 
     @property
     def renders(self) -> int:
