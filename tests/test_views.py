@@ -105,6 +105,22 @@ def test_as_many_decide_as_are_asked_for(sets, scene):
         find_view_set(scene, data=data, aside=14)
 
 
+def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
+    shutil.copytree(sets["rgb"], tmp_path, dirs_exist_ok=True)
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    for part, rows in (("train", slice(8)), ("val", slice(8, 12)), ("test", slice(12, 16))):
+        frames = document["frames"][rows]
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
+    data = DataOptions(str(tmp_path))
+    for aside in (None, 0):
+        views = find_view_set(scene, data=data, aside=aside)
+        roles = [list(range(8)), [8, 9, 10, 11], [12, 13, 14, 15]]
+        assert roles == [numbers(role) for role in (views.teaches, views.decides, views.judges)]
+    assert 4 == len(views.photograph_decider().looks)
+    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, aside=2))))
+    assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
+
+
 def test_the_training_judges_alone(sets, scene):
     views = find_view_set(scene, data=DataOptions(str(sets["rgb"])), split="train")
     assert (0, 0, 14) == tuple(map(len, poses(views)))

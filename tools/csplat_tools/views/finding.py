@@ -5,7 +5,7 @@
 | virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
-| data set | training photographs | every 8th of those | held-out photographs |
+| data set | training photographs | its validation photographs, 16 at most, or every 8th of the others | held-out ones |
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ _JUDGING = (8, 640, 480)  # the views of `psnr`
 _ENOUGH = 40  # cameras of a file that they may teach and judge
 _JUDGE_EVERY, _MOST_JUDGES = 4, 24
 _DECIDE_EVERY = 8
+_MOST_DECIDING = 16  # of the photographs that a data set names for that
 _DECIDING, _DECIDING_SEED = (12, 320, 240), 1000
 _TEST_EVERY = 8
 
@@ -85,7 +86,7 @@ def find_view_set(
         count: virtual views that teach; 16 more do, too, which a removal keeps apart to check what the others taught.
             0: no virtual ones teach or decide.
         size, seed: of virtual views. `None`, and for the count: as is usual for so many splats (`usual_views`).
-        aside: how many views decide; `None`: as many as the table says.
+        aside: how many views decide; `None`: as many as the table says. 0: none that might teach.
         split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
         every: how many splats of the scene each of the source's stands for, where it is a part of them: for views that
             judge.
@@ -156,17 +157,19 @@ def _of_data(
     wanted, notes = _settled(data, said)
     every = _TEST_EVERY if wanted.test_every is None else wanted.test_every
     found = load(wanted.path, wanted.size, images=wanted.images, test_every=every, near=wanted.near)
-    train, test = (_moved(part, source) for part in (found.train, found.test))
+    train, test, val = (_moved(part, source) for part in (found.train, found.test, evenly(found.val, _MOST_DECIDING)))
     colour, more = _colour(background, said, photographs=True)
     if split == "train":
-        train, test = [], train
+        train, test, val = [], train, []
     judging = {pose(one.camera) for one in test}
     apart = _without(judging, [one.camera for one in train])
     if len(apart) < len(train):
         more.append(f"{len(train) - len(apart)} training photographs stand where others judge, and are left out")
-    decides, teaches = _apart(apart, aside)
+    decides, teaches = _without(judging | {pose(camera) for camera in apart}, [one.camera for one in val]), apart
+    if aside or not decides:
+        decides, teaches = _apart(apart, aside)
     return ViewSet(
-        _named_file(data.path), colour, teaches, decides, [one.camera for one in test], [*train, *test],
+        _named_file(data.path), colour, teaches, decides, [one.camera for one in test], [*train, *val, *test],
         origin=source.origin, notes=(*found.report, *notes, *more), split=split,
     )  # fmt: skip
 

@@ -41,6 +41,7 @@ class DataSet:
         test_every: every so-manieth picture was held out; `None` where the set names its test pictures.
         size: what the pictures are scaled to, width and height; `None`: they are not.
         images: the folder of pictures that was asked for; `None`: the reader chose.
+        val: pictures that the set names to decide by: they neither teach nor judge.
     """
 
     name: str
@@ -54,6 +55,7 @@ class DataSet:
     test_every: int | None = None
     size: tuple[int, int] | None = None
     images: str | None = None
+    val: list[Picture] = field(default_factory=list)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -69,7 +71,7 @@ class DataSet:
         return TrainedOn(background, self.test_every, self.size, self.train[0].camera.near, self.images)
 
     def read(self) -> None:
-        """Read all pictures now, so that a damaged one is found before anything is done with the others.
+        """Read all pictures that teach or judge now: a damaged one is found before anything is done with the others.
 
         Raises:
             InputError: a file is no image, or is cut short.
@@ -143,6 +145,7 @@ class Found:
         report: lines for the user.
         test_every: as in `DataSet`.
         coordinate_system: as in `DataSet`.
+        val: shots to decide by.
     """
 
     kind: str
@@ -153,6 +156,7 @@ class Found:
     report: list[str] = field(default_factory=list)
     test_every: int | None = None
     coordinate_system: str = UNSPECIFIED
+    val: list[Shot] = field(default_factory=list)
 
 
 def split_every(shots: Sequence[Shot], every: int) -> tuple[list[Shot], list[Shot]]:

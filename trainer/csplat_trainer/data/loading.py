@@ -61,12 +61,15 @@ def load(
         raise InputError(f"{path} leaves no pictures to train on")
     shots = [*found.train, *found.test]
     near = near_plane(shots) if near is None else near
-    train, test = ([picture_of(shot, size, near) for shot in part] for part in (found.train, found.test))
+    train, test, val = (
+        [picture_of(shot, size, near) for shot in part] for part in (found.train, found.test, found.val)
+    )
     name = f"{found.kind} {path}"
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
     points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
     counts = f"{len(found.train)} training and {counted(len(found.test), 'test picture')}"
+    counts += f", {len(found.val)} to decide by" if found.val else ""
     report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
@@ -87,6 +90,7 @@ def load(
         found.test_every,
         size,
         images,
+        val,
     )
 
 

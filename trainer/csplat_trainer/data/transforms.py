@@ -32,7 +32,7 @@ def read_blender(folder: Path) -> Found:
     """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` beside it.
 
     Args:
-        folder: where they lie. `transforms_val.json` is left alone, as is the custom.
+        folder: where they lie. Nobody learns from the pictures of `transforms_val.json`, or is judged by them.
 
     Raises:
         InputError: a file is not what it is called, or no picture is there.
@@ -45,7 +45,9 @@ def read_blender(folder: Path) -> Found:
     else:
         test = []
         report.append("there is no transforms_test.json: no test pictures")
-    return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES)
+    val_path = folder / "transforms_val.json"
+    val = _shots(val_path, report) if val_path.is_file() else []
+    return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES, val=val)
 
 
 def read_transforms(path: Path, test_every: int) -> Found:
