@@ -72,7 +72,7 @@ def sum_removal(
         tiles_x: tiles side by side.
         limits: [3].
         background: [3].
-        error: [H, W, 3], the picture less the one that is wanted.
+        error: [H, W, 3], the picture less the one that is wanted; [0, 0, 3] where it is the one.
         transmittance: [H, W], as `blend_counted` wrote it, as the next.
         last: [H, W].
         records: [intersections, SUMS], written: sums of |d|², d · error, w and w², d being the change of the pixel if
@@ -87,12 +87,14 @@ def sum_removal(
     batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
     alpha_min, alpha_cap = limits[0], limits[1]
     zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    is_wrong = error.shape[0] > 0
     for tile in range(lane, len(starts) - 1, lanes):
         X0, Y0, columns, high = place(tile, tiles_x, width, height)
         planes[:_LAST] = zero
         planes[_LAST:_ERR_R] = -one  # pixels beyond the picture got nowhere
         planes[_ERR_R:_X] = zero
-        read_planes(error, X0, Y0, columns, high, planes, _ERR_R)
+        if is_wrong:
+            read_planes(error, X0, Y0, columns, high, planes, _ERR_R)
         start, end = starts[tile], starts[tile]
         for y in range(high):
             row = planes[y * TILE :]
@@ -136,14 +138,16 @@ def sum_removal(
                         row[_BLUE + x] -= alpha * db
                         row[_WEIGHT + x] = weight
                         row[_CHANGE + x] = weight * weight * (dr * dr + dg * dg + db * db)
-                        row[_PRODUCT + x] = weight * (
-                            dr * row[_ERR_R + x] + dg * row[_ERR_G + x] + db * row[_ERR_B + x]
-                        )
+                        if is_wrong:
+                            row[_PRODUCT + x] = weight * (
+                                dr * row[_ERR_R + x] + dg * row[_ERR_G + x] + db * row[_ERR_B + x]
+                            )
                 m0, m1, m2, m3 = zero, zero, zero, zero
                 for e in range((after_last - first) * TILE):
                     weight = body[_WEIGHT + e]
                     m0 += body[_CHANGE + e]
-                    m1 += body[_PRODUCT + e]
+                    if is_wrong:
+                        m1 += body[_PRODUCT + e]
                     m2 += weight
                     m3 += weight * weight
                 record[0], record[1], record[2], record[3] = m0, m1, m2, m3

@@ -191,7 +191,7 @@ class Contributions(Rasteriser):
                 rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
                 np.empty((0, 0, 5), self.dtype),
             )  # fmt: skip
-            error = np.zeros_like(rgb) if reference is None else rgb - reference
+            error = np.empty((0, 0, 3), self.dtype) if reference is None else rgb - reference
             sum_removal(
                 drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
                 error.astype(self.dtype, copy=False), transmittance, last, records,

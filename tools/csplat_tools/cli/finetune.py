@@ -66,8 +66,8 @@ def finetune(
             metavar="N",
             min=0,
             hidden=True,
-            help="Views that decide which step was best, and do not teach; 0: with --data some that teach decide, with"
-            " --self a few others.",
+            help="Views that decide which step was best, and do not teach; 0: with --data its validation photographs, or"
+            " some that teach, with --self a few others.",
         ),
     ] = 0,
     iterations: Annotated[int, typer.Option(metavar="N", min=1, help="Steps at most, one picture each.")] = 1_000,
