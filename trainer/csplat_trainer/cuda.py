@@ -18,6 +18,7 @@ from torch.nn.functional import conv2d
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 from csplat_trainer.densify import ScreenGradients
+from csplat_trainer.exposure import Exposure
 from csplat_trainer.loss import LOSS_WEIGHTS, LossValue
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import GROUPS, Parameters, Splats
@@ -92,9 +93,21 @@ class CudaEngine:
         self._count = parameters.step
 
     def step(
-        self, picture: Picture, background: F32, degree: int, rates: dict[str, float], rng: Generator
+        self,
+        picture: Picture,
+        background: F32,
+        degree: int,
+        rates: dict[str, float],
+        rng: Generator,
+        exposure: Exposure | None = None,
     ) -> LossValue:
-        """Make one step of training on one picture: see `CpuEngine.step`."""
+        """Make one step of training on one picture: see `CpuEngine.step`.
+
+        Raises:
+            InputError: an exposure is to be learnt.
+        """
+        if exposure is not None:
+            raise InputError("exposures are learnt on the CPU alone: wanted device cpu, or lr_exposure 0")
         camera = picture.camera
         photograph = self._upload(compose(picture, background, np.empty((camera.H, camera.W, 3), np.float32)))
         rendered, info = self._draw(camera, background, degree)

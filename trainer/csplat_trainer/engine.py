@@ -12,6 +12,7 @@ from csplat_render.camera import Camera
 from csplat_render.jit import lane_run, parallel_kernel
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_trainer.densify import ScreenGradients
+from csplat_trainer.exposure import Exposure
 from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
 from csplat_trainer.mcmc import add_noise
 from csplat_trainer.options import TrainOptions
@@ -42,7 +43,13 @@ class Engine(Protocol):
         ...
 
     def step(
-        self, picture: Picture, background: F32, degree: int, rates: dict[str, float], rng: Generator
+        self,
+        picture: Picture,
+        background: F32,
+        degree: int,
+        rates: dict[str, float],
+        rng: Generator,
+        exposure: Exposure | None = None,
     ) -> LossValue:
         """Make one step of training on one picture."""
         ...
@@ -77,7 +84,13 @@ class CpuEngine:
         self._normals = np.empty((0, 3), np.float32)
 
     def step(
-        self, picture: Picture, background: F32, degree: int, rates: dict[str, float], rng: Generator
+        self,
+        picture: Picture,
+        background: F32,
+        degree: int,
+        rates: dict[str, float],
+        rng: Generator,
+        exposure: Exposure | None = None,
     ) -> LossValue:
         """Make one step of training on one picture.
 
@@ -87,6 +100,7 @@ class CpuEngine:
             degree: of the SH bands that are evaluated.
             rates: learning rate of each group of parameters.
             rng: makes the noise.
+            exposure: how the photograph was exposed, if that is learnt.
 
         Returns:
             The photometric figures before the step.
@@ -95,9 +109,12 @@ class CpuEngine:
         loss, photograph = self._loss_for(camera)
         compose(picture, background, photograph)
         rgb = self._forward(camera, background, degree)
-        value, slope = loss(rgb, photograph, picture.mask)
+        shown = rgb if exposure is None else exposure.applied(rgb)
+        value, slope = loss(shown, photograph, picture.mask)
         if self._perceptual is not None:
-            slope += self._perceptual.gradient(rgb, photograph, options.lpips_weight)
+            slope += self._perceptual.gradient(shown, photograph, options.lpips_weight)
+        if exposure is not None:
+            slope = exposure.learnt(rgb, slope)
         gradients = self._rasteriser.backward(slope)
         values, count = self.parameters.values, max(1, len(self.parameters))
         _chain(

@@ -30,6 +30,7 @@ from csplat_trainer.data import DataSet, load
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.evaluate import evaluate
+from csplat_trainer.exposure import Exposure, Exposures
 from csplat_trainer.mcmc import grow, relocate
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs, TrainResult
@@ -120,6 +121,7 @@ class _Run:
             self._log["growth"] = options.growth_from(len(parameters))
         else:
             parameters = self._go_on(load_checkpoint(outputs.resume))
+        self._exposures = Exposures(len(data.train), self._log.get("exposures", ()))
         self._lpips = _lpips(options, outputs)
         self._engine = _engine(parameters, options, self._lpips)
         self._behind = _COLOURS.get(options.background, data.background)
@@ -188,12 +190,14 @@ class _Run:
     def _step(self, degree: int) -> tuple[float, float]:
         if not self._queue:
             self._queue = self._rng.permutation(len(self._data.train)).tolist()
-        picture = self._data.train[self._queue.pop()]
+        number = self._queue.pop()
+        picture = self._data.train[number]
         background = self._background
         if self._options.background == "random":
             background = self._rng.random(3, dtype=np.float32)
         rates = self._options.learning_rates(self._iteration, self._scene.extent)
-        value = self._engine.step(picture, background, degree, rates, self._rng)
+        exposure = Exposure(self._exposures, number, rates["exposure"]) if self._options.lr_exposure else None
+        value = self._engine.step(picture, background, degree, rates, self._rng, exposure)
         if not math.isfinite(value.loss):
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         self._log["losses"].append(float(f"{value.loss:.6g}"))
@@ -261,6 +265,8 @@ class _Run:
 
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None
+        if self._options.lr_exposure:
+            self._log["exposures"] = self._exposures.as_json()
         save_checkpoint(
             self._outputs.checkpoint,
             Checkpoint(
@@ -293,6 +299,7 @@ class _Run:
             "peak_memory_bytes": peak_memory(),
             "metrics": metrics,
             **self._log,
+            **({"exposures": np.round(self._exposures.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
 
 

@@ -56,6 +56,8 @@ class TrainOptions:
         lr_opacities: learning rate of the logits of opacity.
         lr_sh0: learning rate of the base colour.
         lr_shN: learning rate of the higher SH coefficients.
+        lr_exposure: of a gain and a shift per photograph and channel, for photographs that were exposed differently; no
+            scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
         lr_decay: the other rates fall exponentially to this share of themselves.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
         opacity_weight: of the mean opacity in the loss (mcmc and fixed).
@@ -96,6 +98,7 @@ class TrainOptions:
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-4
+    lr_exposure: float = 0.0
     lr_decay: float = 1.0
     sh_interval: int = 0
     opacity_weight: float = 0.003
@@ -169,10 +172,12 @@ class TrainOptions:
             "logits": self.lr_opacities * decay,
             "sh0": self.lr_sh0 * decay,
             "shN": self.lr_shN * decay,
+            "exposure": self.lr_exposure * _LAST_EXPOSURE**done,
         }
 
 
 _GROWTH = 1.05  # of the paper
+_LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
 
 _CHOICES = {
     "device": DEVICES,
@@ -196,6 +201,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lr_opacities": (0, 10),
     "lr_sh0": (0, 1),
     "lr_shN": (0, 1),
+    "lr_exposure": (0, 1),
     "lr_decay": (1e-6, 1),
     "sh_interval": (0, 10**7),
     "opacity_weight": (0, 100),

@@ -66,7 +66,7 @@ def finetune(
             metavar="N",
             min=0,
             hidden=True,
-            help="Views that decide which step was best, and do not teach; 0: with --data its validation photographs, or"
+            help="Views that decide which step was best, and do not teach; 0: with --data its validation photographs or"
             " some that teach, with --self a few others.",
         ),
     ] = 0,

@@ -17,6 +17,7 @@ from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasterise import Rasteriser, Splats
+from csplat_trainer.exposure import Exposure, Exposures
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
 from csplat_trainer.tuning.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
@@ -133,6 +134,8 @@ class _Run:
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _Buffers] = {}
         self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0, "views": views.digest}
+        self._exposures = Exposures(len(views.train))
+        self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _Best | None = None
         self._costs: Costs | None = None
 
@@ -152,6 +155,7 @@ class _Run:
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
         self._log = checkpoint.log
+        self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
         self._best = _Best(checkpoint.best_held, *checkpoint.best)
         if checkpoint.costs:
             self._costs = Costs(self._scene.frozen, self._options.byte_cost, checkpoint.costs)
@@ -194,17 +198,23 @@ class _Run:
         """One picture; returns its loss before the step."""
         if not self._queue:
             self._queue = self._rng.permutation(len(self._views.train)).tolist()
-        view = self._views.train[self._queue.pop()]
+        number = self._queue.pop()
+        view = self._views.train[number]
         seen, alphas = self._scene.seen()
         if self._options.byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
             self._costs = self._scene.count(seen, self._options.byte_cost)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
-        value, slope = buffers.loss(rendered, view.picture(self._views.background, buffers.wanted), view.mask)
+        rate = self._options.lr_exposure * self._options.share(self._iteration)
+        exposure = Exposure(self._exposures, number, rate) if self._options.lr_exposure else None
+        shown = rendered if exposure is None else exposure.applied(rendered)
+        value, slope = buffers.loss(shown, view.picture(self._views.background, buffers.wanted), view.mask)
         if not math.isfinite(value.loss):
             if self._iteration == 1:  # before anything has moved
                 raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
+        if exposure is not None:
+            slope = exposure.learnt(rendered, slope)
         self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._costs)
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss
@@ -236,6 +246,8 @@ class _Run:
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
+            if self._options.lr_exposure and id(view) in self._numbers:  # one that teaches, too
+                rendered = Exposure(self._exposures, self._numbers[id(view)], 0.0).applied(rendered)
             wanted = view.picture(self._views.background, buffers.wanted)
             loss += buffers.loss(rendered, wanted, view.mask)[0].loss / len(self._views.validation)
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
@@ -271,6 +283,8 @@ class _Run:
 
     def _save(self, path: str | Path) -> None:
         assert self._best is not None
+        if self._options.lr_exposure:
+            self._log["exposures"] = self._exposures.as_json()
         best = (self._best.score, self._best.psnr, self._best.iteration, self._best.since)
         save_finetune(
             path,
@@ -302,4 +316,5 @@ class _Run:
             "best_iteration": self._best.iteration,
             "peak_memory_bytes": peak_memory(),
             **self._log,
+            **({"exposures": np.round(self._exposures.values, 5).tolist()} if self._options.lr_exposure else {}),
         }

@@ -26,6 +26,7 @@ class FinetuneOptions:
         lr_sh0: of the base colour.
         lr_shN: of the higher SH coefficients.
         lr_entries: of the codebook's entries.
+        lr_exposure: as in `TrainOptions`: 0, no photograph is taken for brighter or darker than others.
         byte_cost: how much a bit per splat weighs in the loss; 0: files may grow as they please.
         warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
         decay: share of the learning rates that is left at the end. Next to nothing: values that still move go back and
@@ -49,6 +50,7 @@ class FinetuneOptions:
     lr_sh0: float = 1e-2
     lr_shN: float = 2e-3
     lr_entries: float = 4e-3
+    lr_exposure: float = 0.0
     byte_cost: float = 1e-4
     warm_up: int = 100
     decay: float = 5e-4
@@ -92,6 +94,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lr_sh0": (0, 1),
     "lr_shN": (0, 1),
     "lr_entries": (0, 1),
+    "lr_exposure": (0, 1),
     "byte_cost": (0, 1),
     "warm_up": (0, 10**7),
     "decay": (0, 1),

@@ -1,0 +1,100 @@
+"""Photographs of one scene that were exposed differently."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="the trainer wants the extra [train]")
+
+from test_train_loop import QUICK, photographs
+
+from csplat.encoder import Draft, EncodeOptions
+from csplat.errors import InputError
+from csplat_trainer.data import DataSet
+from csplat_trainer.exposure import Exposure, Exposures
+from csplat_trainer.loop import train
+from csplat_trainer.loss import PhotometricLoss
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.outputs import Outputs
+from csplat_trainer.tuning import FinetuneOptions, View, Views, tune
+
+GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of the photographs that teach; those that judge: 1
+LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
+
+
+@pytest.fixture
+def data(make_model):
+    return photographs(make_model)
+
+
+@pytest.fixture
+def uneven(data):
+    shots = [
+        replace(one, source=np.rint(np.clip(one.pixels * [gain, gain, gain, 1.0], 0, 255)).astype(np.uint8))
+        for one, gain in zip(data.train, GAINS, strict=True)
+    ]
+    return DataSet("uneven", shots, data.test)
+
+
+def test_slopes_are_those_of_the_loss_with_the_correction():
+    rng = np.random.default_rng(0)
+    seen, photograph = (rng.random((20, 24, 3)).astype(np.float32) for _ in range(2))
+    exposures, loss = Exposures(2), PhotometricLoss(20, 24)
+    exposures.values[0] = rng.uniform(-0.3, 0.3, (2, 3))
+    one, moved = Exposure(exposures, 0, 0.0), []
+    exposures.move = lambda number, slope, rate: moved.append((number, slope, rate))  # type: ignore[method-assign]
+    slope = one.learnt(seen, loss(one.applied(seen), photograph.copy())[1].copy()).copy()
+
+    def value(seen) -> float:
+        return float(loss(one.applied(seen), photograph.copy())[0].loss)
+
+    expected = np.zeros((2, 3))
+    for place in np.ndindex(2, 3):
+        for sign in (1.0, -1.0):
+            exposures.values[0][place] += sign * 1e-3
+            expected[place] += sign * value(seen) / 2e-3
+            exposures.values[0][place] -= sign * 1e-3
+    np.testing.assert_allclose(moved[0][1], expected, rtol=0.02, atol=2e-4)
+    step = np.float32(1e-3) * rng.standard_normal(seen.shape).astype(np.float32)
+    assert value(seen + step) - value(seen - step) == pytest.approx(2.0 * float(np.sum(slope * step)), rel=0.1)
+
+
+def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
+    options = TrainOptions(**{**LONGER, "iterations": 600})
+    plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
+    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # of what teaches
+    found = np.array(corrected.log["exposures"])
+    assert np.abs(found.mean(axis=0)).max() < 1e-4
+    assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats hardly hold the scene
+    assert "exposures" not in plain.log
+
+
+def test_a_resumed_run_goes_on_with_its_exposures(uneven, data, tmp_path):
+    options = TrainOptions(**QUICK, lr_exposure=0.02)
+    whole = train(uneven, options, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    stopped = tmp_path / "stopped.npz"
+
+    def stop(now):
+        if now.iteration == 40:
+            stopped.write_bytes((tmp_path / "c.npz").read_bytes())  # the one of step 25
+
+    train(uneven, options, on_step=stop, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    again = train(uneven, options, outputs=Outputs(resume=stopped))
+    assert np.array_equal(whole.model.shN, again.model.shN)
+    assert whole.log["exposures"] == again.log["exposures"]
+    with pytest.raises(InputError, match="exposures of 9 photographs are stored, wanted those of 8"):
+        train(DataSet("fewer", uneven.train[:8], data.test), options, outputs=Outputs(resume=stopped))
+
+
+def test_tuning_corrects_exposures_too(make_model, uneven):
+    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
+    frozen = Draft.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()
+    teach, judge = ([View(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
+    views = Views(teach, judge, np.zeros(3, np.float32))
+    plain, corrected = (
+        tune(frozen, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
+        for rate in (0.0, 0.05)
+    )
+    assert corrected["looks"][-1]["psnr"] > plain["looks"][-1]["psnr"] + 0.5
+    assert np.corrcoef(np.exp(np.array(corrected["exposures"])[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.95
