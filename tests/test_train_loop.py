@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from csplat import read_ply, write_ply
+from csplat import decode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.training import TrainedOn
 from csplat_render.camera import Camera
@@ -243,6 +243,31 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
     metrics = json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
         assert judged[name] == pytest.approx(metrics[name], abs=0.01)
+
+
+def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, make_model, tmp_path):
+    folder = write_set(tmp_path, make_data(make_model))
+    files, report = ("--checkpoint", tmp_path / "run.npz"), tmp_path / "report.json"
+    words = ("train", folder, *QUICK_WORDS, "--tuning-steps", 20, "--keep", 0.9)
+    told = call(*words, "-o", tmp_path / "a.csplat", *files, "--report", report)
+    model = decode((tmp_path / "a.csplat").read_bytes())
+    assert 0 < len(model) <= 36
+    said = json.loads(report.read_text())
+    assert 30 == len(said["training"]["losses"])
+    assert (len(model), (tmp_path / "a.csplat").stat().st_size) == (said["file"]["splats"], said["file"]["size_bytes"])
+    assert {"source", "before tuning", "file"} == set(said["file"]["scores"])
+    assert "held-out photographs" in told.stderr
+    assert (1.0, 1.0, 1.0) == TrainedOn.of(model.metadata).background
+    assert (tmp_path / "run.tuning.npz").exists()
+    call(*words, "-o", tmp_path / "b.csplat", *files, "--resume", tmp_path / "run.npz")
+    assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
+
+
+@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small"), ("--tuning-steps", 5)])
+def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
+    result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])
+    assert 2 == result.exit_code
+    assert "wanted OUT.csplat" in " ".join(result.stderr.split())
 
 
 def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):

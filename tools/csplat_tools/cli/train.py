@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_size
@@ -21,6 +22,7 @@ from csplat_trainer.outputs import Outputs
 __all__ = ["train"]
 
 _DEFAULT = TrainOptions()
+_KEEP = 0.8  # of the splats: of those that training makes some are hardly seen
 
 
 @command(
@@ -29,7 +31,9 @@ _DEFAULT = TrainOptions()
 )
 def train(
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed pictures.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The scene to write.")],
+    output: Annotated[
+        str, typer.Argument(metavar="OUT.ply|OUT.csplat", help="The scene to write, or a file that was tuned, too.")
+    ],
     upright: Upright,
     out: Output,
     settings: Settings,
@@ -38,6 +42,20 @@ def train(
         int, typer.Option(metavar="0..3", help="How colour depends on direction.")
     ] = _DEFAULT.sh_degree,
     iterations: Annotated[int, typer.Option(metavar="N", help="Training steps.")] = _DEFAULT.iterations,
+    preset: Annotated[
+        PresetName | None,
+        typer.Option(metavar="|".join(PRESETS), help="Of OUT.csplat: speed against size; by default small."),
+    ] = None,
+    keep: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="Of the splats that are trained, how many OUT.csplat holds; by default 0.8."
+        ),
+    ] = None,
+    tuning_steps: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, hidden=True, help="Of the tuning of OUT.csplat, at most; by default 1000."),
+    ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
     test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth picture; 0: none.")] = 8,
@@ -81,31 +99,64 @@ def train(
     it and judge the scene alike; encode and decode keep it. Another says which
     way is up, by the kind of set or by how its cameras were held.
 
+    Into OUT.csplat goes what `csplat finetune --data DATA` makes of the scene:
+    splats that pictures hardly need are left out, and the values of the others
+    move, seen through the encoder's quantisers, until the photographs look
+    right. Photographs that a set names for validation, or some that teach, say
+    which step was best. --checkpoint and --resume cover both.
+
     Examples:
       csplat train lego -o lego.ply --max-splats 10000
       csplat train lego -o lego.ply --size 200x200 --report lego.json
+      csplat train lego -o lego.csplat --max-splats 60000
     ---
     More examples:
       csplat train lego -o lego.ply --plot loss.png --previews pictures
       csplat train lego -o lego.ply --set strategy=gradient,loss=l1
+      csplat train capture -o scene.ply --set lr_exposure=0.01  # exposed by turns
       csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
     need_trainer(plots=plot is not None)
-    from csplat_tools.training.train import run_training
+    from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
+    from csplat_tools.training.report import format_report
+    from csplat_tools.training.train import run_training, run_training_to_file, tuning_checkpoint
+    from csplat_trainer.tuning.options import FinetuneOptions
 
     options = chosen(
         TrainOptions, max_splats=max_splats, sh_degree=sh_degree, iterations=iterations, seed=seed, device=device,
         background=background, antialiased=antialiased, **settings.of(TrainOptions),
     )  # fmt: skip
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
+    to_file = Path(output).suffix == ".csplat"
+    if not to_file and any(one is not None for one in (preset, keep, tuning_steps)):
+        raise typer.BadParameter("--preset, --keep and --tuning-steps are about a file: wanted OUT.csplat")
+    if keep is not None and not 0.0 < keep <= 1.0:
+        raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
+    later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None else None
     out.check(
         output, inputs=(source, resume, lpips_weights),
-        named={"--plot": plot, "--checkpoint": None if again else checkpoint},
+        named={
+            "--plot": plot, "--checkpoint": None if again else checkpoint,
+            "the checkpoint of the tuning": None if again else later,
+        },
     )  # fmt: skip
-    check_name(output, ".ply", "train", source)
+    if not to_file:
+        check_name(output, ".ply", "train", source)
     data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
     files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
-    out.publish(
-        run_training(data, output, options, files, facts=upright.upright(), plot=plot, threads=threads, quiet=out.quiet)
-    )
+    facts = upright.upright()
+    if not to_file:
+        out.publish(
+            run_training(data, output, options, files, facts=facts, plot=plot, threads=threads, quiet=out.quiet)
+        )
+        return
+    encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
+    steps = {} if tuning_steps is None else {"iterations": tuning_steps}
+    tuning = chosen(FinetuneOptions, seed=seed, byte_cost=BYTE_COST[False], lr_exposure=options.lr_exposure, **steps)
+    report = run_training_to_file(
+        data, output, options, files, encoding, tuning, keep=_KEEP if keep is None else keep, facts=facts, plot=plot,
+        quiet=out.quiet,
+    )  # fmt: skip
+    out.remark(format_report(report["file"]))
+    out.publish(report)

@@ -1,4 +1,4 @@
-"""From a data set on disk to a trained PLY: the work of `csplat train`."""
+"""From a data set on disk to a trained PLY, or to a file that was tuned by the same photographs: `csplat train`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import csplat_trainer
+from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.training import TrainedOn
 from csplat_render.jit import thread_count
@@ -14,15 +15,17 @@ from csplat_tools.files.console import note, step_progress
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import write_model
-from csplat_tools.views import DataOptions
+from csplat_tools.training.finetune import run_finetuning, usually_aside
+from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import load
 from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import Outputs
+from csplat_trainer.outputs import Outputs, TrainResult
 from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.report import TrainingStep, plot_loss
+from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = ["run_training"]
+__all__ = ["run_training", "run_training_to_file", "tuning_checkpoint"]
 
 
 def run_training(
@@ -36,7 +39,7 @@ def run_training(
     threads: int | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Read a data set, train, write the scene and what else is wanted.
+    """Read a data set, train, write the scene.
 
     Args:
         data: the data set; where it says nothing every eighth picture is held out.
@@ -55,6 +58,66 @@ def run_training(
         InputError: a package or the data set is missing, or does not suit the options.
         OSError: a file cannot be read or written.
     """
+    result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
+    if not quiet:
+        note(f"{output} says how to compare it with its photographs: {TrainedOn.of(result.model.metadata)}")
+    return result.log
+
+
+def run_training_to_file(
+    data: DataOptions,
+    output: str,
+    options: TrainOptions,
+    files: Outputs,
+    encoding: EncodeOptions,
+    tuning: FinetuneOptions,
+    *,
+    keep: float,
+    facts: SceneOverrides | None = None,
+    plot: str | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Read a data set, train, and tune a file by the same photographs; of the scene nothing else is written.
+
+    Args:
+        data, options, facts, plot, quiet: as for `run_training`.
+        output: the `.csplat` file to write, or `-`.
+        files: likewise; checkpoints of the tuning stand beside those of the training (`tuning_checkpoint`), and a run
+            goes on from them where the training had ended.
+        encoding: of the encoder; its threads hold for all.
+        tuning: of the tuning.
+        keep: share of the splats that the file holds.
+
+    Returns:
+        `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
+
+    Raises:
+        InputError: as both.
+        OSError: a file cannot be read or written.
+    """
+    threads = encoding.threads
+    result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    model = (facts or SceneOverrides()).applied(result.model)
+    views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
+    before = None if files.resume is None else tuning_checkpoint(files.resume)
+    further = Outputs(
+        None if files.checkpoint is None else tuning_checkpoint(files.checkpoint), files.checkpoint_every,
+        resume=before if before is not None and before.exists() else None,
+    )  # fmt: skip
+    report = run_finetuning(model, views, output, encoding, tuning, further, keep=keep, quiet=quiet)
+    return {"training": result.log, "file": report}
+
+
+def tuning_checkpoint(path: str | Path) -> Path:
+    """Where the tuning keeps its checkpoint, by where the training does: run.npz, run.tuning.npz."""
+    return Path(path).with_suffix(".tuning.npz")
+
+
+def _trained(
+    data: DataOptions, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
+) -> TrainResult:
+    """Read, train, draw the loss, say what came of it."""
     _check_inputs(options, files)
     every = 8 if data.test_every is None else data.test_every
     pictures = load(data.path, data.size, images=data.images, test_every=every, near=data.near)
@@ -66,13 +129,11 @@ def run_training(
             prepare_renderer(quiet=quiet, gradients=True)
         with step_progress("training", _state, quiet=quiet) as show:
             result = csplat_trainer.train(pictures, options, outputs=files, on_step=show)
-    write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data.path).name)
     if not quiet:
         note(_summary(result.log, result.metrics))
-        note(f"{output} says how to compare it with its photographs: {TrainedOn.of(result.model.metadata)}")
-    return result.log
+    return result
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:
