@@ -72,6 +72,18 @@ def test_blender_sets_keep_their_split_and_their_transparency(blender):
     assert_dots_are_where_points_fall([*data.train, *data.test])
 
 
+def test_validation_pictures_are_those_that_are_there(blender):
+    document = json.loads((blender / "transforms_test.json").read_text())
+    (blender / "transforms_val.json").write_text(json.dumps(document))
+    assert 3 == len(load(blender).val)
+    for frame in document["frames"]:
+        frame["file_path"] = frame["file_path"].replace("test", "val")
+    (blender / "transforms_val.json").write_text(json.dumps(document))
+    data = load(blender)
+    assert (5, 3, 0) == (len(data.train), len(data.test), len(data.val))
+    assert any("transforms_val.json: 3 of 3 pictures are missing" in line for line in data.report)
+
+
 def test_transforms_json_reports_missing_pictures_and_splits_every_eighth(ngp):
     data = load(ngp)
     assert (7, 2) == (len(data.train), len(data.test))

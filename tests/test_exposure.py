@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the trainer wants the extra [train]")
 
-from test_train_loop import QUICK, photographs
+from test_train_loop import QUICK, photographs, resumed_as_if_never_stopped
 
 from csplat.encoder import Draft, EncodeOptions
 from csplat.errors import InputError
@@ -70,21 +70,17 @@ def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
     assert "exposures" not in plain.log
 
 
-def test_a_resumed_run_goes_on_with_its_exposures(uneven, data, tmp_path):
+def test_a_resumed_run_goes_on_with_its_exposures(uneven, tmp_path):
     options = TrainOptions(**QUICK, lr_exposure=0.02)
-    whole = train(uneven, options, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
-    stopped = tmp_path / "stopped.npz"
-
-    def stop(now):
-        if now.iteration == 40:
-            stopped.write_bytes((tmp_path / "c.npz").read_bytes())  # the one of step 25
-
-    train(uneven, options, on_step=stop, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
-    again = train(uneven, options, outputs=Outputs(resume=stopped))
-    assert np.array_equal(whole.model.shN, again.model.shN)
-    assert whole.log["exposures"] == again.log["exposures"]
+    log, stopped = resumed_as_if_never_stopped(uneven, options, tmp_path)
+    assert np.abs(log["exposures"]).max() > 0.0
     with pytest.raises(InputError, match="exposures of 9 photographs are stored, wanted those of 8"):
-        train(DataSet("fewer", uneven.train[:8], data.test), options, outputs=Outputs(resume=stopped))
+        train(DataSet("fewer", uneven.train[:8], uneven.test), options, outputs=Outputs(resume=stopped))
+
+
+def test_a_gpu_learns_none(uneven):
+    with pytest.raises(InputError, match="on the CPU alone"):
+        train(uneven, TrainOptions(**QUICK, lr_exposure=0.02, device="cuda"))
 
 
 def test_tuning_corrects_exposures_too(make_model, uneven):

@@ -336,6 +336,18 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_pa
         tune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
+def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(source, views, tmp_path):
+    file, frozen = tmp_path / "run.npz", Draft.of(source, COARSE).frozen()
+    tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
+    arrays = dict(np.load(file))
+    facts = json.loads(arrays["facts"].tobytes())
+    del facts["options"]["lr_exposure"]
+    np.savez(file, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
+    assert 6 == len(tune(frozen, views, replace(QUICK, iterations=6), resume=file).log["losses"])
+    with pytest.raises(InputError, match=r"another lr_exposure: 0\.0"):
+        tune(frozen, views, replace(QUICK, iterations=6, lr_exposure=0.01), resume=file)
+
+
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
     file = tmp_path / "c.npz"
     tune(Draft.of(source, COARSE).frozen(), views, replace(QUICK, iterations=5), checkpoint=file)

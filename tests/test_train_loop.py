@@ -94,19 +94,24 @@ def test_the_same_seed_makes_the_same_file(make_data, make_model, tmp_path):
 
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
 def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, tmp_path, strategy):
-    data, options = make_data(make_model), TrainOptions(**QUICK, strategy=strategy)
-    whole = train(data, options, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
-    stopped = tmp_path / "stopped.npz"
+    resumed_as_if_never_stopped(make_data(make_model), TrainOptions(**QUICK, strategy=strategy), tmp_path)
+
+
+def resumed_as_if_never_stopped(data, options, folder):
+    """Compare a run with one that goes on from the middle of it; return its log and the checkpoint of that."""
+    outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"
 
     def stop(now):
         if now.iteration == 40:
-            stopped.write_bytes((tmp_path / "c.npz").read_bytes())  # the one of step 25
+            stopped.write_bytes((folder / "c.npz").read_bytes())  # the one of step 25
 
-    train(data, options, on_step=stop, outputs=Outputs(checkpoint=tmp_path / "c.npz", checkpoint_every=25))
+    whole = train(data, options, on_step=stop, outputs=outputs)
     again = train(data, options, outputs=Outputs(resume=stopped))
     assert np.array_equal(whole.model.means, again.model.means)
     assert np.array_equal(whole.model.shN, again.model.shN)
     assert whole.log["losses"] == again.log["losses"]
+    assert whole.log.get("exposures") == again.log.get("exposures")
+    return whole.log, stopped
 
 
 def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_path):
@@ -248,7 +253,7 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
 def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, make_model, tmp_path):
     folder = write_set(tmp_path, make_data(make_model))
     files, report = ("--checkpoint", tmp_path / "run.npz"), tmp_path / "report.json"
-    words = ("train", folder, *QUICK_WORDS, "--tuning-steps", 20, "--keep", 0.9)
+    words = ("train", folder, *QUICK_WORDS, "--keep", 0.9)
     told = call(*words, "-o", tmp_path / "a.csplat", *files, "--report", report)
     model = decode((tmp_path / "a.csplat").read_bytes())
     assert 0 < len(model) <= 36
@@ -261,9 +266,25 @@ def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, ma
     assert (tmp_path / "run.tuning.npz").exists()
     call(*words, "-o", tmp_path / "b.csplat", *files, "--resume", tmp_path / "run.npz")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
+    # Trained further it is another scene, for which the tuning that there was says nothing.
+    call(*words, "-o", tmp_path / "c.csplat", *files, "--resume", tmp_path / "run.npz", "--iterations", 40)
+    assert (tmp_path / "a.csplat").read_bytes() != (tmp_path / "c.csplat").read_bytes()
 
 
-@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small"), ("--tuning-steps", 5)])
+def test_a_damaged_validation_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
+    folder = write_set(tmp_path, make_data(make_model))
+    document = json.loads((folder / "transforms.json").read_text())
+    for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
+        frames = document["frames"][rows]
+        (folder / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
+    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
+    result = CliRunner().invoke(app, ["train", str(folder), "-o", str(tmp_path / "a.csplat")])
+    assert (1, False) == (result.exit_code, (tmp_path / "a.csplat").exists())
+    assert "11.png is not an image that can be read" in result.stderr
+
+
+@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small")])
 def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
     result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])
     assert 2 == result.exit_code

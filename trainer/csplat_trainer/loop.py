@@ -329,6 +329,8 @@ def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) 
         return CpuEngine(parameters, options, PerceptualLoss(lpips) if wanted and lpips is not None else None)
     if options.lpips_weight > 0.0:
         raise InputError("the perceptual loss runs on the CPU alone: wanted --device cpu, or no --lpips-weight")
+    if options.lr_exposure > 0.0:
+        raise InputError("exposures are learnt on the CPU alone: wanted --device cpu, or no lr_exposure")
     try:
         from csplat_trainer.cuda import CudaEngine
     except ImportError:

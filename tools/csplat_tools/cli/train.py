@@ -52,10 +52,6 @@ def train(
             metavar="SHARE", help="Of the splats that are trained, how many OUT.csplat holds; by default 0.8."
         ),
     ] = None,
-    tuning_steps: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, hidden=True, help="Of the tuning of OUT.csplat, at most; by default 1000."),
-    ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
     test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth picture; 0: none.")] = 8,
@@ -113,7 +109,7 @@ def train(
     More examples:
       csplat train lego -o lego.ply --plot loss.png --previews pictures
       csplat train lego -o lego.ply --set strategy=gradient,loss=l1
-      csplat train capture -o scene.ply --set lr_exposure=0.01  # exposed by turns
+      csplat train capture -o scene.ply --set lr_exposure=0.01  # photographs differ in brightness
       csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
@@ -129,8 +125,8 @@ def train(
     )  # fmt: skip
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     to_file = Path(output).suffix == ".csplat"
-    if not to_file and any(one is not None for one in (preset, keep, tuning_steps)):
-        raise typer.BadParameter("--preset, --keep and --tuning-steps are about a file: wanted OUT.csplat")
+    if not to_file and (preset is not None or keep is not None):
+        raise typer.BadParameter("--preset and --keep are about a file: wanted OUT.csplat")
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None else None
@@ -152,8 +148,7 @@ def train(
         )
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
-    steps = {} if tuning_steps is None else {"iterations": tuning_steps}
-    tuning = chosen(FinetuneOptions, seed=seed, byte_cost=BYTE_COST[False], lr_exposure=options.lr_exposure, **steps)
+    tuning = FinetuneOptions(seed=seed, byte_cost=BYTE_COST[False], lr_exposure=options.lr_exposure)
     report = run_training_to_file(
         data, output, options, files, encoding, tuning, keep=_KEEP if keep is None else keep, facts=facts, plot=plot,
         quiet=out.quiet,

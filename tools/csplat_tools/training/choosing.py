@@ -90,7 +90,9 @@ def choose_splats(
     looking = [*views.teaches, *views.decides]
 
     def weighed(model: SplatModel) -> Sensitivity:
-        return measure_views(model, measuring, views.background, matrices=True, threads=threads, progress=progress)
+        return measure_views(
+            model, measuring, views.background, matrices=True, magnitudes=False, threads=threads, progress=progress
+        )
 
     given = _read(importance, source)
     prune = bool(views.photographs) if prune_unseen is None else prune_unseen

@@ -18,7 +18,7 @@ from csplat_tools.files.streams import write_model
 from csplat_tools.training.finetune import run_finetuning, usually_aside
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.checkpoint import load_checkpoint
-from csplat_trainer.data import load
+from csplat_trainer.data import DataSet, load
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs, TrainResult
 from csplat_trainer.perceptual import PerceptualLoss
@@ -96,22 +96,29 @@ def run_training_to_file(
         InputError: as both.
         OSError: a file cannot be read or written.
     """
-    threads = encoding.threads
-    result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    further = _tuning_outputs(files, options)
+    for one in _loaded(data).val:  # a damaged one is found before training; nobody keeps them until then
+        _ = one.pixels, one.mask
+    result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    before = None if files.resume is None else tuning_checkpoint(files.resume)
-    further = Outputs(
-        None if files.checkpoint is None else tuning_checkpoint(files.checkpoint), files.checkpoint_every,
-        resume=before if before is not None and before.exists() else None,
-    )  # fmt: skip
     report = run_finetuning(model, views, output, encoding, tuning, further, keep=keep, quiet=quiet)
     return {"training": result.log, "file": report}
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
     """Where the tuning keeps its checkpoint, by where the training does: run.npz, run.tuning.npz."""
-    return Path(path).with_suffix(".tuning.npz")
+    return Path(f"{str(path).removesuffix('.npz')}.tuning.npz")
+
+
+def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
+    """Checkpoints of the tuning: to go on from only where the training, whose scene it tunes, had ended."""
+    checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
+    resume = None if files.resume is None else tuning_checkpoint(files.resume)
+    if files.resume is None or resume is None or not resume.exists():
+        return Outputs(checkpoint, files.checkpoint_every)
+    ended = load_checkpoint(files.resume).iteration >= options.iterations
+    return Outputs(checkpoint, files.checkpoint_every, resume=resume if ended else None)
 
 
 def _trained(
@@ -119,8 +126,7 @@ def _trained(
 ) -> TrainResult:
     """Read, train, draw the loss, say what came of it."""
     _check_inputs(options, files)
-    every = 8 if data.test_every is None else data.test_every
-    pictures = load(data.path, data.size, images=data.images, test_every=every, near=data.near)
+    pictures = _loaded(data)
     for line in () if quiet else pictures.report:
         note(line)
     pictures.read()  # a damaged picture is found before kernels are compiled
@@ -134,6 +140,12 @@ def _trained(
     if not quiet:
         note(_summary(result.log, result.metrics))
     return result
+
+
+def _loaded(data: DataOptions) -> DataSet:
+    """The data set; where it says nothing every eighth picture is held out."""
+    every = 8 if data.test_every is None else data.test_every
+    return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:

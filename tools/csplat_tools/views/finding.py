@@ -5,7 +5,7 @@
 | virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
-| data set | training photographs | its validation photographs, 16 at most, or every 8th of the others | held-out ones |
+| data set | training photographs | 16 for validation at most, else every 8th that teaches | held-out ones |
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def read_blender(folder: Path) -> Found:
         test = []
         report.append("there is no transforms_test.json: no test pictures")
     val_path = folder / "transforms_val.json"
-    val = _shots(val_path, report) if val_path.is_file() else []
+    val = _shots(val_path, report, needed=False) if val_path.is_file() else []
     return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES, val=val)
 
 
@@ -74,8 +74,8 @@ def read_transforms(path: Path, test_every: int) -> Found:
     return Found("transforms.json set", train, test, report=report, test_every=test_every)
 
 
-def _shots(path: Path, report: list[str]) -> list[Shot]:
-    """The shots of one file whose pictures are there; those that are not are reported."""
+def _shots(path: Path, report: list[str], *, needed: bool = True) -> list[Shot]:
+    """The shots of one file whose pictures are there; those that are not are reported. If needed, one at least."""
     document = _load(path)
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -96,7 +96,7 @@ def _shots(path: Path, report: list[str]) -> list[Shot]:
     if missing:
         shown = ", ".join(missing[:_NAMED_MISSING]) + (", …" if len(missing) > _NAMED_MISSING else "")
         report.append(f"{path.name}: {len(missing)} of {len(frames)} pictures are missing and left out: {shown}")
-    if not shots:
+    if needed and not shots:
         raise InputError(f"{path}: none of its {len(frames)} pictures is there ({missing[0]}, …)")
     return shots
 

@@ -160,14 +160,9 @@ def _measured(
     """How much the views that teach depend on each splat."""
     cameras = [one.camera for one in views.train]
     found = measure_sensitivity(
-        model,
-        cameras,
-        background=views.background,
-        metric=True,
-        magnitudes=False,
-        threads=encoding.threads,
+        model, cameras, background=views.background, metric=True, magnitudes=False, threads=encoding.threads,
         progress=progress,
-    )
+    )  # fmt: skip
     return StoredSensitivity.of(model, found).importance()
 
 

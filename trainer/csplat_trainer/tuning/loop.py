@@ -147,9 +147,10 @@ class _Run:
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
+        before = {**asdict(FinetuneOptions()), **checkpoint.options}  # an older one does not name all of them
         for name, value in asdict(self._options).items():
-            if name != "iterations" and checkpoint.options[name] != value:
-                raise InputError(f"the checkpoint is of a run with another {name}: {checkpoint.options[name]}")
+            if name != "iterations" and before[name] != value:
+                raise InputError(f"the checkpoint is of a run with another {name}: {before[name]}")
         self._scene = TunedScene(self._scene.frozen, checkpoint.parameters)
         self._rng.bit_generator.state = checkpoint.rng_state
         self._iteration = checkpoint.iteration
