@@ -325,6 +325,27 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
     assert whole.log["looks"] == rest.log["looks"]
 
 
+def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
+    frozen = Draft.of(source, EncodeOptions(attribute_psnr=34.0)).frozen()
+    before = len(frozen.coded(frozen.start()).write().data)
+    options, costs = replace(QUICK, iterations=600, validate_every=50), []
+    for share in (0.95, 1.5):
+        tuned = tune(frozen, views, options, size_bytes=int(share * before))
+        assert len(frozen.coded(tuned.held).write().data) <= share * before
+        best = next(look for look in tuned.log["looks"] if look["iteration"] == tuned.log["best_iteration"])
+        assert best["size_bytes"] == len(frozen.coded(tuned.held).write().data)
+        costs.append(tuned.log["byte_cost"])
+    assert costs[0] > options.byte_cost > costs[1]
+    file = tmp_path / "run.npz"
+    half = replace(options, iterations=100)
+    tune(frozen, views, half, size_bytes=before, checkpoint=file)
+    whole, rest = (tune(frozen, views, half, size_bytes=before, resume=one) for one in (None, file))
+    assert frozen.coded(whole.held).write().data == frozen.coded(rest.held).write().data
+    assert whole.log["byte_cost"] == rest.log["byte_cost"]
+    with pytest.raises(InputError, match="another target"):
+        tune(frozen, views, half, resume=file)
+
+
 def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
     frozen, file = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz"
     tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
@@ -529,6 +550,19 @@ def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     call("verify", out, "--source", capture / "scene.ply")
     again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", "--iterations", 1)
     assert "need least" not in again.stderr
+
+
+def test_a_file_keeps_to_the_size_that_is_wanted(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--preset", "small", "--iterations", 200, "--json")
+    whole = json.loads(call(*words, "-o", tmp_path / "w.csplat").stdout)
+    for share, splats in ((0.7, (80, 260)), (1.15, (300, 300))):
+        size, out = int(share * whole["size_bytes"]), tmp_path / f"{share}.csplat"
+        facts = json.loads(call(*words, "-o", out, "--target-size", f"{size}B").stdout)
+        assert 0.85 * size < out.stat().st_size == facts["size_bytes"] <= size
+        assert splats[0] <= facts["splats"] <= splats[1]
+    result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-size", "300B")
+    assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
+    assert "more than 300 (E_INPUT)" in result.stderr
 
 
 def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,6 +71,17 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
     assert np.array_equal(first.model.shN, second.model.shN)
     assert first.metrics == second.metrics
     assert first.log["entries"][-1]["psnr"] == second.log["entries"][-1]["psnr"]
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
+def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, make_model, tmp_path, strategy):
+    data = make_data(make_model)
+    options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
+    whole = train(data, options)
+    counts = [entry["splat_count"] for entry in whole.log["entries"]]
+    assert counts[1] == counts[2] == len(whole.model)
+    assert len(train(data, replace(options, final_share=1.0)).model) / 2 == pytest.approx(counts[2], abs=3)
+    resumed_as_if_never_stopped(data, options, tmp_path)
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
@@ -271,6 +283,17 @@ def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, ma
     assert (tmp_path / "a.csplat").read_bytes() != (tmp_path / "c.csplat").read_bytes()
 
 
+def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tmp_path):
+    folder, run = write_set(tmp_path, make_data(make_model)), tmp_path / "run.npz"
+    words = ("train", folder, *QUICK_WORDS)
+    call(*words, "-o", tmp_path / "a.csplat", "--checkpoint", run)
+    size = (tmp_path / "a.csplat").stat().st_size
+    trained = run.read_bytes()
+    call(*words[:2], *QUICK_WORDS[2:], "-o", tmp_path / "b.csplat", "--resume", run, "--target-size", f"{size - 30}B")
+    assert (tmp_path / "b.csplat").stat().st_size <= size - 30
+    assert trained == run.read_bytes()
+
+
 def test_a_damaged_validation_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
     folder = write_set(tmp_path, make_data(make_model))
     document = json.loads((folder / "transforms.json").read_text())
@@ -284,7 +307,7 @@ def test_a_damaged_validation_picture_is_refused_before_training_begins(make_dat
     assert "11.png is not an image that can be read" in result.stderr
 
 
-@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small")])
+@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB")])
 def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
     result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])
     assert 2 == result.exit_code

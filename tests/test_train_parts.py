@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
+from csplat_render.cameras import intrinsics, orbit
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.mcmc import add_noise, grow, relocate, share
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
+from csplat_trainer.pictures import Picture
 from csplat_trainer.report import moving_average
 from csplat_trainer.resume import adapt
+from csplat_trainer.thinning import thin
 
 
 @pytest.fixture
@@ -199,3 +202,25 @@ def test_growth_reaches_the_cap_halfway():
 def test_sh_degrees_come_one_after_the_other():
     options = TrainOptions(iterations=1500, sh_degree=2)
     assert [0, 1, 2, 2] == [options.active_degree(step) for step in (0, 100, 200, 1400)]
+
+
+def test_splats_go_a_few_at_a_time_and_the_last_long_before_the_end():
+    options = TrainOptions(max_splats=1000, final_share=0.4, iterations=1000, refine_stop=0.6)
+    steps = [step for step in range(1, 1001) if options.thins_after(step)]
+    assert [*range(624, 841, 24)] == steps  # 600 is the last step at which splats move
+    assert 0.4 == pytest.approx(options.thinning ** len(steps))
+    assert not any(TrainOptions(iterations=1000).thins_after(step) for step in range(1, 1001))
+
+
+def test_those_go_that_pictures_need_least(make_model):
+    cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(40, 40, 50.0), 40, 40)
+    pictures = [Picture(camera, np.zeros((40, 40, 3), np.uint8)) for camera in cameras]
+    values = from_model(make_model(40, 1, seed=3, scales=np.full((40, 3), -1.2, np.float32)), 1)
+    values["logits"][5:15] = -7.0
+    parameters = Parameters.starting_at(values)
+    parameters.second["means"][:] = np.arange(40, dtype=np.float32)[:, None]
+    thin(parameters, pictures, np.ones(3, np.float32), 0.75, antialiased=False)
+    wanted = [*range(5), *range(15, 40)]
+    assert wanted == parameters.second["means"][:, 0].tolist()
+    thin(parameters, pictures, np.ones(3, np.float32), 0.01, antialiased=False)
+    assert 1 == len(parameters)

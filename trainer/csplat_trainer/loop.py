@@ -40,6 +40,7 @@ from csplat_trainer.pictures import compose
 from csplat_trainer.report import TrainingStep, peak_memory, save_picture, side_by_side
 from csplat_trainer.resume import adapt
 from csplat_trainer.starting import StartingScene, scene_of, starting_splats
+from csplat_trainer.thinning import thin
 
 __all__ = ["train"]
 
@@ -141,6 +142,8 @@ class _Run:
             window.errors.append(value[1])
             if options.refines_after(step):
                 self._refine()
+            if options.thins_after(step):
+                self._thin()
             seconds = time.perf_counter() - begin
             if step % options.log_every == 0 or step == options.iterations:
                 left = seconds / (step - first) * (options.iterations - step)
@@ -224,6 +227,13 @@ class _Run:
             if options.strategy == "mcmc":
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
         self._engine.parameters = parameters
+
+    def _thin(self) -> None:
+        options, parameters = self._options, self._engine.parameters
+        thin(parameters, self._data.train, self._background, options.thinning, antialiased=options.antialiased)
+        self._engine.parameters = parameters
+        if self._engine.screen is not None:
+            self._engine.screen = ScreenGradients.none(len(parameters))
 
     def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
         mse = sum(window.errors) / len(window.errors)

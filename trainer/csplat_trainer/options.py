@@ -44,6 +44,8 @@ class TrainOptions:
         init: where splats start: at the data set's points, inside the visual hull of the alpha
             masks, anywhere in the scene's box, or (`auto`) the first of these that there is.
         initial_splats: how many there are at first; 0: the strategy decides.
+        final_share: of the splats, how many are left at the end: once they no longer move, those that pictures need
+            least go, a few at a time. 1: all stay.
         background: behind the splats, and behind pictures that have an alpha channel. `auto`: white
             if any has one, else black; `random`: another one at each step, judged in front of white.
         antialiased: train with the mip-splatting low-pass filter.
@@ -87,6 +89,7 @@ class TrainOptions:
     strategy: Strategy = "mcmc"
     init: Init = "auto"
     initial_splats: int = 0
+    final_share: float = 1.0
     background: Background = "auto"
     antialiased: bool = False
     loss: Loss = "inria"
@@ -146,6 +149,20 @@ class TrainOptions:
         due = iteration % self.refine_every == 0
         return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
 
+    def thins_after(self, iteration: int) -> bool:
+        """Whether splats go after a step, a share of `thinning` of which stays.
+
+        The last go where two fifths of the steps are left that follow the last move of splats.
+        """
+        every = max(1, int(_THINNED * (self.iterations - self.refine_end)) // _THINNINGS)
+        done, rest = divmod(iteration - self.refine_end, every)
+        return self.final_share < 1.0 and rest == 0 and 0 < done <= _THINNINGS
+
+    @property
+    def thinning(self) -> float:
+        """Share of the splats that stays each time that some go."""
+        return math.pow(self.final_share, 1.0 / _THINNINGS)
+
     def growth_from(self, count: int) -> float:
         """Factor by which a run that begins with so many splats grows each time."""
         if self.growth:
@@ -177,6 +194,8 @@ class TrainOptions:
 
 
 _GROWTH = 1.05  # of the paper
+_THINNINGS = 10  # times that splats go,
+_THINNED = 0.6  # in this share of the steps that follow the last move of splats
 _LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
 
 _CHOICES = {
@@ -193,6 +212,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "iterations": (1, 10**7),
     "seed": (0, 2**63 - 1),
     "initial_splats": (0, 2**25),
+    "final_share": (0, 1),
     "lpips_weight": (0, 100),
     "lr_means": (0, 1),
     "lr_means_final": (0, 1),

@@ -20,6 +20,7 @@ from csplat_tools.cli.options import (
     chosen,
     command,
 )
+from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Near, Views, Virtual
 from csplat_tools.files.convert import read_source
@@ -49,6 +50,10 @@ def finetune(
     keep: Annotated[
         float | None,
         typer.Option(metavar="SHARE", help="First leave only this share of the splats, those that pictures need most."),
+    ] = None,
+    target_size: Annotated[
+        str | None,
+        typer.Option(metavar="5MB", help="So many bytes at most: as many splats stay as there is room for."),
     ] = None,
     prune_unseen: Annotated[
         bool | None,
@@ -94,6 +99,7 @@ def finetune(
       csplat finetune scene.ply scene.csplat --data capture --preset small
       csplat finetune scene.ply scene.csplat --data capture --attribute-psnr 40 --report scene.json
       csplat finetune scene.ply scene.csplat --data capture --keep 0.5
+      csplat finetune scene.ply scene.csplat --data capture --target-size 2MB
       csplat finetune scene.ply scene.csplat --self
       csplat finetune scene.ply scene.csplat --data capture --checkpoint run.npz --resume run.npz
     """
@@ -108,6 +114,7 @@ def finetune(
         raise typer.BadParameter("wanted one of --data and --self")
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
+    size_bytes = parse_bytes(target_size)
     rates = {"byte_cost": tuning.BYTE_COST[itself], **settings.of(FinetuneOptions)}
     options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)
@@ -132,7 +139,8 @@ def finetune(
     around.read()
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,
-        prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance, quiet=out.quiet,
+        prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,
+        size_bytes=size_bytes, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report))
     out.publish(report)

@@ -10,7 +10,7 @@ import typer
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
-from csplat_tools.cli.parsing import parse_size
+from csplat_tools.cli.parsing import parse_bytes, parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.extras import need_trainer
@@ -22,11 +22,12 @@ from csplat_trainer.outputs import Outputs
 __all__ = ["train"]
 
 _DEFAULT = TrainOptions()
-_KEEP = 0.8  # of the splats: of those that training makes some are hardly seen
+_KEEP = 0.8  # of the splats, of a file: of those that training makes some are hardly seen
 
 
 @command(
     needs={"preview_every": ("previews",), "checkpoint_every": ("checkpoint",)},
+    one_of=(("keep", "target_size"),),
     settings=("csplat_trainer.options:TrainOptions",),
 )
 def train(
@@ -37,7 +38,12 @@ def train(
     upright: Upright,
     out: Output,
     settings: Settings,
-    max_splats: Annotated[int, typer.Option(metavar="N", help="No more splats than this.")] = _DEFAULT.max_splats,
+    max_splats: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="No more splats than this; by default 20,000, with a target as many as it has room for."
+        ),
+    ] = None,
     sh_degree: Annotated[
         int, typer.Option(metavar="0..3", help="How colour depends on direction.")
     ] = _DEFAULT.sh_degree,
@@ -51,6 +57,9 @@ def train(
         typer.Option(
             metavar="SHARE", help="Of the splats that are trained, how many OUT.csplat holds; by default 0.8."
         ),
+    ] = None,
+    target_size: Annotated[
+        str | None, typer.Option(metavar="1.4MB", help="OUT.csplat has so many bytes at most; not with --keep.")
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
@@ -95,40 +104,53 @@ def train(
     it and judge the scene alike; encode and decode keep it. Another says which
     way is up, by the kind of set or by how its cameras were held.
 
-    Into OUT.csplat goes what `csplat finetune --data DATA` makes of the scene:
-    splats that pictures hardly need are left out, and the values of the others
+    For OUT.csplat splats that pictures hardly need go while others still learn
+    to stand in for them. Then `csplat finetune --data DATA` follows: values
     move, seen through the encoder's quantisers, until the photographs look
     right. Photographs that a set names for validation, or some that teach, say
-    which step was best. --checkpoint and --resume cover both.
+    which step was best. With --target-size bytes cost as much in the loss as
+    keeps the file to it. --checkpoint and --resume cover both: from one
+    training files of several sizes can be made.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000
       csplat train lego -o lego.ply --size 200x200 --report lego.json
-      csplat train lego -o lego.csplat --max-splats 60000
+      csplat train lego -o lego.csplat --target-size 800KB
     ---
     More examples:
       csplat train lego -o lego.ply --plot loss.png --previews pictures
       csplat train lego -o lego.ply --set strategy=gradient,loss=l1
       csplat train capture -o scene.ply --set lr_exposure=0.01  # photographs differ in brightness
+      csplat train lego -o lego.csplat --max-splats 120000 --keep 0.8 --iterations 7000
+      csplat train lego -o smaller.csplat --max-splats 120000 --resume run.npz --target-size 500KB
       csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
     need_trainer(plots=plot is not None)
     from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
     from csplat_tools.training.report import format_report
-    from csplat_tools.training.train import run_training, run_training_to_file, tuning_checkpoint
+    from csplat_tools.training.train import SPLAT_BYTES, run_training, run_training_to_file, tuning_checkpoint
+    from csplat_trainer.checkpoint import load_checkpoint
     from csplat_trainer.tuning.options import FinetuneOptions
 
-    options = chosen(
-        TrainOptions, max_splats=max_splats, sh_degree=sh_degree, iterations=iterations, seed=seed, device=device,
-        background=background, antialiased=antialiased, **settings.of(TrainOptions),
-    )  # fmt: skip
-    again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
-    to_file = Path(output).suffix == ".csplat"
-    if not to_file and (preset is not None or keep is not None):
-        raise typer.BadParameter("--preset and --keep are about a file: wanted OUT.csplat")
+    to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
+    if not to_file and (preset is not None or keep is not None or size_bytes is not None):
+        raise typer.BadParameter("--preset, --keep and --target-size are about a file: wanted OUT.csplat")
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
+    share = 1.0 if not to_file else _KEEP if keep is None else keep
+    if size_bytes is not None:
+        left = max(1, size_bytes // SPLAT_BYTES)
+        if max_splats is None and resume is not None:
+            max_splats = int(load_checkpoint(resume).options["max_splats"])
+        max_splats = max_splats or round(left / _KEEP)
+        share = min(1.0, left / max_splats)
+    options = chosen(
+        TrainOptions, max_splats=max_splats or TrainOptions.max_splats, sh_degree=sh_degree, iterations=iterations,
+        seed=seed, device=device, background=background, antialiased=antialiased,
+        **{"final_share": share, **settings.of(TrainOptions)},
+    )  # fmt: skip
+    again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None else None
     out.check(
         output, inputs=(source, resume, lpips_weights),
@@ -150,8 +172,7 @@ def train(
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
     tuning = FinetuneOptions(seed=seed, byte_cost=BYTE_COST[False], lr_exposure=options.lr_exposure)
     report = run_training_to_file(
-        data, output, options, files, encoding, tuning, keep=_KEEP if keep is None else keep, facts=facts, plot=plot,
-        quiet=out.quiet,
+        data, output, options, files, encoding, tuning, size_bytes=size_bytes, facts=facts, plot=plot, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report["file"]))
     out.publish(report)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Origin
+from csplat.encoder import PRESETS, EncodeOptions, Origin, encode_with_report
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
 from csplat_tools.files.console import Progress, progress_bar, step_progress
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import write_array, write_bytes
+from csplat_tools.optimise.exchange import BYTES_PER_DB
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.views import ViewSet
@@ -48,6 +51,11 @@ SHAPE_ENTRIES = 4096
 #: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
+_TUNED = 0.96  # of the bytes before tuning are left after it, where nothing presses for more,
+_WITHIN = 1.08  # and more or less by so much is what the cost of bytes in the loss brings about
+_TRIES = 3  # counts of splats, each from what the last one took
+_FINEST = 70.0  # dB of an attribute: renders are as good as the scene's
+
 _RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
 _MOST_ASIDE = 16  # but no more than these
 
@@ -72,6 +80,7 @@ def run_finetuning(
     options: FinetuneOptions,
     files: Outputs,
     *,
+    size_bytes: int | None = None,
     keep: float | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
@@ -88,6 +97,7 @@ def run_finetuning(
         encoding: of the encoder.
         options: of the tuning.
         files: checkpoints.
+        size_bytes: as for `choose_and_finetune`.
         keep, prune_unseen, importance: as for `choose_splats`.
         source_index: a .npy file to write: which splat of the scene each splat of the file is.
         lpips: computes it, if wanted.
@@ -105,8 +115,8 @@ def run_finetuning(
         prepare_renderer(quiet=quiet, gradients=True)
         with progress_bar(quiet=quiet) as progress, step_progress("tuning", _state, quiet=quiet) as show:
             tuned = choose_and_finetune(
-                source, views, encoding, options, files=files, keep=keep, prune_unseen=prune_unseen,
-                importance=importance, progress=progress, on_step=show,
+                source, views, encoding, options, size_bytes=size_bytes, files=files, keep=keep,
+                prune_unseen=prune_unseen, importance=importance, progress=progress, on_step=show,
             )  # fmt: skip
         made, clock = tuned.made, Clock(tuned.seconds)
         write_bytes(output, made.data)
@@ -139,6 +149,7 @@ def choose_and_finetune(
     encoding: EncodeOptions,
     options: FinetuneOptions,
     *,
+    size_bytes: int | None = None,
     files: Outputs | None = None,
     keep: float | None = None,
     prune_unseen: bool | None = None,
@@ -153,25 +164,72 @@ def choose_and_finetune(
         views: what the file is to look like.
         encoding: of the encoder.
         options: of the tuning.
+        size_bytes: of the file, at most: so many splats stay as it has room for, and the tuning keeps to it.
         files: checkpoints.
-        keep, prune_unseen, importance: as for `choose_splats`.
+        keep, prune_unseen, importance: as for `choose_splats`; of `keep` at most stays.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
+        InputError: no file of the scene is as small.
         CsplatError: as `choose_splats` and `csplat_trainer.finetune`.
     """
     clock = Clock()
-    with clock.stage("choosing"):
-        looked = training_views(source, views, encoding.threads)
-        chosen = choose_splats(
-            source, views, keep=keep, prune_unseen=prune_unseen, importance=importance, threads=encoding.threads,
+
+    def choose(share: float | None) -> Chosen:
+        return choose_splats(
+            source, views, keep=share, prune_unseen=prune_unseen, importance=importance, threads=encoding.threads,
             progress=progress,
         )  # fmt: skip
-    made = csplat_trainer.finetune(
-        chosen.model, looked, encoding, options, importance=chosen.importance, source=source,
-        origin=Origin(len(source), chosen.rows), said=chosen.said, outputs=files, progress=progress, on_step=on_step,
-    )  # fmt: skip
-    return TunedChoice(chosen, made, {**clock.seconds, **made.seconds})
+
+    with clock.stage("choosing"):
+        looked = training_views(source, views, encoding.threads)
+        chosen = choose(keep)
+        if size_bytes is not None:
+            chosen, encoding = _fitting(
+                chosen, encoding, size_bytes, lambda count: choose(count / len(source)), progress
+            )
+    outputs, tries = files or Outputs(), _TRIES
+    while True:
+        made = csplat_trainer.finetune(
+            chosen.model, looked, encoding, options, size_bytes=size_bytes, importance=chosen.importance,
+            source=source, origin=Origin(len(source), chosen.rows), said=chosen.said, outputs=outputs,
+            progress=progress, on_step=on_step,
+        )  # fmt: skip
+        if size_bytes is None or len(made.data) <= size_bytes:
+            return TunedChoice(chosen, made, {**clock.seconds, **made.seconds})
+        tries -= 1
+        if not tries:
+            raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
+        outputs = replace(outputs, resume=None)  # of the tuning of more splats
+        share = (size_bytes / len(made.data)) ** 2 / _WITHIN  # a part of the bytes does not depend on the count
+        chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
+
+
+def _fitting(
+    chosen: Chosen,
+    encoding: EncodeOptions,
+    size_bytes: int,
+    choose: Callable[[int], Chosen],
+    progress: Progress | None,
+) -> tuple[Chosen, EncodeOptions]:
+    """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
+
+    def room() -> float:
+        made = encode_with_report(chosen.model, encoding, importance=chosen.importance, progress=progress)
+        return size_bytes / (_TUNED * len(made.data))
+
+    for _ in range(_TRIES):
+        share = room()
+        if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
+            break
+        chosen = choose(max(1, round(share * len(chosen.model))))
+    else:
+        share = room()
+    if share > _WITHIN and encoding.attribute_psnr is None:
+        finer = math.log(share) / BYTES_PER_DB
+        usual = PRESETS[encoding.preset].quality[0 if chosen.model.sh_degree else 1]
+        encoding = replace(encoding, attribute_psnr=min(usual + finer, _FINEST))
+    return chosen, encoding
 
 
 def _state(now: TuningStep) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,11 @@ from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = ["run_training", "run_training_to_file", "tuning_checkpoint"]
+__all__ = ["SPLAT_BYTES", "run_training", "run_training_to_file", "tuning_checkpoint"]
+
+
+#: Of a splat in a tuned file, about, with all bands and the preset small: 7.6 of Lego at 800x800, 10 of few splats.
+SPLAT_BYTES = 8
 
 
 def run_training(
@@ -73,7 +78,7 @@ def run_training_to_file(
     encoding: EncodeOptions,
     tuning: FinetuneOptions,
     *,
-    keep: float,
+    size_bytes: int | None = None,
     facts: SceneOverrides | None = None,
     plot: str | None = None,
     quiet: bool = False,
@@ -87,7 +92,7 @@ def run_training_to_file(
             goes on from them where the training had ended.
         encoding: of the encoder; its threads hold for all.
         tuning: of the tuning.
-        keep: share of the splats that the file holds.
+        size_bytes: of the file, at most.
 
     Returns:
         `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
@@ -102,7 +107,7 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    report = run_finetuning(model, views, output, encoding, tuning, further, keep=keep, quiet=quiet)
+    report = run_finetuning(model, views, output, encoding, tuning, further, size_bytes=size_bytes, quiet=quiet)
     return {"training": result.log, "file": report}
 
 
@@ -112,13 +117,18 @@ def tuning_checkpoint(path: str | Path) -> Path:
 
 
 def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
-    """Checkpoints of the tuning: to go on from only where the training, whose scene it tunes, had ended."""
+    """Checkpoints of the tuning.
+
+    It goes on from its own where the run goes on, and the training, whose scene it tunes, had ended. A run that leaves
+    the checkpoint as it is makes another file of the training.
+    """
     checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
-    resume = None if files.resume is None else tuning_checkpoint(files.resume)
-    if files.resume is None or resume is None or not resume.exists():
-        return Outputs(checkpoint, files.checkpoint_every)
+    tuned = Outputs(checkpoint, files.checkpoint_every)
+    if files.resume is None or checkpoint is None or not checkpoint.exists():
+        return tuned
+    same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
     ended = load_checkpoint(files.resume).iteration >= options.iterations
-    return Outputs(checkpoint, files.checkpoint_every, resume=resume if ended else None)
+    return replace(tuned, resume=checkpoint) if same and ended else tuned
 
 
 def _trained(

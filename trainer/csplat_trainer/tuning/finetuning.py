@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.decoder import decode
 from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Importance, Origin
+from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.training import TrainedOn
 from csplat_render.cameras import relative_to
@@ -73,6 +74,7 @@ def finetune(
     encoding: EncodeOptions | None = None,
     options: FinetuneOptions | None = None,
     *,
+    size_bytes: int | None = None,
     importance: NDArray[Any] | Importance | None = None,
     source: SplatModel | None = None,
     origin: Origin | None = None,
@@ -91,6 +93,7 @@ def finetune(
             that it trains on, in front of what the scene says was behind it.
         encoding: of the encoder; its threads hold for all.
         options: of the tuning.
+        size_bytes: of the file, at most, as far as the cost of bytes can bring it there; as of `tune`.
         importance: how much splats matter, as for the encoder; `None`: measured in the views that teach.
         source: the scene that the splats were chosen of, where they are not all, and `origin` which of it they are.
         origin: as of the encoder.
@@ -107,7 +110,8 @@ def finetune(
         True
 
     Raises:
-        InputError: no view shows a splat, an option does not suit the scene, or a checkpoint is of another run.
+        InputError: no view shows a splat, the size has no room for one, an option does not suit the scene, or a
+            checkpoint is of another run.
         RuntimeError: the file is not what was tuned: a fault of csplat.
     """
     check_model("finetune", model)
@@ -119,7 +123,17 @@ def finetune(
     with clock.stage("encoding"):
         draft = Draft.of(model, encoding, importance=importance, origin=origin, graded=False, progress=progress)
         frozen = draft.frozen(source or model, progress)
-        plain = frozen.coded(frozen.start()).write()
+        coded = frozen.coded(frozen.start())
+        plain = coded.write()
+
+    def told(steps: int) -> dict[str, Any]:
+        """What the file says of its tuning; `simplified_from` says the first, where splats were taken away."""
+        return {"finetuned": {"simplified": {}, "views": len(views.train), "steps": steps, **(said or {})}}
+
+    if size_bytes is not None:
+        size_bytes -= len(coded.write(told(options.iterations)).data) - len(plain.data)
+        if size_bytes < 1:
+            raise InputError("the size that is wanted has no room for what the file says of itself")
 
     def show(now: TuningStep) -> None:
         if progress is not None:
@@ -130,17 +144,11 @@ def finetune(
     files = outputs or Outputs()
     with clock.stage("tuning"):
         tuned = tune(
-            frozen, views, options, progress=show, checkpoint=files.checkpoint,
+            frozen, views, options, size_bytes=size_bytes, progress=show, checkpoint=files.checkpoint,
             checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
         )  # fmt: skip
     with clock.stage("encoding"):
-        facts = {
-            "simplified": {},  # `simplified_from` says it, where splats were taken away
-            "views": len(views.train),
-            "steps": tuned.log["best_iteration"],
-            **(said or {}),
-        }
-        result = frozen.coded(tuned.held).write({"finetuned": facts})
+        result = frozen.coded(tuned.held).write(told(tuned.log["best_iteration"]))
         decoded = decode(result.data)
     _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
     return Finetuned(result, decoded, plain, tuned.log, clock.seconds)

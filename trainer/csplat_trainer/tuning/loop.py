@@ -20,6 +20,7 @@ from csplat_render.rasterise import Rasteriser, Splats
 from csplat_trainer.exposure import Exposure, Exposures
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
+from csplat_trainer.tuning.budget import Budget
 from csplat_trainer.tuning.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
 from csplat_trainer.tuning.options import FinetuneOptions
 from csplat_trainer.tuning.rate import Costs
@@ -73,6 +74,7 @@ def tune(
     views: Views,
     options: FinetuneOptions | None = None,
     *,
+    size_bytes: int | None = None,
     progress: Callable[[TuningStep], None] | None = None,
     checkpoint: str | Path | None = None,
     checkpoint_every: int = 0,
@@ -87,6 +89,8 @@ def tune(
         frozen: what the encoder decided.
         views: what the file is to look like.
         options: how.
+        size_bytes: of the file, at most: bytes then cost as much as keeps to it, in place of `byte_cost`, with which
+            the run begins.
         progress: is told every `log_every` steps.
         checkpoint: where checkpoints go, each in the place of the last; `None`: nowhere.
         checkpoint_every: steps from one to the next; 0: at the end alone.
@@ -96,7 +100,7 @@ def tune(
     Raises:
         InputError: a checkpoint is none, or of another scene, views or options; or a loss or a value is not finite.
     """
-    run = _Run(frozen, views, options or FinetuneOptions(), threads)
+    run = _Run(frozen, views, options or FinetuneOptions(), threads, size_bytes)
     if resume is not None:
         run.go_on(load_finetune(resume, frozen))
     return run.to_the_end(progress, checkpoint, checkpoint_every)
@@ -124,7 +128,9 @@ class _Buffers:
 class _Run:
     """A run: the scene, the renderer, the random numbers, the log."""
 
-    def __init__(self, frozen: Frozen, views: Views, options: FinetuneOptions, threads: int | None) -> None:
+    def __init__(
+        self, frozen: Frozen, views: Views, options: FinetuneOptions, threads: int | None, size_bytes: int | None
+    ) -> None:
         self._views, self._options = views, options
         self._scene = TunedScene(frozen)
         self._rasteriser = Rasteriser(threads=threads)
@@ -138,6 +144,7 @@ class _Run:
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _Best | None = None
         self._costs: Costs | None = None
+        self._budget = None if size_bytes is None else Budget(size_bytes, options.byte_cost)
 
     def go_on(self, checkpoint: FinetuneCheckpoint) -> None:
         """Take up what a checkpoint holds.
@@ -147,6 +154,9 @@ class _Run:
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
+        wanted = None if self._budget is None else self._budget.size_bytes
+        if checkpoint.log.get("budget", {}).get("size_bytes") != wanted:
+            raise InputError("the checkpoint is of a run with another target")
         before = {**asdict(FinetuneOptions()), **checkpoint.options}  # an older one does not name all of them
         for name, value in asdict(self._options).items():
             if name != "iterations" and before[name] != value:
@@ -158,8 +168,10 @@ class _Run:
         self._log = checkpoint.log
         self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
         self._best = _Best(checkpoint.best_held, *checkpoint.best)
+        if self._budget is not None:
+            self._budget = Budget(**self._log["budget"])
         if checkpoint.costs:
-            self._costs = Costs(self._scene.frozen, self._options.byte_cost, checkpoint.costs)
+            self._costs = Costs(self._scene.frozen, self._byte_cost, checkpoint.costs)
 
     def to_the_end(
         self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
@@ -202,8 +214,10 @@ class _Run:
         number = self._queue.pop()
         view = self._views.train[number]
         seen, alphas = self._scene.seen()
-        if self._options.byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
-            self._costs = self._scene.count(seen, self._options.byte_cost)
+        if self._byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
+            self._costs = self._scene.count(seen, self._byte_cost)
+            if self._budget is not None:
+                self._budget.weigh(self._costs.bits, (self._iteration - 1) / self._options.iterations)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
         rate = self._options.lr_exposure * self._options.share(self._iteration)
@@ -219,6 +233,11 @@ class _Run:
         self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._costs)
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss
+
+    @property
+    def _byte_cost(self) -> float:
+        """What a bit per splat costs at present, in loss."""
+        return self._options.byte_cost if self._budget is None else self._budget.byte_cost
 
     def _rates(self) -> dict[str, float]:
         options = self._options
@@ -254,10 +273,20 @@ class _Run:
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
-        score, psnr = loss + costs.loss, psnr_of_mse(error / count)
-        self._log["looks"].append(
-            {"iteration": self._iteration, "loss": loss, "psnr": psnr, "bits_per_splat": costs.bits / len(seen.means)}
-        )
+        psnr = psnr_of_mse(error / count)
+        look = {
+            "iteration": self._iteration,
+            "loss": loss,
+            "psnr": psnr,
+            "bits_per_splat": costs.bits / len(seen.means),
+        }
+        if self._budget is None:
+            score = loss + costs.loss
+        else:
+            size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
+            look |= {"size_bytes": size_bytes}
+            score = loss + self._budget.overdrawn(size_bytes, costs.bits)
+        self._log["looks"].append(look)
         if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
             self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
         elif self._options.has_calmed(self._iteration):
@@ -286,6 +315,8 @@ class _Run:
         assert self._best is not None
         if self._options.lr_exposure:
             self._log["exposures"] = self._exposures.as_json()
+        if self._budget is not None:
+            self._log["budget"] = asdict(self._budget)
         best = (self._best.score, self._best.psnr, self._best.iteration, self._best.since)
         save_finetune(
             path,
@@ -312,6 +343,7 @@ class _Run:
             "kept_aside": self._views.kept_aside,
             "steps": self._iteration,
             "settled": self._settled,
+            "byte_cost": self._byte_cost,
             "start_psnr": self._log["looks"][0]["psnr"],
             "best_psnr": self._best.psnr,
             "best_iteration": self._best.iteration,

@@ -1,0 +1,44 @@
+"""Fewer splats, a little at a time: those that pictures need least go, and the others learn to stand in for them.
+
+A splat's worth is the exact squared change of the pictures if it alone were not there. Splats that share a place are
+each needed little, and together much: so few go at once, and what is left is trained on before it is measured anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat_render.removal import measure_removal
+from csplat_trainer.parameters import Parameters, to_model
+from csplat_trainer.pictures import Picture
+
+__all__ = ["thin"]
+
+_VIEWS = 32  # at most, spread over all, that say what splats are worth
+
+
+def thin(
+    parameters: Parameters,
+    pictures: Sequence[Picture],
+    background: NDArray[np.float32],
+    share: float,
+    *,
+    antialiased: bool,
+) -> None:
+    """Remove the splats that pictures need least.
+
+    Args:
+        parameters: changed in place.
+        pictures: those that are trained on.
+        background: [3], behind the splats.
+        share: of the splats, how many stay, rounded; one at least.
+        antialiased: as the scene is trained.
+    """
+    views = pictures[:: -(-len(pictures) // _VIEWS)]
+    model = to_model(parameters.values, antialiased=antialiased)
+    found = measure_removal(model, [one.camera for one in views], background=background, bands=False)
+    left = max(1, round(share * len(parameters)))
+    parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:left]))

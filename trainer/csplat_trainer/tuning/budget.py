@@ -1,0 +1,53 @@
+"""A file that is to have a size: what its bytes cost in the loss follows from how many they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+__all__ = ["Budget"]
+
+_REACHED = 0.6  # share of the steps after which the size is to stand: later ones hardly move a value
+_BELOW = 0.002  # of the size that is left free: counts come every few steps, and files grow between them
+_GAIN, _FASTEST = 20.0, 0.5  # of the logarithm of the cost: per share of bits too many, and at most, at each count
+_COSTS = (1e-7, 1e-2)
+
+
+@dataclass
+class Budget:
+    """Bytes that a file may have, and what they cost at present so that it does.
+
+    Attributes:
+        size_bytes: at most.
+        byte_cost: what a bit per splat costs in the loss at present.
+        first_bits: of the integers where the run began; 0: not known yet.
+        goal_bits: of the integers of a file of that size, by the last file that was made.
+    """
+
+    size_bytes: int
+    byte_cost: float
+    first_bits: float = 0.0
+    goal_bits: float = 0.0
+
+    def overdrawn(self, size_bytes: int, bits: float) -> float:
+        """What a file that is too large adds to its loss; its size says how many bits its integers may have.
+
+        Args:
+            size_bytes: of the file.
+            bits: of its integers, by their order-0 entropy.
+        """
+        allowed = (1.0 - _BELOW) * self.size_bytes
+        self.first_bits = self.first_bits or bits
+        self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), 0.1 * bits)
+        return max(0.0, size_bytes / self.size_bytes - 1.0)
+
+    def weigh(self, bits: float, done: float) -> None:
+        """Make bytes dearer or cheaper, by how many bits there are and how many should be left.
+
+        Args:
+            bits: of the integers at present.
+            done: share of the steps.
+        """
+        wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _REACHED)
+        by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_FASTEST), _FASTEST)
+        self.byte_cost = min(max(self.byte_cost * math.exp(by), _COSTS[0]), _COSTS[1])
