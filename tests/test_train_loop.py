@@ -289,8 +289,11 @@ def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tm
     call(*words, "-o", tmp_path / "a.csplat", "--checkpoint", run)
     size = (tmp_path / "a.csplat").stat().st_size
     trained = run.read_bytes()
-    call(*words[:2], *QUICK_WORDS[2:], "-o", tmp_path / "b.csplat", "--resume", run, "--target-size", f"{size - 30}B")
+    call(*words, "-o", tmp_path / "b.csplat", "--resume", run, "--target-size", f"{size - 30}B")
     assert (tmp_path / "b.csplat").stat().st_size <= size - 30
+    call(*words, "-o", tmp_path / "c.csplat", "--resume", run, "--keep", 0.4)
+    trained_with = len(decode((tmp_path / "a.csplat").read_bytes()))
+    assert trained_with / 2 == pytest.approx(len(decode((tmp_path / "c.csplat").read_bytes())), abs=2)
     assert trained == run.read_bytes()
 
 

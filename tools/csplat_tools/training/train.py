@@ -28,7 +28,6 @@ from csplat_trainer.tuning import FinetuneOptions
 
 __all__ = ["SPLAT_BYTES", "run_training", "run_training_to_file", "tuning_checkpoint"]
 
-
 #: Of a splat in a tuned file, about, with all bands and the preset small: 7.6 of Lego at 800x800, 10 of few splats.
 SPLAT_BYTES = 8
 
@@ -107,7 +106,10 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    report = run_finetuning(model, views, output, encoding, tuning, further, size_bytes=size_bytes, quiet=quiet)
+    keep = _left_to_keep(files, options) if size_bytes is None else None
+    report = run_finetuning(
+        model, views, output, encoding, tuning, further, size_bytes=size_bytes, keep=keep, quiet=quiet
+    )
     return {"training": result.log, "file": report}
 
 
@@ -129,6 +131,15 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
     ended = load_checkpoint(files.resume).iteration >= options.iterations
     return replace(tuned, resume=checkpoint) if same and ended else tuned
+
+
+def _left_to_keep(files: Outputs, options: TrainOptions) -> float | None:
+    """Share of the splats that is still to stay, where a training had ended that left more of them than are wanted."""
+    stored = None if files.resume is None else load_checkpoint(files.resume)
+    if stored is None or stored.iteration < options.iterations:
+        return None
+    share = options.final_share / stored.options.get("final_share", 1.0)  # earlier ones left all
+    return share if share < 1.0 else None
 
 
 def _trained(
