@@ -212,7 +212,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "iterations": (1, 10**7),
     "seed": (0, 2**63 - 1),
     "initial_splats": (0, 2**25),
-    "final_share": (0, 1),
+    "final_share": (1e-6, 1),
     "lpips_weight": (0, 100),
     "lr_means": (0, 1),
     "lr_means_final": (0, 1),

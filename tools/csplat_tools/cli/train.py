@@ -142,7 +142,7 @@ def train(
     if size_bytes is not None:
         left = max(1, size_bytes // SPLAT_BYTES)
         if max_splats is None and resume is not None:
-            max_splats = int(load_checkpoint(resume).options["max_splats"])
+            max_splats = load_checkpoint(resume).options.get("max_splats")
         max_splats = max_splats or round(left / _KEEP)
         share = min(1.0, left / max_splats)
     options = chosen(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions, Origin, encode_with_report
+from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.jit import thread_count
@@ -202,7 +202,8 @@ def choose_and_finetune(
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
         outputs = replace(outputs, resume=None)  # of the tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _WITHIN  # a part of the bytes does not depend on the count
-        chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
+        with clock.stage("choosing"):
+            chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
 
 def _fitting(
@@ -215,8 +216,8 @@ def _fitting(
     """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
     def room() -> float:
-        made = encode_with_report(chosen.model, encoding, importance=chosen.importance, progress=progress)
-        return size_bytes / (_TUNED * len(made.data))
+        draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
+        return size_bytes / (_TUNED * len(draft.coded(progress).write().data))
 
     for _ in range(_TRIES):
         share = room()

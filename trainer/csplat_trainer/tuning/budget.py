@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 __all__ = ["Budget"]
 
@@ -28,6 +29,15 @@ class Budget:
     byte_cost: float
     first_bits: float = 0.0
     goal_bits: float = 0.0
+
+    @classmethod
+    def of(cls, stored: Any) -> Budget | None:
+        """The budget of a checkpoint; `None` where it holds none, or not all of its numbers."""
+        names = {one.name for one in fields(cls)}
+        if not isinstance(stored, dict) or stored.keys() != names:
+            return None
+        numbers = all(isinstance(one, (int, float)) and math.isfinite(one) for one in stored.values())
+        return cls(**stored) if numbers else None
 
     def overdrawn(self, size_bytes: int, bits: float) -> float:
         """What a file that is too large adds to its loss; its size says how many bits its integers may have.

@@ -154,8 +154,8 @@ class _Run:
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
-        wanted = None if self._budget is None else self._budget.size_bytes
-        if checkpoint.log.get("budget", {}).get("size_bytes") != wanted:
+        budget = Budget.of(checkpoint.log.get("budget"))
+        if (budget and budget.size_bytes) != (self._budget and self._budget.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
         before = {**asdict(FinetuneOptions()), **checkpoint.options}  # an older one does not name all of them
         for name, value in asdict(self._options).items():
@@ -168,8 +168,7 @@ class _Run:
         self._log = checkpoint.log
         self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
         self._best = _Best(checkpoint.best_held, *checkpoint.best)
-        if self._budget is not None:
-            self._budget = Budget(**self._log["budget"])
+        self._budget = budget
         if checkpoint.costs:
             self._costs = Costs(self._scene.frozen, self._byte_cost, checkpoint.costs)
 
