@@ -16,12 +16,14 @@ from csplat_render.camera import Camera
 from csplat_render.cameras import intrinsics, orbit
 from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
+from csplat_tools.training.train import tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.pictures import Picture
 from csplat_trainer.starting import scene_of, starting_splats
+from csplat_trainer.tuning import FinetuneOptions
 
 SIZE = 48
 QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
@@ -82,6 +84,16 @@ def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, ma
     assert counts[1] == counts[2] == len(whole.model)
     assert len(train(data, replace(options, final_share=1.0)).model) / 2 == pytest.approx(counts[2], abs=3)
     resumed_as_if_never_stopped(data, options, tmp_path)
+
+
+@pytest.mark.parametrize("steps", [38, 42, 60])  # while splats would go, after that, at the end
+def test_a_run_that_goes_on_late_ends_with_the_share_that_is_wanted(make_data, make_model, tmp_path, steps):
+    data = make_data(make_model)
+    trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
+    whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
+    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.25)
+    left = train(data, options, outputs=Outputs(resume=tmp_path / "trunk.npz"))
+    assert 0.25 * len(whole.model) == pytest.approx(len(left.model), abs=3)
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
@@ -281,6 +293,13 @@ def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, ma
     # Trained further it is another scene, for which the tuning that there was says nothing.
     call(*words, "-o", tmp_path / "c.csplat", *files, "--resume", tmp_path / "run.npz", "--iterations", 40)
     assert (tmp_path / "a.csplat").read_bytes() != (tmp_path / "c.csplat").read_bytes()
+
+
+def test_what_was_trained_for_longer_is_tuned_for_longer_and_in_smaller_steps():
+    brief, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
+    assert FinetuneOptions(lr_exposure=0.01) == brief
+    assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
+    assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
 
 
 def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tmp_path):

@@ -206,10 +206,12 @@ def test_sh_degrees_come_one_after_the_other():
 
 def test_splats_go_a_few_at_a_time_and_the_last_long_before_the_end():
     options = TrainOptions(max_splats=1000, final_share=0.4, iterations=1000, refine_stop=0.6)
-    steps = [step for step in range(1, 1001) if options.thins_after(step)]
-    assert [*range(624, 841, 24)] == steps  # 600 is the last step at which splats move
-    assert 0.4 == pytest.approx(options.thinning ** len(steps))
-    assert not any(TrainOptions(iterations=1000).thins_after(step) for step in range(1, 1001))
+    left = {step: options.thinnings_left(step) for step in range(1, 1001) if options.thinnings_left(step)}
+    assert dict(zip(range(624, 841, 24), range(10, 0, -1), strict=True)) == left  # 600 is the last at which splats move
+    for stop, last in ((0.5, 8), (0.8, 9), (1.0, 10)):  # few steps: fewer times
+        short = TrainOptions(final_share=0.4, iterations=10, refine_stop=stop)
+        assert [last] == [step for step in range(11) if short.thinnings_left(step) == 1]
+    assert not any(TrainOptions(iterations=1000).thinnings_left(step) for step in range(1, 1001))
 
 
 def test_those_go_that_pictures_need_least(make_model):
@@ -219,8 +221,6 @@ def test_those_go_that_pictures_need_least(make_model):
     values["logits"][5:15] = -7.0
     parameters = Parameters.starting_at(values)
     parameters.second["means"][:] = np.arange(40, dtype=np.float32)[:, None]
-    thin(parameters, pictures, np.ones(3, np.float32), 0.75, antialiased=False)
+    thin(parameters, pictures, np.ones(3, np.float32), 30, antialiased=False)
     wanted = [*range(5), *range(15, 40)]
     assert wanted == parameters.second["means"][:, 0].tolist()
-    thin(parameters, pictures, np.ones(3, np.float32), 0.01, antialiased=False)
-    assert 1 == len(parameters)

@@ -133,6 +133,8 @@ class _Run:
         window = _Window()
         spent = float(self._log["seconds"])  # by what was resumed
         begin, first = time.perf_counter(), self._iteration
+        if first and not any(map(options.thinnings_left, range(first + 1, options.iterations + 1))):
+            self._thin(1)
         while self._iteration < options.iterations:
             self._iteration += 1
             step = self._iteration
@@ -142,8 +144,8 @@ class _Run:
             window.errors.append(value[1])
             if options.refines_after(step):
                 self._refine()
-            if options.thins_after(step):
-                self._thin()
+            if times := options.thinnings_left(step):
+                self._thin(times)
             seconds = time.perf_counter() - begin
             if step % options.log_every == 0 or step == options.iterations:
                 left = seconds / (step - first) * (options.iterations - step)
@@ -228,9 +230,17 @@ class _Run:
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
         self._engine.parameters = parameters
 
-    def _thin(self) -> None:
+    def _thin(self, times: int) -> None:
+        """Have splats go, so that as many such times leave the share of them that is wanted."""
         options, parameters = self._options, self._engine.parameters
-        thin(parameters, self._data.train, self._background, options.thinning, antialiased=options.antialiased)
+        if options.final_share == 1.0:
+            return
+        wanted = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
+        count = len(parameters) * math.pow(wanted / len(parameters), 1.0 / times) if times > 1 else wanted
+        left = max(1, round(count))
+        if left >= len(parameters):
+            return
+        thin(parameters, self._data.train, self._background, left, antialiased=options.antialiased)
         self._engine.parameters = parameters
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))

@@ -149,19 +149,16 @@ class TrainOptions:
         due = iteration % self.refine_every == 0
         return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
 
-    def thins_after(self, iteration: int) -> bool:
-        """Whether splats go after a step, a share of `thinning` of which stays.
+    def thinnings_left(self, iteration: int) -> int:
+        """How many times splats still go, the one after this step included; 0 where none go after it.
 
         The last go where two fifths of the steps are left that follow the last move of splats.
         """
-        every = max(1, int(_THINNED * (self.iterations - self.refine_end)) // _THINNINGS)
-        done, rest = divmod(iteration - self.refine_end, every)
-        return self.final_share < 1.0 and rest == 0 and 0 < done <= _THINNINGS
-
-    @property
-    def thinning(self) -> float:
-        """Share of the splats that stays each time that some go."""
-        return math.pow(self.final_share, 1.0 / _THINNINGS)
+        begin = min(self.refine_end, self.iterations - 1)
+        steps = max(1, int(_THINNED * (self.iterations - begin)))
+        times = min(_THINNINGS, steps)
+        done, rest = divmod(iteration - begin, steps // times)
+        return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
 
     def growth_from(self, count: int) -> float:
         """Factor by which a run that begins with so many splats grows each time."""
@@ -194,7 +191,7 @@ class TrainOptions:
 
 
 _GROWTH = 1.05  # of the paper
-_THINNINGS = 10  # times that splats go,
+_THINNINGS = 10  # times at most that splats go,
 _THINNED = 0.6  # in this share of the steps that follow the last move of splats
 _LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
 

@@ -24,7 +24,7 @@ def thin(
     parameters: Parameters,
     pictures: Sequence[Picture],
     background: NDArray[np.float32],
-    share: float,
+    count: int,
     *,
     antialiased: bool,
 ) -> None:
@@ -34,11 +34,10 @@ def thin(
         parameters: changed in place.
         pictures: those that are trained on.
         background: [3], behind the splats.
-        share: of the splats, how many stay, rounded; one at least.
+        count: how many stay.
         antialiased: as the scene is trained.
     """
     views = pictures[:: -(-len(pictures) // _VIEWS)]
     model = to_model(parameters.values, antialiased=antialiased)
     found = measure_removal(model, [one.camera for one in views], background=background, bands=False)
-    left = max(1, round(share * len(parameters)))
-    parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:left]))
+    parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:count]))

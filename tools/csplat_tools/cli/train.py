@@ -127,11 +127,16 @@ def train(
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
     need_trainer(plots=plot is not None)
-    from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
+    from csplat_tools.training.finetune import SHAPE_ENTRIES
     from csplat_tools.training.report import format_report
-    from csplat_tools.training.train import SPLAT_BYTES, run_training, run_training_to_file, tuning_checkpoint
+    from csplat_tools.training.train import (
+        SPLAT_BYTES,
+        run_training,
+        run_training_to_file,
+        tuning_after,
+        tuning_checkpoint,
+    )
     from csplat_trainer.checkpoint import load_checkpoint
-    from csplat_trainer.tuning.options import FinetuneOptions
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
     if not to_file and (preset is not None or keep is not None or size_bytes is not None):
@@ -170,9 +175,9 @@ def train(
         )
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
-    tuning = FinetuneOptions(seed=seed, byte_cost=BYTE_COST[False], lr_exposure=options.lr_exposure)
     report = run_training_to_file(
-        data, output, options, files, encoding, tuning, size_bytes=size_bytes, facts=facts, plot=plot, quiet=out.quiet,
+        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, facts=facts, plot=plot,
+        quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report["file"]))
     out.publish(report)

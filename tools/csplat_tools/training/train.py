@@ -16,7 +16,7 @@ from csplat_tools.files.console import note, step_progress
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import write_model
-from csplat_tools.training.finetune import run_finetuning, usually_aside
+from csplat_tools.training.finetune import BYTE_COST, run_finetuning, usually_aside
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import DataSet, load
@@ -26,10 +26,13 @@ from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = ["SPLAT_BYTES", "run_training", "run_training_to_file", "tuning_checkpoint"]
+__all__ = ["SPLAT_BYTES", "run_training", "run_training_to_file", "tuning_after", "tuning_checkpoint"]
 
 #: Of a splat in a tuned file, about, with all bands and the preset small: 7.6 of Lego at 800x800, 10 of few splats.
 SPLAT_BYTES = 8
+
+_TUNING = 1 / 6  # of the steps of a training, those of the tuning that follows it,
+_BRIEF = 4_000  # and steps of one whose scene gains by the whole learning rates: a longer one has found what they find
 
 
 def run_training(
@@ -106,11 +109,16 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    keep = _left_to_keep(files, options) if size_bytes is None else None
-    report = run_finetuning(
-        model, views, output, encoding, tuning, further, size_bytes=size_bytes, keep=keep, quiet=quiet
-    )
+    report = run_finetuning(model, views, output, encoding, tuning, further, size_bytes=size_bytes, quiet=quiet)
     return {"training": result.log, "file": report}
+
+
+def tuning_after(training: TrainOptions) -> FinetuneOptions:
+    """How a scene is tuned that was trained so: the longer it was, the longer and in the smaller steps."""
+    usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False])
+    tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
+    steps = max(usual.iterations, round(_TUNING * training.iterations))
+    return replace(tuning, iterations=steps, lr_exposure=training.lr_exposure)
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
@@ -131,15 +139,6 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
     ended = load_checkpoint(files.resume).iteration >= options.iterations
     return replace(tuned, resume=checkpoint) if same and ended else tuned
-
-
-def _left_to_keep(files: Outputs, options: TrainOptions) -> float | None:
-    """Share of the splats that is still to stay, where a training had ended that left more of them than are wanted."""
-    stored = None if files.resume is None else load_checkpoint(files.resume)
-    if stored is None or stored.iteration < options.iterations:
-        return None
-    share = options.final_share / stored.options.get("final_share", 1.0)  # earlier ones left all
-    return share if share < 1.0 else None
 
 
 def _trained(
