@@ -4,6 +4,8 @@ import inspect
 import json
 import math
 from dataclasses import fields, replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.training.report import ply_splat_bytes
+from csplat_tools.training.searching import smallest_reaching
 from csplat_trainer.loss import PhotometricLoss
 from csplat_trainer.pictures import Picture
 from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
@@ -563,6 +566,36 @@ def test_a_file_keeps_to_the_size_that_is_wanted(capture, tmp_path):
     result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-size", "300B")
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
     assert "more than 300 (E_INPUT)" in result.stderr
+
+
+def test_the_smallest_file_is_found_that_looks_well_enough(capture, tmp_path):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--preset", "small", "--iterations", 30)
+    out, report = tmp_path / "s.csplat", tmp_path / "s.json"
+    usual = json.loads(call(*words, "-o", tmp_path / "u.csplat", "--json").stdout)["validation"]["psnr"]
+    told = call(*words, "-o", out, "--target-psnr", usual - 2.0, "--report", report)
+    facts = json.loads(report.read_text())
+    assert usual - 2.0 <= facts["validation"]["psnr"] < usual - 0.5
+    assert out.stat().st_size == facts["size_bytes"] < (tmp_path / "u.csplat").stat().st_size
+    assert "dB on the views that decide" in told.stderr
+    result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-psnr", 90)
+    assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
+    assert "90 dB are not reached" in result.stderr
+
+
+@pytest.mark.parametrize(("wanted", "size"), [(30.0, 100_000), (33.0, 400_000), (24.0, 6_250)])
+def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
+    tried = []
+
+    def make(size_bytes, most=1_000_000):
+        tried.append(min(size_bytes or 100_000, most))
+        return SimpleNamespace(size_bytes=tried[-1], psnr=30.0 + 1.5 * math.log2(tried[-1] / 100_000))
+
+    found = smallest_reaching(wanted, make)
+    assert wanted <= found.psnr <= wanted + 0.1
+    assert size <= found.size_bytes <= 1.05 * size
+    assert len(tried) <= 4
+    with pytest.raises(InputError, match=r"31 dB are not reached: 90,000 bytes have 29\.77 dB"):
+        smallest_reaching(31.0, partial(make, most=90_000))
 
 
 def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):

@@ -313,6 +313,8 @@ def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tm
     call(*words, "-o", tmp_path / "c.csplat", "--resume", run, "--keep", 0.4)
     trained_with = len(decode((tmp_path / "a.csplat").read_bytes()))
     assert trained_with / 2 == pytest.approx(len(decode((tmp_path / "c.csplat").read_bytes())), abs=2)
+    told = call(*words, "-o", tmp_path / "d.csplat", "--resume", run, "--target-psnr", "5dB")
+    assert "dB on the views that decide" in told.stderr
     assert trained == run.read_bytes()
 
 
@@ -329,7 +331,9 @@ def test_a_damaged_validation_picture_is_refused_before_training_begins(make_dat
     assert "11.png is not an image that can be read" in result.stderr
 
 
-@pytest.mark.parametrize("words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB")])
+@pytest.mark.parametrize(
+    "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)]
+)
 def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
     result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])
     assert 2 == result.exit_code

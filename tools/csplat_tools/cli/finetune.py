@@ -20,7 +20,7 @@ from csplat_tools.cli.options import (
     chosen,
     command,
 )
-from csplat_tools.cli.parsing import parse_bytes
+from csplat_tools.cli.parsing import parse_bytes, parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Near, Views, Virtual
 from csplat_tools.files.convert import read_source
@@ -31,7 +31,12 @@ __all__ = ["finetune"]
 
 
 @command(
-    one_of=(("data", "itself"), ("data", "views"), ("data", "view_size")),
+    one_of=(
+        ("data", "itself"),
+        ("data", "views"),
+        ("data", "view_size"),
+        *(("target_psnr", other) for other in ("target_size", "keep", "checkpoint", "resume")),
+    ),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
     settings=(ENCODER, "csplat_trainer.tuning.options:FinetuneOptions"),
 )
@@ -54,6 +59,10 @@ def finetune(
     target_size: Annotated[
         str | None,
         typer.Option(metavar="5MB", help="So many bytes at most: as many splats stay as there is room for."),
+    ] = None,
+    target_psnr: Annotated[
+        str | None,
+        typer.Option(metavar="dB", help="The smallest file found that has it on the views that decide; tunes several."),
     ] = None,
     prune_unseen: Annotated[
         bool | None,
@@ -100,6 +109,7 @@ def finetune(
       csplat finetune scene.ply scene.csplat --data capture --attribute-psnr 40 --report scene.json
       csplat finetune scene.ply scene.csplat --data capture --keep 0.5
       csplat finetune scene.ply scene.csplat --data capture --target-size 2MB
+      csplat finetune scene.ply scene.csplat --data capture --target-psnr 30
       csplat finetune scene.ply scene.csplat --self
       csplat finetune scene.ply scene.csplat --data capture --checkpoint run.npz --resume run.npz
     """
@@ -115,6 +125,7 @@ def finetune(
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     size_bytes = parse_bytes(target_size)
+    psnr = None if target_psnr is None else parse_decibels(target_psnr)
     rates = {"byte_cost": tuning.BYTE_COST[itself], **settings.of(FinetuneOptions)}
     options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)
@@ -140,7 +151,7 @@ def finetune(
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,
         prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,
-        size_bytes=size_bytes, quiet=out.quiet,
+        size_bytes=size_bytes, psnr=psnr, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report))
     out.publish(report)

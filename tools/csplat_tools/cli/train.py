@@ -10,7 +10,7 @@ import typer
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
-from csplat_tools.cli.parsing import parse_bytes, parse_size
+from csplat_tools.cli.parsing import parse_bytes, parse_decibels, parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.extras import need_trainer
@@ -27,7 +27,7 @@ _KEEP = 0.8  # of the splats, of a file: of those that training makes some are h
 
 @command(
     needs={"preview_every": ("previews",), "checkpoint_every": ("checkpoint",)},
-    one_of=(("keep", "target_size"),),
+    one_of=(("keep", "target_size", "target_psnr"),),
     settings=("csplat_trainer.options:TrainOptions",),
 )
 def train(
@@ -60,6 +60,10 @@ def train(
     ] = None,
     target_size: Annotated[
         str | None, typer.Option(metavar="1.4MB", help="OUT.csplat has so many bytes at most; not with --keep.")
+    ] = None,
+    target_psnr: Annotated[
+        str | None,
+        typer.Option(metavar="dB", help="OUT.csplat is the smallest found that has it on photographs that decide."),
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
@@ -109,8 +113,9 @@ def train(
     move, seen through the encoder's quantisers, until the photographs look
     right. Photographs that a set names for validation, or some that teach, say
     which step was best. With --target-size bytes cost as much in the loss as
-    keeps the file to it. --checkpoint and --resume cover both: from one
-    training files of several sizes can be made.
+    keeps the file to it. --target-psnr tunes files of several sizes, until the
+    smallest has it. --checkpoint and --resume cover training and tuning: from
+    one training files of several sizes can be made.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000
@@ -127,23 +132,18 @@ def train(
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
     need_trainer(plots=plot is not None)
-    from csplat_tools.training.finetune import SHAPE_ENTRIES
+    from csplat_tools.training.finetune import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_tools.training.report import format_report
-    from csplat_tools.training.train import (
-        SPLAT_BYTES,
-        run_training,
-        run_training_to_file,
-        tuning_after,
-        tuning_checkpoint,
-    )
+    from csplat_tools.training.train import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_trainer.checkpoint import load_checkpoint
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
-    if not to_file and (preset is not None or keep is not None or size_bytes is not None):
-        raise typer.BadParameter("--preset, --keep and --target-size are about a file: wanted OUT.csplat")
+    psnr = None if target_psnr is None else parse_decibels(target_psnr)
+    if not to_file and (preset, keep, size_bytes, psnr) != (None, None, None, None):
+        raise typer.BadParameter("--preset, --keep and targets are about a file: wanted OUT.csplat")
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
-    share = 1.0 if not to_file else _KEEP if keep is None else keep
+    share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
     if size_bytes is not None:
         left = max(1, size_bytes // SPLAT_BYTES)
         if max_splats is None and resume is not None:
@@ -156,7 +156,7 @@ def train(
         **{"final_share": share, **settings.of(TrainOptions)},
     )  # fmt: skip
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
-    later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None else None
+    later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and psnr is None else None
     out.check(
         output, inputs=(source, resume, lpips_weights),
         named={
@@ -176,8 +176,8 @@ def train(
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
     report = run_training_to_file(
-        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, facts=facts, plot=plot,
-        quiet=out.quiet,
+        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, psnr=psnr, facts=facts,
+        plot=plot, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report["file"]))
     out.publish(report)

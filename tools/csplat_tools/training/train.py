@@ -26,10 +26,7 @@ from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = ["SPLAT_BYTES", "run_training", "run_training_to_file", "tuning_after", "tuning_checkpoint"]
-
-#: Of a splat in a tuned file, about, with all bands and the preset small: 7.6 of Lego at 800x800, 10 of few splats.
-SPLAT_BYTES = 8
+__all__ = ["run_training", "run_training_to_file", "tuning_after", "tuning_checkpoint"]
 
 _TUNING = 1 / 6  # of the steps of a training, those of the tuning that follows it,
 _BRIEF = 4_000  # and steps of one whose scene gains by the whole learning rates: a longer one has found what they find
@@ -81,6 +78,7 @@ def run_training_to_file(
     tuning: FinetuneOptions,
     *,
     size_bytes: int | None = None,
+    psnr: float | None = None,
     facts: SceneOverrides | None = None,
     plot: str | None = None,
     quiet: bool = False,
@@ -95,6 +93,7 @@ def run_training_to_file(
         encoding: of the encoder; its threads hold for all.
         tuning: of the tuning.
         size_bytes: of the file, at most.
+        psnr: as for `run_finetuning`.
 
     Returns:
         `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
@@ -109,7 +108,9 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    report = run_finetuning(model, views, output, encoding, tuning, further, size_bytes=size_bytes, quiet=quiet)
+    report = run_finetuning(
+        model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, quiet=quiet
+    )
     return {"training": result.log, "file": report}
 
 

@@ -1,0 +1,74 @@
+"""Which size a tuned file must have to look so well: sizes are tried, each with a tuning of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+from csplat.errors import InputError
+
+__all__ = ["smallest_reaching"]
+
+_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, where nothing is known yet,
+_SLOPES = (0.3, 6.0)  # and what is believed of two files
+_NEAR = 0.1  # dB above what is wanted that are near enough
+_TRIES, _FARTHEST = 5, 2.0  # doublings from one try to the next
+
+
+class Tried(Protocol):
+    """A file that was made."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file."""
+        ...
+
+    @property
+    def psnr(self) -> float:
+        """Of the views that decide, pooled, dB."""
+        ...
+
+
+T = TypeVar("T", bound=Tried)
+
+
+def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
+    """Find the smallest file that reaches a PSNR: of those made, until one is near enough above it.
+
+    PSNR is taken to be straight in the logarithm of the size between two files.
+
+    Args:
+        psnr: wanted, dB.
+        make: makes a file of so many bytes at most, first one of any size.
+
+    Raises:
+        InputError: none of the files is good enough, and larger ones are no better.
+    """
+    tried = [make(None)]
+    while len(tried) < _TRIES and not psnr <= tried[-1].psnr <= psnr + _NEAR:
+        size = max(1, round(_next(psnr + 0.5 * _NEAR, tried)))
+        try:
+            tried.append(make(size))
+        except InputError:
+            if any(one.psnr >= psnr for one in tried):  # no file is as small
+                break
+            raise
+        if tried[-1].size_bytes < 0.9 * size:  # there is nothing more to put into it
+            break
+    enough = [one for one in tried if one.psnr >= psnr]
+    if not enough:
+        best = max(tried, key=lambda one: one.psnr)
+        raise InputError(f"{psnr:g} dB are not reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
+    return min(enough, key=lambda one: one.size_bytes)
+
+
+def _next(psnr: float, tried: list[T]) -> float:
+    """The size at which a PSNR is to be expected, by the two files nearest to it."""
+    near = sorted(tried, key=lambda one: abs(one.psnr - psnr))
+    octave = math.log2(near[0].size_bytes)
+    slope = _PER_DOUBLING
+    if len(near) > 1 and near[1].size_bytes != near[0].size_bytes:
+        slope = (near[1].psnr - near[0].psnr) / (math.log2(near[1].size_bytes) - octave)
+    by = (psnr - near[0].psnr) / min(max(slope, _SLOPES[0]), _SLOPES[1])
+    return float(2.0 ** (octave + min(max(by, -_FARTHEST), _FARTHEST)))
