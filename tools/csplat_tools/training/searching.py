@@ -11,7 +11,7 @@ from csplat.errors import InputError
 __all__ = ["smallest_reaching"]
 
 _PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, where nothing is known yet,
-_SLOPES = (0.3, 6.0)  # and what is believed of two files
+_SLOPES = (0.3, 12.0)  # and what is believed of two files
 _NEAR = 0.1  # dB above what is wanted that are near enough
 _TRIES, _FARTHEST = 5, 2.0  # doublings from one try to the next
 
@@ -43,17 +43,20 @@ def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
         make: makes a file of so many bytes at most, first one of any size.
 
     Raises:
-        InputError: none of the files is good enough, and larger ones are no better.
+        InputError: none of the files is good enough.
     """
-    tried = [make(None)]
-    while len(tried) < _TRIES and not psnr <= tried[-1].psnr <= psnr + _NEAR:
-        size = max(1, round(_next(psnr + 0.5 * _NEAR, tried)))
+    tried, least = [make(None)], 1.0
+    for _ in range(_TRIES):
+        if psnr <= tried[-1].psnr <= psnr + _NEAR:
+            break
+        size = _next(psnr + 0.5 * _NEAR, tried)
+        if size <= least:  # no file is as small: halfway to those that there are
+            size = math.sqrt(least * min(one.size_bytes for one in tried))
         try:
-            tried.append(make(size))
+            tried.append(make(max(1, round(size))))
         except InputError:
-            if any(one.psnr >= psnr for one in tried):  # no file is as small
-                break
-            raise
+            least = size
+            continue
         if tried[-1].size_bytes < 0.9 * size:  # there is nothing more to put into it
             break
     enough = [one for one in tried if one.psnr >= psnr]
@@ -64,8 +67,9 @@ def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
 
 
 def _next(psnr: float, tried: list[T]) -> float:
-    """The size at which a PSNR is to be expected, by the two files nearest to it."""
+    """The size at which a PSNR is to be expected, by the files nearest to it, on either side where there are such."""
     near = sorted(tried, key=lambda one: abs(one.psnr - psnr))
+    near[1:] = sorted(near[1:], key=lambda one: (one.psnr < psnr) == (near[0].psnr < psnr))
     octave = math.log2(near[0].size_bytes)
     slope = _PER_DOUBLING
     if len(near) > 1 and near[1].size_bytes != near[0].size_bytes:
