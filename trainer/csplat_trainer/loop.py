@@ -49,6 +49,7 @@ F32 = NDArray[np.float32]
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
+_LEFT_AT_ONCE, _STEPS_BETWEEN = 0.85, 100  # share of the splats that stays where some go late, and steps that follow
 _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
 
 
@@ -134,7 +135,7 @@ class _Run:
         spent = float(self._log["seconds"])  # by what was resumed
         begin, first = time.perf_counter(), self._iteration
         if first and not any(map(options.thinnings_left, range(first + 1, options.iterations + 1))):
-            self._thin(1)
+            self._thin_late(show)
         while self._iteration < options.iterations:
             self._iteration += 1
             step = self._iteration
@@ -233,8 +234,6 @@ class _Run:
     def _thin(self, times: int) -> None:
         """Have splats go, so that as many such times leave the share of them that is wanted."""
         options, parameters = self._options, self._engine.parameters
-        if options.final_share == 1.0:
-            return
         wanted = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
         count = len(parameters) * math.pow(wanted / len(parameters), 1.0 / times) if times > 1 else wanted
         left = max(1, round(count))
@@ -244,6 +243,25 @@ class _Run:
         self._engine.parameters = parameters
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))
+
+    def _thin_late(self, show: Callable[[TrainingStep], None]) -> None:
+        """Have splats go after the steps at which they usually do, each time with some more steps at the last rates."""
+        count = len(self._engine.parameters)
+        wanted = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
+        if wanted >= count:
+            return
+        spent, begin = float(self._log["seconds"]), time.perf_counter()
+        degree = self._options.active_degree(self._iteration)
+        times = math.ceil(math.log(wanted / count) / math.log(_LEFT_AT_ONCE))
+        for left in range(times, 0, -1):
+            self._thin(left)
+            window = _Window()
+            for _ in range(_STEPS_BETWEEN):
+                loss, error = self._step(degree)
+                window.losses.append(loss)
+                window.errors.append(error)
+            seconds = time.perf_counter() - begin
+            show(self._entry(window, degree, spent + seconds, seconds / (times - left + 1) * (left - 1)))
 
     def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
         mse = sum(window.errors) / len(window.errors)

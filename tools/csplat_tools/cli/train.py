@@ -71,7 +71,9 @@ def train(
     background: Annotated[
         str, typer.Option(metavar="|".join(BACKGROUNDS), help="auto: white behind RGBA, else black.")
     ] = _DEFAULT.background,
-    device: Annotated[str, typer.Option(metavar="|".join(DEVICES), help="cuda wants a GPU and gsplat.")] = "cpu",
+    device: Annotated[
+        str, typer.Option(metavar="|".join(DEVICES), help="cuda wants a GPU and gsplat, and never ran on one.")
+    ] = "cpu",
     near: Annotated[
         float | None, typer.Option(metavar="UNITS", hidden=True, help="Near plane; else one that suits.")
     ] = None,

@@ -58,7 +58,10 @@ VIEWS, VIEW_SIZE = 480, (320, 240)
 
 _TUNED = 0.96  # of the bytes before tuning are left after it, where nothing presses for more,
 _WITHIN = 1.08  # and more or less by so much is what the cost of bytes in the loss brings about
+_FREE = 1.05  # of the bytes that there are, may be had: finer steps are not worth the time
 _TRIES = 3  # counts of splats, each from what the last one took
+_ENTRIES_DOUBLE = 6.0  # dB of all attributes that pay as twice the entries of a codebook of SH do,
+_FEW_OCTAVES, _MOST_OCTAVES = 9, 15  # where those are no more than what the encoder makes of any scene; and at most
 _FINEST = 70.0  # dB of an attribute: renders are as good as the scene's
 
 _RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
@@ -252,22 +255,39 @@ def _fitting(
 ) -> tuple[Chosen, EncodeOptions]:
     """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
-    def room() -> float:
+    def room(encoding: EncodeOptions) -> float:
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
         return size_bytes / (_TUNED * len(draft.coded(progress).write().data))
 
     for _ in range(_TRIES):
-        share = room()
+        share = room(encoding)
         if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
             break
         chosen = choose(max(1, round(share * len(chosen.model))))
     else:
-        share = room()
-    if share > _WITHIN and encoding.attribute_psnr is None:
-        finer = math.log(share) / BYTES_PER_DB
-        usual = PRESETS[encoding.preset].quality[0 if chosen.model.sh_degree else 1]
-        encoding = replace(encoding, attribute_psnr=min(usual + finer, _FINEST))
+        share = room(encoding)
+    if share <= _FREE or encoding.attribute_psnr is not None:
+        return chosen, encoding
+    usual, finer = encoding, 0.0
+    for _ in range(_TRIES - 1):
+        finer += (math.log(share) - 0.5 * math.log(_FREE)) / BYTES_PER_DB
+        trial = _finer(usual, chosen.model, finer)
+        share = room(trial)
+        if share >= 1.0:
+            encoding = trial
+            if share <= _FREE:
+                break
     return chosen, encoding
+
+
+def _finer(encoding: EncodeOptions, model: SplatModel, finer: float) -> EncodeOptions:
+    """Options whose attributes keep so many dB more, with as many more entries of a codebook of SH as go with that."""
+    preset = PRESETS[encoding.preset]
+    quality = min(preset.quality[0 if model.sh_degree else 1] + finer, _FINEST)
+    octaves = math.log2(preset.codebook_share * len(model)) + finer / _ENTRIES_DOUBLE
+    if encoding.codebook_size is None and octaves > _FEW_OCTAVES:
+        encoding = replace(encoding, codebook_size=1 << min(round(octaves), _MOST_OCTAVES))
+    return replace(encoding, attribute_psnr=quality)
 
 
 def _state(now: TuningStep) -> str:
