@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -126,6 +127,8 @@ def finetune(
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     size_bytes = parse_bytes(target_size)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
+    if psnr is not None and not math.isfinite(psnr):
+        raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
     rates = {"byte_cost": tuning.BYTE_COST[itself], **settings.of(FinetuneOptions)}
     options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)

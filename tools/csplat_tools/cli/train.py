@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -141,6 +142,8 @@ def train(
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
+    if psnr is not None and not math.isfinite(psnr):
+        raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
     if not to_file and (preset, keep, size_bytes, psnr) != (None, None, None, None):
         raise typer.BadParameter("--preset, --keep and targets are about a file: wanted OUT.csplat")
     if keep is not None and not 0.0 < keep <= 1.0:

@@ -67,7 +67,7 @@ def _row(name: str, one: Mapping[str, Any]) -> list[str]:
         f"{one['splats']:,}",
         f"{one['size_bytes'] / one['splats']:.2f}",
         f"{one['seconds'] / 60:.0f}",
-        f"{one['peak_memory_bytes'] / 1e9:.2f}",
+        optional(one["peak_memory_bytes"], lambda size: f"{size / 1e9:.2f}"),
     ]
 
 
