@@ -149,10 +149,10 @@ def train(
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
+    if (size_bytes, psnr) != (None, None) and max_splats is None and resume is not None:
+        max_splats = load_checkpoint(resume).options.get("max_splats")
     if size_bytes is not None:
         left = max(1, size_bytes // SPLAT_BYTES)
-        if max_splats is None and resume is not None:
-            max_splats = load_checkpoint(resume).options.get("max_splats")
         max_splats = max_splats or round(left / _KEEP)
         share = min(1.0, left / max_splats)
     options = chosen(
