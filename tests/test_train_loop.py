@@ -18,6 +18,7 @@ from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.training.train import tuning_after
 from csplat_trainer.data import DataSet
+from csplat_trainer.engine import CpuEngine
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs
@@ -94,6 +95,21 @@ def test_a_run_that_goes_on_late_ends_with_the_share_that_is_wanted(make_data, m
     options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.25)
     left = train(data, options, outputs=Outputs(resume=tmp_path / "trunk.npz"))
     assert 0.25 * len(whole.model) == pytest.approx(len(left.model), abs=3)
+
+
+def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, tmp_path, monkeypatch):
+    widths: list[int] = []
+    step = CpuEngine.step
+
+    def watched(engine, picture, *rest):
+        widths.append(picture.camera.W)
+        return step(engine, picture, *rest)
+
+    monkeypatch.setattr(CpuEngine, "step", watched)
+    options = TrainOptions(**QUICK, half_size=0.5)
+    train(make_data(make_model), options)
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths
+    resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])

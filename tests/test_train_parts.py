@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
+from csplat_render.camera import Camera
 from csplat_render.cameras import intrinsics, orbit
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.mcmc import add_noise, grow, relocate, share
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
-from csplat_trainer.pictures import Picture
+from csplat_trainer.pictures import Picture, compose, halved
 from csplat_trainer.report import moving_average
 from csplat_trainer.resume import adapt
 from csplat_trainer.thinning import thin
@@ -186,6 +187,29 @@ def test_the_learning_rate_of_the_means_falls_to_its_end():
     options = TrainOptions(iterations=100)
     assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
     assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
+
+
+def test_other_learning_rates_fall_once_splats_no_longer_move():
+    options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
+    shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
+    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)
+    assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_halved_picture_is_what_its_camera_sees(channels):
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (7, 10, channels), dtype=np.uint8)
+    mask = np.ones((7, 10), bool)
+    mask[3, 4] = False
+    camera = Camera(intrinsics(10, 7, 8.0), np.eye(4), 10, 7)
+    half, behind = halved(Picture(camera, pixels, mask)), np.array([0.2, 0.5, 0.9], np.float32)
+    whole = compose(Picture(camera, pixels), behind, np.empty((7, 10, 3), np.float32))
+    means = whole[:6].reshape(3, 2, 5, 2, 3).mean(axis=(1, 3))
+    assert np.abs(compose(half, behind, np.empty((3, 5, 3), np.float32)) - means).max() <= 1.01 / 255
+    point = np.array([0.1, -0.05, 1.0])
+    assert np.allclose(half.camera.K @ point, [0.5, 0.5, 1.0] * (camera.K @ point))
+    assert [[1, 2]] == np.argwhere(~half.mask).tolist()
 
 
 def test_growth_reaches_the_cap_halfway():

@@ -36,7 +36,7 @@ from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs, TrainResult
 from csplat_trainer.parameters import Parameters, to_model
 from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.pictures import compose
+from csplat_trainer.pictures import Picture, compose, halved
 from csplat_trainer.report import TrainingStep, peak_memory, save_picture, side_by_side
 from csplat_trainer.resume import adapt
 from csplat_trainer.starting import StartingScene, scene_of, starting_splats
@@ -117,6 +117,7 @@ class _Run:
         self._rng = Generator(PCG64(options.seed))
         self._iteration = 0
         self._queue: list[int] = []
+        self._halved: dict[int, Picture] = {}
         self._log: dict[str, Any] = {"entries": [], "evaluations": [], "losses": [], "seconds": 0.0}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._start(self._scene))
@@ -197,7 +198,7 @@ class _Run:
         if not self._queue:
             self._queue = self._rng.permutation(len(self._data.train)).tolist()
         number = self._queue.pop()
-        picture = self._data.train[number]
+        picture = self._picture(number)
         background = self._background
         if self._options.background == "random":
             background = self._rng.random(3, dtype=np.float32)
@@ -208,6 +209,15 @@ class _Run:
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss, value.mse
+
+    def _picture(self, number: int) -> Picture:
+        """A photograph that teaches, of the size that its step wants."""
+        if not self._options.halves(self._iteration):
+            self._halved.clear()
+            return self._data.train[number]
+        if number not in self._halved:
+            self._halved[number] = halved(self._data.train[number])
+        return self._halved[number]
 
     def _refine(self) -> None:
         options, parameters = self._options, self._engine.parameters

@@ -60,7 +60,9 @@ class TrainOptions:
         lr_shN: learning rate of the higher SH coefficients.
         lr_exposure: of a gain and a shift per photograph and channel, for photographs that were exposed differently; no
             scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
-        lr_decay: the other rates fall exponentially to this share of themselves.
+        lr_decay: the other rates fall to this share of themselves, along half a cosine from `refine_stop` to the end.
+        half_size: share of the iterations, the first, that learn from photographs of half the width and height: while
+            splats are few and places rough, these teach as much, in little more than half the time.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
         opacity_weight: of the mean opacity in the loss (mcmc and fixed).
         scale_weight: of the mean standard deviation in the loss (mcmc and fixed).
@@ -103,6 +105,7 @@ class TrainOptions:
     lr_shN: float = 2.5e-4
     lr_exposure: float = 0.0
     lr_decay: float = 1.0
+    half_size: float = 0.0
     sh_interval: int = 0
     opacity_weight: float = 0.003
     scale_weight: float = 0.01
@@ -139,6 +142,10 @@ class TrainOptions:
     def refine_end(self) -> int:
         """The step after which splats are neither moved nor added nor removed."""
         return int(self.refine_stop * self.iterations)
+
+    def halves(self, iteration: int) -> bool:
+        """Whether a step learns from a photograph of half the size."""
+        return iteration <= self.half_size * self.iterations
 
     def active_degree(self, iteration: int) -> int:
         """SH degree that is trained at a step."""
@@ -178,7 +185,8 @@ class TrainOptions:
         means = self.lr_means
         if means > 0.0:
             means *= (self.lr_means_final / means) ** done if self.lr_means_final > 0.0 else 1.0 - done
-        decay = self.lr_decay**done
+        left = max(0, iteration - self.refine_end) / max(1, self.iterations - self.refine_end)
+        decay = self.lr_decay + (1.0 - self.lr_decay) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, left)))
         return {
             "means": means * extent,
             "quats": self.lr_quats * decay,
@@ -220,6 +228,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lr_shN": (0, 1),
     "lr_exposure": (0, 1),
     "lr_decay": (1e-6, 1),
+    "half_size": (0, 1),
     "sh_interval": (0, 10**7),
     "opacity_weight": (0, 100),
     "scale_weight": (0, 100),

@@ -91,6 +91,9 @@ def finetune(
         typer.Option(metavar="FACTOR", hidden=True, help="Of all learning rates; by default 1, with --self 0.03."),
     ] = None,
     lpips: Lpips = None,
+    page: Annotated[
+        str | None, typer.Option(metavar="FILE.html", help="Write a page about it: scores, curve, pictures.")
+    ] = None,
     source_index: SourceIndex = None,
     checkpoint: Checkpoint = None,
     checkpoint_every: CheckpointEvery = 0,
@@ -114,7 +117,7 @@ def finetune(
       csplat finetune scene.ply scene.csplat --self
       csplat finetune scene.ply scene.csplat --data capture --checkpoint run.npz --resume run.npz
     """
-    need_trainer()
+    need_trainer(plots=page is not None)
     from csplat_render.lpips import load_lpips
     from csplat_tools.training import finetune as tuning
     from csplat_tools.training.report import format_report
@@ -138,7 +141,7 @@ def finetune(
     # A checkpoint may take the place of the one that it goes on from.
     again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
     inputs = (source, importance, *views.inputs, None if lpips == "auto" else lpips)
-    named = {"--source-index": source_index, "--checkpoint": checkpoint}
+    named = {"--source-index": source_index, "--checkpoint": checkpoint, "--page": page}
     if again:
         out.check(inputs=inputs, named={"--checkpoint": checkpoint}, force=True)
         del named["--checkpoint"]
@@ -154,7 +157,7 @@ def finetune(
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,
         prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,
-        size_bytes=size_bytes, psnr=psnr, quiet=out.quiet,
+        size_bytes=size_bytes, psnr=psnr, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report))
     out.publish(report)

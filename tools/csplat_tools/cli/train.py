@@ -87,6 +87,9 @@ def train(
         str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Weights of LPIPS-Alex.")
     ] = None,
     plot: Annotated[str | None, typer.Option(metavar="FILE.png", hidden=True, help="The loss over the steps.")] = None,
+    page: Annotated[
+        str | None, typer.Option(metavar="FILE.html", help="Write a page about it: scores, curves, pictures.")
+    ] = None,
     previews: Annotated[
         str | None, typer.Option(metavar="FOLDER", hidden=True, help="Early pictures, beside the photograph.")
     ] = None,
@@ -123,7 +126,7 @@ def train(
     Examples:
       csplat train lego -o lego.ply --max-splats 10000
       csplat train lego -o lego.ply --size 200x200 --report lego.json
-      csplat train lego -o lego.csplat --target-size 800KB
+      csplat train lego -o lego.csplat --target-size 800KB --page lego.html
     ---
     More examples:
       csplat train lego -o lego.ply --plot loss.png --previews pictures
@@ -134,7 +137,7 @@ def train(
       csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
-    need_trainer(plots=plot is not None)
+    need_trainer(plots=plot is not None or page is not None)
     from csplat_tools.training.finetune import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_tools.training.report import format_report
     from csplat_tools.training.train import run_training, run_training_to_file, tuning_after, tuning_checkpoint
@@ -165,7 +168,7 @@ def train(
     out.check(
         output, inputs=(source, resume, lpips_weights),
         named={
-            "--plot": plot, "--checkpoint": None if again else checkpoint,
+            "--plot": plot, "--page": page, "--checkpoint": None if again else checkpoint,
             "the checkpoint of the tuning": None if again else later,
         },
     )  # fmt: skip
@@ -176,13 +179,15 @@ def train(
     facts = upright.upright()
     if not to_file:
         out.publish(
-            run_training(data, output, options, files, facts=facts, plot=plot, threads=threads, quiet=out.quiet)
+            run_training(
+                data, output, options, files, facts=facts, plot=plot, page=page, threads=threads, quiet=out.quiet
+            )
         )
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
     report = run_training_to_file(
         data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, psnr=psnr, facts=facts,
-        plot=plot, quiet=out.quiet,
+        plot=plot, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report["file"]))
     out.publish(report)

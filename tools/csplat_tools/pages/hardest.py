@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from csplat_render.metrics import psnr, squared_error
 from csplat_tools.files.pictures import panels, to_bytes
 
-__all__ = ["AMPLIFICATION", "PICTURES", "HardestPlace", "Place", "picture_row"]
+__all__ = ["AMPLIFICATION", "PICTURES", "HardestPlace", "Place", "picture_row", "pictures_beside"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -93,11 +94,23 @@ def picture_row(place: Place, name: str) -> str:
         f"file, here {place.psnr:.1f} dB": place.decoded,
         f"difference × {AMPLIFICATION:g}": place.difference,
     }
-    images = "".join(
-        f'<figure><img src="{_data_uri(pixels)}" width="{pixels.shape[1]}" height="{pixels.shape[0]}"'
-        f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
-        for word, pixels in words.items()
-    )
+    return pictures_beside(words, name)
+
+
+def pictures_beside(pictures: Mapping[str, U8], name: str) -> str:
+    """Pictures beside each other, reduced to a size for a page.
+
+    Args:
+        pictures: [h, w, 3] uint8, by what is said below each.
+        name: of what they show.
+    """
+    images = ""
+    for word, pixels in pictures.items():
+        small = _reduced(pixels)
+        images += (
+            f'<figure><img src="{_data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
+            f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
+        )
     return f'<div class="pictures">{images}</div>'
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from csplat_tools.tradeoffs.svg import INK
+from csplat_tools.pages.svg import INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

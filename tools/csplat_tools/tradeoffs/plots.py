@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from csplat_tools.files.console import format_bytes
 from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.svg import INK, drawn, hover
 from csplat_tools.tradeoffs.labels import label_marks
 from csplat_tools.tradeoffs.points import Point
 from csplat_tools.tradeoffs.running import Tradeoff
-from csplat_tools.tradeoffs.svg import INK, drawn, hover
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,6 +23,7 @@ from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.optimise.exchange import BYTES_PER_DB
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
+from csplat_tools.training.page import show_views, write_page
 from csplat_tools.training.report import as_report, judge_models
 from csplat_tools.training.searching import smallest_reaching
 from csplat_tools.views import ViewSet
@@ -95,6 +96,9 @@ def run_finetuning(
     importance: str | None = None,
     source_index: str | None = None,
     lpips: Distance | None = None,
+    known: Mapping[str, Mapping[str, float | None]] | None = None,
+    page: str | None = None,
+    training: Mapping[str, Any] | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Prune, freeze, tune, write, judge.
@@ -112,6 +116,9 @@ def run_finetuning(
         keep, prune_unseen, importance: as for `choose_splats`.
         source_index: a .npy file to write: which splat of the scene each splat of the file is.
         lpips: computes it, if wanted.
+        known: as for `judge_models`.
+        page: an HTML file to write, which shows what came of it.
+        training: log of the training before, for the page.
         quiet: say nothing that is not wrong.
 
     Returns:
@@ -139,9 +146,13 @@ def run_finetuning(
             write_array(source_index, made.result.source_index)
         with clock.stage("judging"):
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
-            judged = judge_models(source, models, views, lpips, threads)
-    report = as_report(source, made.plain, made.result, judged, made.log, clock.seconds, tuned.chosen.said)
-    return {**report, "log": made.log}
+            judged = judge_models(source, models, views, lpips, threads, known=known)
+        shown = [] if page is None else show_views(source, models, views, threads)
+    facts = as_report(source, made.plain, made.result, judged, made.log, clock.seconds, tuned.chosen.said)
+    report = {**facts, "log": made.log}
+    if page is not None:
+        write_page(page, output, training, report, shown)
+    return report
 
 
 @dataclass(frozen=True, eq=False)

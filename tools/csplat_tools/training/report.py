@@ -16,9 +16,10 @@ from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.views import ViewSet
 
-__all__ = ["Judged", "as_report", "format_report", "judge_models"]
+__all__ = ["SCORES", "Judged", "as_report", "format_report", "judge_models", "number"]
 
-_SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
+#: Scores that are told, and with how many digits.
+SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,8 @@ def judge_models(
     views: ViewSet,
     lpips: Distance | None,
     threads: int | None = None,
+    *,
+    known: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> Judged | None:
     """Score models on views that nothing was learnt from: by photographs, else by renders of the source.
 
@@ -51,6 +54,7 @@ def judge_models(
         views: those that judge are asked; `None` comes back where there are none.
         lpips: computes it, if wanted.
         threads: how many; `None` for all.
+        known: scores by name of models that were judged by the same photographs already.
     """
     if not views.judges:
         return None
@@ -58,9 +62,11 @@ def judge_models(
     judge = views.photograph_judge(threads=threads) if taken else views.judge(source, threads=threads)
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
-        if taken or model is not source:
+        if known is not None and name in known:
+            scores[name] = {score: known[name][score] for score, _ in SCORES}
+        elif taken or model is not source:
             found = judge.scores(model, lpips=lpips)
-            scores[name] = {score: getattr(found, score) for score, _ in _SCORES}
+            scores[name] = {score: getattr(found, score) for score, _ in SCORES}
     return Judged("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
 
 
@@ -128,10 +134,9 @@ def format_report(report: Mapping[str, Any]) -> str:
     lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
     if report["scores"]:
         rows = [
-            (name, *(_number(one[score], digits) for score, digits in _SCORES))
-            for name, one in report["scores"].items()
+            (name, *(number(one[score], digits) for score, digits in SCORES)) for name, one in report["scores"].items()
         ]
-        header = (f"{report['judged_views']} {report['judged_by']}", *(score for score, _ in _SCORES))
+        header = (f"{report['judged_views']} {report['judged_by']}", *(score for score, _ in SCORES))
         lines += ["", format_table(header, rows)]
     parts = [*report["bytes_by_attribute"].items(), ("everything else", report["overhead_bytes"])]
     rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
@@ -145,5 +150,6 @@ def format_report(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
+    """A score as text."""
     return "-" if value is None else f"{value:.{digits}f}"

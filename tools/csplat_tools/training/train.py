@@ -17,6 +17,7 @@ from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import write_model
 from csplat_tools.training.finetune import BYTE_COST, run_finetuning, usually_aside
+from csplat_tools.training.page import show_views, write_page
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import DataSet, load
@@ -40,6 +41,7 @@ def run_training(
     *,
     facts: SceneOverrides | None = None,
     plot: str | None = None,
+    page: str | None = None,
     threads: int | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -52,6 +54,7 @@ def run_training(
         files: that are written, and read, on the way.
         facts: what the scene is to say instead of what the set does.
         plot: a PNG of the loss over the steps.
+        page: an HTML file to write, which shows what came of it.
         threads: how many; `None` for all.
         quiet: say nothing.
 
@@ -63,7 +66,11 @@ def run_training(
         OSError: a file cannot be read or written.
     """
     result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
-    write_model(output, (facts or SceneOverrides()).applied(result.model), absolute=False)
+    model = (facts or SceneOverrides()).applied(result.model)
+    write_model(output, model, absolute=False)
+    if page is not None:
+        views = find_view_set(model, data=data, aside=0)
+        write_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
         note(f"{output} says how to compare it with its photographs: {TrainedOn.of(result.model.metadata)}")
     return result.log
@@ -81,12 +88,13 @@ def run_training_to_file(
     psnr: float | None = None,
     facts: SceneOverrides | None = None,
     plot: str | None = None,
+    page: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Read a data set, train, and tune a file by the same photographs; of the scene nothing else is written.
 
     Args:
-        data, options, facts, plot, quiet: as for `run_training`.
+        data, options, facts, plot, page, quiet: as for `run_training`.
         output: the `.csplat` file to write, or `-`.
         files: likewise; checkpoints of the tuning stand beside those of the training (`tuning_checkpoint`), and a run
             goes on from them where the training had ended.
@@ -108,9 +116,11 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
+    known = {"source": {**result.metrics, "lpips": None}} if result.metrics and not options.eval_views else None
     report = run_finetuning(
-        model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, quiet=quiet
-    )
+        model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
+        training=result.log, quiet=quiet,
+    )  # fmt: skip
     return {"training": result.log, "file": report}
 
 

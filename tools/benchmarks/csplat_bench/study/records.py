@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from csplat_bench.common.report import Machine
 
@@ -23,13 +23,14 @@ class Scored(TypedDict):
 
 
 class How(TypedDict):
-    """All that a line depends on."""
+    """All that a line depends on; `tuned` where a file was."""
 
     name: str
     reduction: dict[str, Any]
     preset: str
     decoded: bool
     kmeans: dict[str, Any] | None
+    tuned: NotRequired[bool]
 
 
 class Measured(Scored):

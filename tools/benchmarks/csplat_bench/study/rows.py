@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
+import csplat_trainer
 from csplat.decoder import decode, read_header
 from csplat.encoder import EncodeOptions
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_bench.common.command import preset_of
 from csplat_bench.common.measuring import timed
@@ -24,7 +26,10 @@ from csplat_tools.study import (
     raw_bytes,
     reduce_model,
 )
+from csplat_tools.training.choosing import training_views
+from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
 from csplat_tools.views import ViewSet, with_deciders
+from csplat_trainer.tuning import FinetuneOptions
 
 __all__ = [
     "TAUS", "Row", "attribute_bytes", "baseline_bytes", "measure_row", "measure_taus", "rows_of_baseline",
@@ -58,12 +63,14 @@ class Row:
         reduction: what is done to the scene.
         preset: of the .csplat file.
         decoded: scores are those of the decoded file; otherwise of the scene in float32, before it is coded.
+        tuned: the file is tuned by the photographs, bytes being part of the loss.
     """
 
     name: str
     reduction: Reduction = field(default_factory=Reduction)
     preset: str = "balanced"
     decoded: bool = False
+    tuned: bool = False
 
     @property
     def how(self) -> How:
@@ -73,9 +80,10 @@ class Row:
         if kmeans is not None:
             sizes = {"sizes": dict(kmeans.sizes), "stages": kmeans.stages, "gauge": kmeans.gauge}
         reduction = asdict(self.reduction)
-        return {
+        how: How = {
             "name": self.name, "reduction": reduction, "preset": self.preset, "decoded": self.decoded, "kmeans": sizes,
         }  # fmt: skip
+        return {**how, "tuned": True} if self.tuned else how
 
 
 def rows_of_baseline() -> list[Row]:
@@ -90,6 +98,10 @@ def rows_of_baseline() -> list[Row]:
         Row(f"SH 0, τ 0.02, file, {preset}", pruned[0.02], preset, decoded=True) for preset in ("balanced", "small")
     ]
     files.append(Row("SH 0 distilled, τ 0.02, file, small", _distilled(0.02), "small", decoded=True))
+    files += [
+        Row("rate in the loss", preset="small", decoded=True, tuned=True),
+        Row("τ 0.02, rate in the loss", Reduction(0.02), "small", decoded=True, tuned=True),
+    ]
     books = {"plain": _PLAIN, "by attribute": _BY_ATTRIBUTE, "adaptive": _ADAPTIVE, "residual": _RESIDUAL}
     clustered = [
         Row(f"SH 0, τ 0.02, k-means {name}", Reduction(0.02, sh_degree=0, kmeans=kmeans))
@@ -115,6 +127,8 @@ def rows_of_scene(subject: Subject) -> list[Row]:
         Row("file, small", preset="small", decoded=True),
         Row("SH 0, τ 0.02, file, small", Reduction(0.02, sh_degree=0), "small", decoded=True),
     ]
+    if subject.photographs is not None and len(subject.source) <= _SMALL:
+        rows.append(Row("rate in the loss", preset="small", decoded=True, tuned=True))
     return rows
 
 
@@ -136,8 +150,12 @@ def measure_row(subject: Subject, row: Row) -> Measured:
         views = with_deciders(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
     reduced, strategy = timed(reduce_model, subject.source, row.reduction, views)
     options = EncodeOptions(preset=preset_of(row.preset))
-    encoded, encoding = timed(encode_reduced, subject.source, row.reduction, options, views=views)
-    decoded = decode(encoded.data)
+    if row.tuned:
+        data, encoding = timed(_tuned, subject, reduced.model, options)
+    else:
+        encoded, encoding = timed(encode_reduced, subject.source, row.reduction, options, views=views)
+        data = encoded.data
+    decoded = decode(data)
     scores = subject.views.score(decoded if row.decoded else reduced.model)
     file = scores if row.decoded else subject.views.score(decoded, quick=True)
     return {
@@ -145,7 +163,7 @@ def measure_row(subject: Subject, row: Row) -> Measured:
         **scores,
         "splats": len(reduced.model),
         "study_bytes": reduced.size_bytes,
-        "csplat_bytes": len(encoded.data),
+        "csplat_bytes": len(data),
         "file_psnr_mean": file["psnr_mean"],
         "file_psnr_std": file["psnr_std"],
         "books": {} if reduced.clustered is None else reduced.clustered.as_json(),
@@ -153,6 +171,15 @@ def measure_row(subject: Subject, row: Row) -> Measured:
         "encode_seconds": encoding.wall,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _tuned(subject: Subject, model: SplatModel, options: EncodeOptions) -> bytes:
+    """A file that was tuned by the photographs, as `csplat finetune --data` does."""
+    if subject.photographs is None:
+        raise InputError(f"{subject.name} has no photographs that a file could be tuned by")
+    views = training_views(model, subject.photographs, None)
+    options = replace(options, shape_codebook_size=SHAPE_ENTRIES)
+    return csplat_trainer.finetune(model, views, options, FinetuneOptions(byte_cost=BYTE_COST[False])).data
 
 
 def measure_taus(source: SplatModel, views: Views) -> list[Survivors]:

@@ -16,7 +16,7 @@ from csplat_bench.common.captures import CAPTURES, Capture, Training, trained
 from csplat_bench.common.scenes import DATA, OUT, cameras_of
 from csplat_bench.study.judge import Distance, Views, renders_at
 from csplat_render import Camera
-from csplat_tools.views import BLACK, DataOptions, find_view_set
+from csplat_tools.views import BLACK, DataOptions, ViewSet, find_view_set
 from csplat_trainer.options import TrainOptions
 
 __all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "larger", "open_subject"]
@@ -55,6 +55,7 @@ class Subject:
         views: what it is judged by.
         teachers: cameras that a lower SH degree is distilled by; None for virtual ones.
         judged_by: in words.
+        photographs: by which files are tuned; None where there are none.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Subject:
     views: Views
     teachers: Sequence[Camera] | None
     judged_by: str
+    photographs: ViewSet | None = None
 
 
 def baselines(iterations: int, count: int) -> dict[str, Capture]:
@@ -116,7 +118,8 @@ def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Dist
     cameras = list(judge.cameras)
     wanted = [judge.look(number).picture for number in range(len(cameras))]
     by = f"{len(cameras)} photographs of {cameras[0].W}×{cameras[0].H} that were held out"
-    return Subject(name, source, ply, training, Views(cameras, wanted, scene.background, lpips), teachers, by)
+    judged = Views(cameras, wanted, scene.background, lpips)
+    return Subject(name, source, ply, training, judged, teachers, by, found)
 
 
 def larger(subject: Subject, width: int, count: int) -> Subject:

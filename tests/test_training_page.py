@@ -1,0 +1,78 @@
+"""The page about a training and its file: what it shows, and that it fetches nothing."""
+
+import json
+import re
+
+import pytest
+
+pytest.importorskip("numba", reason="training wants the extra [render]")
+pytest.importorskip("scipy", reason="data sets want the extra [render]")
+pytest.importorskip("matplotlib", reason="plots want the extra [render]")
+
+from posed_sets import write_blender
+from typer.testing import CliRunner
+
+from csplat_tools.cli.app import app
+
+WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 30, "--set", "log_every=10")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("set")
+    write_blender(path)
+    return path
+
+
+def call(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, (result.stderr, result.exception)
+
+
+def headings(page):
+    return re.findall("<h2>(.*?)</h2>", page)
+
+
+def test_a_page_about_a_training_and_its_file(folder, tmp_path):
+    path, report = tmp_path / "page.html", tmp_path / "report.json"
+    call("train", folder, "-o", tmp_path / "a.csplat", *WORDS, "--page", path, "--report", report)
+    page, said = path.read_text(), json.loads(report.read_text())
+    assert [
+        "How near it comes", "What it looks like", "The training", "The tuning", "Where the bytes are",
+        "How it was made",
+    ] == headings(page)  # fmt: skip
+    for scores in said["file"]["scores"].values():
+        assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
+    assert ["photograph", "source", "before tuning", "file"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert 12 == page.count('src="data:image/')
+    assert not re.search("(src|href)=.http", page)
+
+
+def test_a_page_about_a_training_alone(folder, tmp_path):
+    path = tmp_path / "page.html"
+    call("train", folder, "-o", tmp_path / "a.ply", *WORDS, "--page", path)
+    page = path.read_text()
+    assert ["How near it comes", "What it looks like", "The training", "How it was made"] == headings(page)
+    assert ["photograph", "trained scene"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
+
+
+def test_a_page_about_a_tuned_file(tmp_path, make_model):
+    from csplat import write_ply
+
+    write_ply(tmp_path / "a.ply", make_model(60, 1))
+    path = tmp_path / "page.html"
+    words = ("--self", "--views", 16, "--view-size", "40x30", "--iterations", 20, "--page", path)
+    call("finetune", tmp_path / "a.ply", tmp_path / "a.csplat", *words)
+    page = path.read_text()
+    assert "by 8 renders of the source" in page.lower()
+    assert "The tuning" in headings(page)
+    assert "The training" not in headings(page)
+    assert {"the source", "before tuning", "file"} <= set(re.findall("<figcaption>(.*?)</figcaption>", page))
+
+
+def test_a_page_is_not_replaced_without_being_told(folder, tmp_path):
+    (tmp_path / "page.html").write_text("mine")
+    words = ["train", str(folder), "-o", str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
+    result = CliRunner().invoke(app, words)
+    assert (1, "mine") == (result.exit_code, (tmp_path / "page.html").read_text())
+    assert "page.html exists" in result.stderr

@@ -1,0 +1,220 @@
+"""One page about a training and the file that was tuned after it: `--page` of train and finetune."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import counted
+from csplat.model import SplatModel
+from csplat_tools.files.console import format_bytes
+from csplat_tools.files.pictures import to_bytes
+from csplat_tools.files.streams import write_bytes
+from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.hardest import pictures_beside
+from csplat_tools.pages.parts import definitions, document, table
+from csplat_tools.pages.svg import INK, drawn
+from csplat_tools.training.report import SCORES, number
+from csplat_tools.views import ViewSet, evenly
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Shown", "make_page", "show_views", "write_page"]
+
+U8 = NDArray[np.uint8]
+
+_VIEWS = 3  # that are shown
+_WIDE, _HIGH = 7.0, 3.4  # inches of a plot
+_LINE, _OTHER = "#2f83c9", "#d55e00"
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A view that judges, as pictures.
+
+    Attributes:
+        name: of the photograph, or its number.
+        pictures: [H, W, 3] uint8 each, by what they are.
+    """
+
+    name: str
+    pictures: Mapping[str, U8]
+
+
+def show_views(
+    source: SplatModel, models: Mapping[str, SplatModel], views: ViewSet, threads: int | None
+) -> list[Shown]:
+    """Draw a few of the views that judge, beside what they ought to look like.
+
+    Args:
+        source: the scene, whose renders are shown where there are no photographs.
+        models: by what is said below the picture.
+        views: those that judge are shown, evenly spread.
+        threads: how many; `None` for all.
+    """
+    if not views.judges:
+        return []
+    judge = views.photograph_judge(threads=threads) if views.photographs else views.judge(source, threads=threads)
+    places = evenly(range(len(judge.cameras)), _VIEWS)
+    judge = judge.some(places)
+    wanted = "photograph" if views.photographs else "the source"
+    rows: list[dict[str, U8]] = [{} for _ in places]
+    for name, model in models.items():
+
+        def look(at: int, picture: NDArray[np.float32], seen: NDArray[np.float32], name: str = name) -> None:
+            rows[at].setdefault(wanted, to_bytes(picture))
+            rows[at][name] = to_bytes(seen)
+
+        judge.scores(model, ssim=False, on_view=look)
+    names = [camera.image or f"view {place}" for place, camera in zip(places, judge.cameras, strict=True)]
+    return [Shown(name, row) for name, row in zip(names, rows, strict=True)]
+
+
+def write_page(
+    path: str, name: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[Shown]
+) -> None:
+    """Write the page; arguments as of `make_page`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    write_bytes(path, make_page(PurePath(name).name, training, file, shown).encode())
+
+
+def make_page(
+    title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[Shown]
+) -> str:
+    """The page as text.
+
+    Args:
+        title: name of the scene or file.
+        training: log of the training, if there was one.
+        file: report of the file, if there is one, with its log.
+        shown: pictures.
+    """
+    parts = [
+        _head(title, training, file),
+        _scores(training, file),
+        _pictures(shown),
+        _steps(training),
+        _tuning(file),
+        _bytes(file),
+        _options(training, file),
+    ]
+    return document(title, parts)
+
+
+def _head(title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    words = []
+    if file is not None:
+        words += [counted(file["splats"], "splat"), format_bytes(file["size_bytes"])]
+        words.append(f"{file['ratio']:.1f} times smaller than the PLY")
+    elif training is not None:
+        words.append(counted(training["splat_count"], "splat"))
+    seconds = (training["seconds"] if training else 0.0) + (file["seconds_without_judging"] if file else 0.0)
+    words.append(f"{seconds / 60:.1f} minutes")
+    return f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape("; ".join(words))}</p>'
+
+
+def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    if file is not None and file["scores"]:
+        scores, views, by = file["scores"], file["judged_views"], file["judged_by"]
+    elif training is not None and training["metrics"]:
+        scores, views, by = {"trained scene": training["metrics"]}, training["metrics"]["views"], "held-out photographs"
+    else:
+        return ""
+    rows = [(name, *(number(one[score], digits) for score, digits in SCORES)) for name, one in scores.items()]
+    text = (
+        f"By {views} {by}, from which nothing was learnt. psnr is of the error over all their pixels, dB; psnr_mean the"
+        " mean of the views' own, as papers have it; ssim is 1 at best, lpips 0."
+    )
+    return f"<h2>How near it comes</h2>\n<p>{escape(text)}</p>\n{table(('', *(name for name, _ in SCORES)), rows)}"
+
+
+def _pictures(shown: Sequence[Shown]) -> str:
+    blocks = [f"<h3>{escape(one.name)}</h3>\n{pictures_beside(one.pictures, one.name)}" for one in shown]
+    text = "Views from which nothing was learnt, evenly spread. They are compressed for this page."
+    return f"<h2>What it looks like</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
+
+
+def _steps(training: Mapping[str, Any] | None) -> str:
+    if training is None or len(training["entries"]) < 2:
+        return ""
+    entries, tests = training["entries"], training["evaluations"]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        steps = [one["iteration"] for one in entries]
+        axes.plot(steps, [one["psnr"] for one in entries], color=_LINE, label="photographs that teach")
+        if tests:
+            at, found = [one["iteration"] for one in tests], [one["psnr"] for one in tests]
+            axes.plot(at, found, "o", color=_OTHER, label="photographs held out")
+        axes.set(xlabel="step", ylabel="PSNR, dB")
+        axes.legend(loc="lower right")
+        beside = axes.twinx()
+        beside.plot(steps, [one["splat_count"] for one in entries], ":", color=INK)
+        beside.set_ylabel("splats (dotted)")
+        beside.set_ylim(bottom=0)
+        beside.grid(visible=False)
+
+    return f"<h2>The training</h2>\n{_plot(draw, 'training')}"
+
+
+def _tuning(file: Mapping[str, Any] | None) -> str:
+    looks = [] if file is None else file["log"]["looks"]
+    if len(looks) < 2:
+        return ""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        steps = [one["iteration"] for one in looks]
+        axes.plot(steps, [one["psnr"] for one in looks], "o-", color=_LINE, markersize=3)
+        axes.set(xlabel="step", ylabel="PSNR of views that decide, dB")
+        beside = axes.twinx()
+        beside.plot(steps, [one["bits_per_splat"] for one in looks], ":", color=INK)
+        beside.set_ylabel("bits per splat (dotted)")
+        beside.grid(visible=False)
+
+    text = "Values move, seen through the encoder's quantisers; what looked best for its bytes was kept."
+    return f"<h2>The tuning</h2>\n<p>{escape(text)}</p>\n{_plot(draw, 'tuning')}"
+
+
+def _plot(draw: Any, name: str) -> str:
+    picture = drawn(draw, (_WIDE, _HIGH), name, inline=True)
+    return f'<figure class="plot"><div class="scroll">{picture}</div></figure>'
+
+
+def _bytes(file: Mapping[str, Any] | None) -> str:
+    if file is None:
+        return ""
+    sizes, whole = {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}, file["size_bytes"]
+    bars = [
+        Bar(name, {name: taken}, f"{format_bytes(taken)}, {100.0 * taken / whole:.1f} %")
+        for name, taken in sizes.items()
+    ]
+    picture = f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
+    return f"<h2>Where the bytes are</h2>\n{picture}"
+
+
+def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    words = {}
+    if training is not None:
+        words["training"] = _words(training["options"])
+    if file is not None:
+        words |= {"encoding": _words(file["encoding"]), "tuning": _words(file["log"]["options"])}
+        words["seconds"] = _words(file["seconds"])
+    memory = (file["log"] if file else training or {}).get("peak_memory_bytes")
+    if memory is not None:
+        words["memory at most"] = format_bytes(memory)
+    return f"<h2>How it was made</h2>\n{definitions(words)}"
+
+
+def _words(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in options.items() if value is not None)
