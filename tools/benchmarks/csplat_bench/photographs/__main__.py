@@ -3,10 +3,13 @@
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml FOLDER --lpips alex.npz
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml --tables --markdown
 
-FOLDER is the data set. A configuration file says with which words `csplat train` is called: `training` for all files,
-`files` for each, by name. The training lies in --work as NAME.ply, with its checkpoint, its files beside it. Figures of
-the held-out photographs are kept in NAME.json beside the configuration file, and drawn in NAME.svg: an interrupted run
-goes on where it ended. PSNR is the mean over the photographs, as papers print it, and pooled; LPIPS is AlexNet's.
+FOLDER is the data set. A configuration file says with which words `csplat train` is called: `trainings`, by name,
+each from nothing or `after` another one, from whose end it goes on; and `files`, by name, each `of` a training. A file
+that is not made by `csplat train` says `by` what: `finetune` or `encode` of the trained PLY, FOLDER among its words
+where that is to look at photographs. Trainings lie in --work as NAME-TRAINING.ply, with their checkpoints, files
+beside them. Figures of the held-out photographs are kept in NAME.json beside the configuration file, and drawn in
+NAME.svg: an interrupted run goes on where it ended. PSNR is the mean over the photographs, as papers print it, and
+pooled; LPIPS is AlexNet's.
 """
 
 from __future__ import annotations
@@ -67,35 +70,55 @@ def _measure(
     if not data.test:
         raise InputError(f"{folder} holds out no photographs to judge by")
     work.mkdir(parents=True, exist_ok=True)
-    ply, run_file = work / f"{name}.ply", work / f"{name}.npz"
     kept.values |= {"title": wanted["title"], "machine": describe(), "test_views": len(data.test)}
-    training = ["csplat", "train", str(folder), *wanted["training"]]
+    trainings: dict[str, dict[str, Any]] = wanted["trainings"]
 
-    def trained() -> dict[str, Any]:
-        words = [*training, "-o", str(ply), "--checkpoint", str(run_file), "--checkpoint-every", "1000"]
-        found = _called(words if not run_file.exists() else [*words, "--resume", str(run_file)], ply)
+    def words_of(training: str) -> list[str]:
+        return ["csplat", "train", str(folder), *trainings[training]["words"]]
+
+    def checkpoint(training: str) -> Path:
+        return work / f"{name}-{training}.npz"
+
+    def trained(training: str) -> dict[str, Any]:
+        ply, run_file, after = work / f"{name}-{training}.ply", checkpoint(training), trainings[training].get("after")
+        begin = run_file if run_file.exists() else None if after is None else checkpoint(after)
+        resumed = [] if begin is None else ["--resume", str(begin)]
+        words = [*words_of(training), "-o", str(ply), "--checkpoint", str(run_file), "--checkpoint-every", "1000"]
+        found = _called([*words, *resumed], ply)
         source = read_ply(ply)
+        said = [] if after is None else ["--resume", checkpoint(after).name]
         return {
-            "command": _said(training, folder), "seconds": round(found["seconds"]), "splats": len(source),
-            "size_bytes": ply.stat().st_size, "peak_memory_bytes": found["peak_memory_bytes"],
+            "command": _said([*words_of(training), *said], folder), "seconds": round(found["seconds"]),
+            "splats": len(source), "size_bytes": ply.stat().st_size, "peak_memory_bytes": found["peak_memory_bytes"],
             **_scores(source, data, lpips),
         }  # fmt: skip
 
     def made(file: str) -> dict[str, Any]:
         path, start = work / f"{name}-{file.replace(' ', '')}.csplat", time.perf_counter()
-        words = [*training, *wanted["files"][file], "--resume", str(run_file), "-o", str(path)]
-        found = _called(words, path)["file"]
-        seconds = time.perf_counter() - start - found["seconds"].get("judging", 0.0)
+        training, by = wanted["files"][file]["of"], wanted["files"][file].get("by", "train")
+        words = ["csplat", by, str(work / f"{name}-{training}.ply")]
+        if by == "train":
+            words = [*words_of(training), "--resume", str(checkpoint(training))]
+        words += [str(folder) if word == "FOLDER" else word for word in wanted["files"][file]["words"]]
+        found = _called([*words, "-o", str(path)], path)
+        seconds = time.perf_counter() - start
+        found = found.get("file", found)
+        decoded, stages = decode(path.read_bytes()), found.get("seconds")
+        stages = stages if isinstance(stages, dict) else {}
         return {
-            "command": _said([*training, *wanted["files"][file]], folder), "seconds": round(seconds),
-            "stages": found["seconds"], "steps": found["steps"], "splats": found["splats"],
-            "size_bytes": found["size_bytes"], "peak_memory_bytes": found["peak_memory_bytes"],
-            "attribute_bytes": found["bytes_by_attribute"], "before_tuning": found["scores"]["before tuning"],
-            **_scores(decode(path.read_bytes()), data, lpips),
+            "training": training, "by": by, "command": _said(words, folder).replace(f"{work}/", ""),
+            "seconds": round(seconds - stages.get("judging", 0.0)), "stages": stages, "steps": found.get("steps"),
+            "splats": len(decoded), "size_bytes": path.stat().st_size,
+            "peak_memory_bytes": found.get("peak_memory_bytes"), "attribute_bytes": found.get("bytes_by_attribute"),
+            "before_tuning": found.get("scores", {}).get("before tuning"), **_scores(decoded, data, lpips),
         }  # fmt: skip
 
-    kept.measure("training", "scene", trained)
     for file in files:
+        chain = [wanted["files"][file]["of"]]
+        while (after := trainings[chain[0]].get("after")) is not None:
+            chain.insert(0, after)
+        for training in chain:
+            kept.measure("trainings", training, partial(trained, training))
         kept.measure("files", file, partial(made, file))
 
 

@@ -13,7 +13,7 @@ from csplat_bench.photographs.published import PUBLISHED, Published
 __all__ = ["plot", "tables"]
 
 # Okabe and Ito's colours, told apart by all eyes.
-_OURS = "#0072B2"
+_OURS = {"train": ("#0072B2", "o-"), "finetune": ("#56B4E9", "o--"), "encode": ("#0072B2", "o:")}
 _STYLES = {
     "HAC": ("#E69F00", "s"), "HAC++": ("#D55E00", "D"), "HEMGS": ("#CC79A7", "^"), "RDO-Gaussian": ("#009E73", "v"),
     "Compact-3DGS": ("0.5", "P"), "Self-Organizing Gaussians": ("0.5", "X"),
@@ -32,7 +32,7 @@ _HEADER = (
     "memory, GB",
 )
 _THEIR_HEADER = ("published", "MB", "PSNR mean, dB", "SSIM", "LPIPS (VGG)", "networks", "from")
-_FROM, _TO = 3.5e5, 5.2e6  # bytes that the plot shows
+_TICKS = [factor * decade for decade in (1e4, 1e5, 1e6) for factor in (1, 1.5, 2, 3, 4, 6, 8)]  # bytes
 
 
 def tables(known: Mapping[str, Any], name: str, *, markdown: bool = False) -> str:
@@ -43,13 +43,15 @@ def tables(known: Mapping[str, Any], name: str, *, markdown: bool = False) -> st
         name: of the scene, as published figures are kept.
         markdown: as documents have tables.
     """
-    if "training" not in known:
+    if "trainings" not in known:
         return "nothing is known yet"
-    scene = known["training"]["scene"]
-    rows = [_row(name, one) for name, one in (("trained scene", scene), *_by_size(known))]
+    rows = [_row(f"trained: {name}", one) for name, one in known["trainings"].items()]
+    rows += [_row(f"{name}, of {one['training']}", one) for name, one in _by_size(known)]
+    made = [(name, f"`{one['command']}`") for name, one in known["trainings"].items()]
     theirs = [_their_row(one) for one in sorted(PUBLISHED.get(name, ()), key=lambda one: one.size_bytes)]
-    title = f"{known['title']}, {known['test_views']} held-out photographs: `{scene['command']}`"
-    return laid_out([Table(_HEADER, rows, title), Table(_THEIR_HEADER, theirs)], markdown=markdown)
+    title = f"{known['title']}, {known['test_views']} held-out photographs"
+    parts = [Table(_HEADER, rows, title), Table(("training", "made by"), made), Table(_THEIR_HEADER, theirs)]
+    return laid_out(parts, markdown=markdown)
 
 
 def _by_size(known: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
@@ -104,10 +106,11 @@ def plot(known: Mapping[str, Any], name: str, path: Path) -> None:
             points = sorted((one.size_bytes, one.psnr) for one in PUBLISHED.get(name, ()) if one.method == method)
             if points:
                 axis.plot(*zip(*points, strict=True), f"{marker}--", color=colour, markersize=5, lw=1, label=method)
-        sizes, decibels = [one["size_bytes"] for one in files], [one["psnr_mean"] for one in files]
-        axis.plot(sizes, decibels, "o-", color=_OURS, lw=1.8, label="csplat")
-        axis.set_xlim(_FROM, _TO)
-        ticks = [0.4e6, 0.6e6, 0.8e6, 1e6, 1.5e6, 2e6, 3e6, 4e6, 5e6]
+        for by, (colour, style) in _OURS.items():
+            points = [(one["size_bytes"], one["psnr_mean"]) for one in files if one["by"] == by]
+            if points:
+                axis.plot(*zip(*points, strict=True), style, color=colour, lw=1.8, label=f"csplat {by}")
+        ticks = [tick for tick in _TICKS if axis.get_xlim()[0] <= tick <= axis.get_xlim()[1]]
         axis.set_xticks(ticks, [f"{tick / 1e6:g}" for tick in ticks])
         axis.set_xticks([], minor=True)
         axis.set_xlabel("MB")
