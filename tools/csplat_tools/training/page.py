@@ -217,4 +217,4 @@ def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None)
 
 
 def _words(options: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in options.items() if value is not None)
+    return ", ".join(f"{name} {value}" for name, value in options.items() if isinstance(value, str | int | float))
