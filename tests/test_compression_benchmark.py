@@ -1,7 +1,6 @@
 """The benchmark of compressions: sizes by arithmetic, the control without quantisers, what is kept, a whole run."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +25,6 @@ from csplat_bench.compression.controls import Unquantised, eight_bits
 from csplat_bench.compression.memory import finetuned
 from csplat_bench.compression.sizes import Book, books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 from csplat_bench.compression.tables import tables
-from csplat_bench.photographs.__main__ import main as from_photographs
 from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 
 BLACK = np.zeros(3, np.float32)
@@ -222,24 +220,3 @@ def test_peak_memory_is_that_of_the_command(capture, tmp_path):
 def test_nothing_is_printed_of_what_is_not_known():
     assert "" == tables({})
     assert "" == tables({"half": {"settings": {}}})
-
-
-# from photographs
-
-
-def test_one_training_becomes_files_whose_figures_are_kept(capture, tmp_path, capsys):
-    config, work = tmp_path / "lego800.toml", tmp_path / "work"
-    config.write_text(
-        'title = "Shell"\ntraining = ["--max-splats", "40", "--sh-degree", "0", "--iterations", "30"]\n'
-        '[files]\nhalf = ["--keep", "0.5"]\nall = ["--keep", "1"]\n'
-    )
-    assert 0 == command(from_photographs, [str(config), str(capture), "--work", str(work)])
-    printed = capsys.readouterr().out
-    assert all(word in printed for word in ("trained scene", "half", "HAC++", "RDO-Gaussian"))
-    known = json.loads(config.with_suffix(".json").read_text())
-    assert known["files"]["half"]["size_bytes"] < known["files"]["all"]["size_bytes"]
-    assert "csplat train" in known["training"]["scene"]["command"]
-    assert config.with_suffix(".svg").stat().st_size > 1000
-    shutil.rmtree(work)  # what is known is not made again
-    assert 0 == command(from_photographs, [str(config), str(capture), "--work", str(work), "--files", "half"])
-    assert printed == capsys.readouterr().out

@@ -212,6 +212,17 @@ def test_a_halved_picture_is_what_its_camera_sees(channels):
     assert [[1, 2]] == np.argwhere(~half.mask).tolist()
 
 
+def test_a_picture_of_which_half_the_size_would_leave_nothing_stays_as_it_is():
+    lines, narrow = np.zeros((6, 8), bool), Camera(intrinsics(1, 6, 8.0), np.eye(4), 1, 6)
+    lines[:, ::2] = True
+    camera = Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
+    for picture in (
+        Picture(camera, np.zeros((6, 8, 3), np.uint8), lines),
+        Picture(narrow, np.zeros((6, 1, 3), np.uint8)),
+    ):
+        assert halved(picture) is picture
+
+
 def test_growth_reaches_the_cap_halfway():
     options = TrainOptions(max_splats=1000, iterations=2000, refine_start=100)
     count = 10.0

@@ -60,7 +60,8 @@ class TrainOptions:
         lr_shN: learning rate of the higher SH coefficients.
         lr_exposure: of a gain and a shift per photograph and channel, for photographs that were exposed differently; no
             scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
-        lr_decay: the other rates fall to this share of themselves, along half a cosine from `refine_stop` to the end.
+        lr_decay: the other rates fall to this share of themselves, along half a cosine from `refine_stop` (not where
+            that is 1) to the end.
         half_size: share of the iterations, the first, that learn from photographs of half the width and height: while
             splats are few and places rough, these teach as much, in little more than half the time.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.

@@ -140,23 +140,23 @@ def compose(picture: Picture, background: F32, out: F32) -> F32:
 def halved(picture: Picture) -> Picture:
     """The picture at half its width and height: each pixel is the mean of four, weighted with their alpha.
 
-    A last odd row or column is left out. A pixel counts where all four do.
-
-    Raises:
-        InputError: the picture is one pixel wide or high, or none of its smaller pixels counts.
+    A last odd row or column is left out. A pixel counts where all four do; where none would, or the picture is one
+    pixel wide or high, it stays as it is.
     """
     camera = picture.camera
     W, H = camera.W // 2, camera.H // 2
-    smaller = replace(camera, K=np.diag([0.5, 0.5, 1.0]) @ camera.K, W=W, H=H)
     corners = [(slice(y, 2 * H, 2), slice(x, 2 * W, 2)) for y in (0, 1) for x in (0, 1)]
+    mask: Mask | None = None
+    if picture.mask is not None:
+        mask = np.asarray(np.stack([picture.mask[corner] for corner in corners]).all(axis=0))
+    if min(W, H) == 0 or (mask is not None and not mask.any()):
+        return picture
+    smaller = replace(camera, K=np.diag([0.5, 0.5, 1.0]) @ camera.K, W=W, H=H)
     four = np.stack([picture.pixels[corner] for corner in corners]).astype(np.uint32)
     alphas = four[..., 3:] if picture.has_alpha else np.ones((4, H, W, 1), np.uint32)
     weights = alphas.sum(axis=0)
     colours = ((alphas * four[..., :3]).sum(axis=0) + weights // 2) // np.maximum(weights, 1)
     pixels = np.concatenate([colours, (weights + 2) // 4], axis=2) if picture.has_alpha else colours
-    mask: Mask | None = None
-    if picture.mask is not None:
-        mask = np.asarray(np.stack([picture.mask[corner] for corner in corners]).all(axis=0))
     return Picture(smaller, np.ascontiguousarray(pixels, np.uint8), mask)
 
 

@@ -57,7 +57,7 @@ tr.front td { background: var(--front); }
 .legend dt { font-weight: 600; color: var(--text); }
 .commands div { padding: 6px 0; border-bottom: 1px solid var(--line); }
 code { font: 12.5px/1.5 ui-monospace, 'SF Mono', Consolas, monospace; overflow-wrap: anywhere; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(45%, 220px), 1fr)); gap: 6px; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(45%, 150px), 1fr)); gap: 6px; }
 .pictures img { display: block; width: 100%; height: auto; background: #000; border-radius: 4px; }
 dl { display: grid; grid-template-columns: fit-content(28ch) 1fr; gap: 3px 18px; margin: 0; }
 @media (max-width: 640px) { dl { grid-template-columns: 1fr; } dd { padding-bottom: 6px; } }

@@ -20,7 +20,7 @@ from csplat_tools.pages.bars import Bar, draw_bars
 from csplat_tools.pages.hardest import pictures_beside
 from csplat_tools.pages.parts import definitions, document, table
 from csplat_tools.pages.svg import INK, drawn
-from csplat_tools.training.report import SCORES, number
+from csplat_tools.training.report import SCORES, score_rows
 from csplat_tools.views import ViewSet, evenly
 
 if TYPE_CHECKING:
@@ -67,6 +67,8 @@ def show_views(
     wanted = "photograph" if views.photographs else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
+        if model is source and not views.photographs:
+            continue  # it is what the others ought to look like
 
         def look(at: int, picture: NDArray[np.float32], seen: NDArray[np.float32], name: str = name) -> None:
             rows[at].setdefault(wanted, to_bytes(picture))
@@ -118,7 +120,10 @@ def _head(title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any
         words.append(f"{file['ratio']:.1f} times smaller than the PLY")
     elif training is not None:
         words.append(counted(training["splat_count"], "splat"))
-    seconds = (training["seconds"] if training else 0.0) + (file["seconds_without_judging"] if file else 0.0)
+    seconds = training["seconds"] if training else 0.0
+    if file is not None:
+        tuning = file["seconds"]["tuning"]
+        seconds += file["seconds_without_judging"] - tuning + max(tuning, file["log"]["seconds"])  # if it was resumed
     words.append(f"{seconds / 60:.1f} minutes")
     return f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape("; ".join(words))}</p>'
 
@@ -130,12 +135,11 @@ def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) 
         scores, views, by = {"trained scene": training["metrics"]}, training["metrics"]["views"], "held-out photographs"
     else:
         return ""
-    rows = [(name, *(number(one[score], digits) for score, digits in SCORES)) for name, one in scores.items()]
     text = (
         f"By {views} {by}, from which nothing was learnt. psnr is of the error over all their pixels, dB; psnr_mean the"
         " mean of the views' own, as papers have it; ssim is 1 at best, lpips 0."
     )
-    return f"<h2>How near it comes</h2>\n<p>{escape(text)}</p>\n{table(('', *(name for name, _ in SCORES)), rows)}"
+    return f"<h2>How near it comes</h2>\n<p>{escape(text)}</p>\n{table(('', *SCORES), score_rows(scores))}"
 
 
 def _pictures(shown: Sequence[Shown]) -> str:
@@ -164,7 +168,9 @@ def _steps(training: Mapping[str, Any] | None) -> str:
         beside.set_ylim(bottom=0)
         beside.grid(visible=False)
 
-    return f"<h2>The training</h2>\n{_plot(draw, 'training')}"
+    small = training["options"]["half_size"]
+    text = f"<p>The first {small:.0%} of the steps saw photographs of half the size.</p>\n" if small else ""
+    return f"<h2>The training</h2>\n{text}{_plot(draw, 'training')}"
 
 
 def _tuning(file: Mapping[str, Any] | None) -> str:

@@ -16,10 +16,10 @@ from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.views import ViewSet
 
-__all__ = ["SCORES", "Judged", "as_report", "format_report", "judge_models", "number"]
+__all__ = ["SCORES", "Judged", "as_report", "format_report", "judge_models", "score_rows"]
 
 #: Scores that are told, and with how many digits.
-SCORES = (("psnr", 2), ("psnr_mean", 2), ("ssim", 4), ("lpips", 4))
+SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ def judge_models(
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
         if known is not None and name in known:
-            scores[name] = {score: known[name][score] for score, _ in SCORES}
+            scores[name] = {score: known[name][score] for score in SCORES}
         elif taken or model is not source:
             found = judge.scores(model, lpips=lpips)
-            scores[name] = {score: getattr(found, score) for score, _ in SCORES}
+            scores[name] = {score: getattr(found, score) for score in SCORES}
     return Judged("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
 
 
@@ -133,11 +133,8 @@ def format_report(report: Mapping[str, Any]) -> str:
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
     lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
     if report["scores"]:
-        rows = [
-            (name, *(number(one[score], digits) for score, digits in SCORES)) for name, one in report["scores"].items()
-        ]
-        header = (f"{report['judged_views']} {report['judged_by']}", *(score for score, _ in SCORES))
-        lines += ["", format_table(header, rows)]
+        header = (f"{report['judged_views']} {report['judged_by']}", *SCORES)
+        lines += ["", format_table(header, score_rows(report["scores"]))]
     parts = [*report["bytes_by_attribute"].items(), ("everything else", report["overhead_bytes"])]
     rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
     lines += ["", format_table(("bytes", "all", "per source splat"), rows_bytes)]
@@ -150,6 +147,10 @@ def format_report(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def number(value: float | None, digits: int) -> str:
-    """A score as text."""
-    return "-" if value is None else f"{value:.{digits}f}"
+def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[str, ...]]:
+    """Rows of a table of scores, by name of the model; what was not measured is a dash."""
+
+    def cell(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    return [(name, *(cell(one[score], digits) for score, digits in SCORES.items())) for name, one in scores.items()]

@@ -116,7 +116,9 @@ def run_training_to_file(
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
     views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
-    known = {"source": {**result.metrics, "lpips": None}} if result.metrics and not options.eval_views else None
+    known = None
+    if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
+        known = {"source": {**result.metrics, "lpips": None}}
     report = run_finetuning(
         model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
         training=result.log, quiet=quiet,

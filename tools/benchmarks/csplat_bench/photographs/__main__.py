@@ -1,10 +1,11 @@
-"""Train a scene once, make files of several sizes of it, judge them, and draw them beside published ones.
+"""Train a scene, make files of several sizes of it, judge them, and draw them beside published ones.
 
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml FOLDER --lpips alex.npz
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml --tables --markdown
 
 FOLDER is the data set. A configuration file says with which words `csplat train` is called: `trainings`, by name,
-each from nothing or `after` another one, from whose end it goes on; and `files`, by name, each `of` a training. A file
+each from nothing or `after` another one, from whose end it goes on; `files`, by name, each `of` a training; `size`, if
+photographs are to be made smaller. Seconds are those of one training, or one file, on top of those before it. A file
 that is not made by `csplat train` says `by` what: `finetune` or `encode` of the trained PLY, FOLDER among its words
 where that is to look at photographs. Trainings lie in --work as NAME-TRAINING.ply, with their checkpoints, files
 beside them. Figures of the held-out photographs are kept in NAME.json beside the configuration file, and drawn in
@@ -36,6 +37,8 @@ from csplat_bench.common.report import describe
 from csplat_bench.common.scenes import OUT
 from csplat_bench.photographs.tables import plot, tables
 from csplat_render.lpips import Lpips, load_lpips
+from csplat_tools.cli.parsing import parse_size
+from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.evaluate import photograph_judge
 
@@ -45,7 +48,7 @@ def main(
     folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="the data set")] = None,
     *,
     files: Annotated[str | None, typer.Option(help="only these, by name, separated by commas")] = None,
-    work: Annotated[Path, typer.Option(help="folder for the training and its files")] = OUT / "photographs",
+    work: Annotated[Path, typer.Option(help="folder for trainings and files")] = OUT / "photographs",
     lpips: LPIPS = None,
     show: TABLES = False,
     markdown: MARKDOWN = False,
@@ -66,7 +69,8 @@ def main(
 def _measure(
     name: str, wanted: dict[str, Any], files: Sequence[str], folder: Path, work: Path, lpips: Lpips | None, kept: Kept
 ) -> None:
-    data = load(folder, test_every=8)
+    size = wanted.get("size")
+    data = load(folder, None if size is None else parse_size(size), test_every=8)
     if not data.test:
         raise InputError(f"{folder} holds out no photographs to judge by")
     work.mkdir(parents=True, exist_ok=True)
@@ -74,7 +78,8 @@ def _measure(
     trainings: dict[str, dict[str, Any]] = wanted["trainings"]
 
     def words_of(training: str) -> list[str]:
-        return ["csplat", "train", str(folder), *trainings[training]["words"]]
+        sized = [] if size is None else ["--size", size]
+        return ["csplat", "train", str(folder), *sized, *trainings[training]["words"]]
 
     def checkpoint(training: str) -> Path:
         return work / f"{name}-{training}.npz"
@@ -85,10 +90,12 @@ def _measure(
         resumed = [] if begin is None else ["--resume", str(begin)]
         words = [*words_of(training), "-o", str(ply), "--checkpoint", str(run_file), "--checkpoint-every", "1000"]
         found = _called([*words, *resumed], ply)
-        source = read_ply(ply)
+        source, seconds = read_ply(ply), found["seconds"]
+        if after is not None:
+            seconds -= load_checkpoint(checkpoint(after)).log["seconds"]
         said = [] if after is None else ["--resume", checkpoint(after).name]
         return {
-            "command": _said([*words_of(training), *said], folder), "seconds": round(found["seconds"]),
+            "command": _said([*words_of(training), *said], folder), "seconds": round(seconds),
             "splats": len(source), "size_bytes": ply.stat().st_size, "peak_memory_bytes": found["peak_memory_bytes"],
             **_scores(source, data, lpips),
         }  # fmt: skip

@@ -174,7 +174,7 @@ def measure_row(subject: Subject, row: Row) -> Measured:
 
 
 def _tuned(subject: Subject, model: SplatModel, options: EncodeOptions) -> bytes:
-    """A file that was tuned by the photographs, as `csplat finetune --data` does."""
+    """A file that was tuned by the photographs, as `csplat finetune --data … --keep-unseen` does."""
     if subject.photographs is None:
         raise InputError(f"{subject.name} has no photographs that a file could be tuned by")
     views = training_views(model, subject.photographs, None)
