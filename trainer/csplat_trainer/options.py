@@ -62,8 +62,8 @@ class TrainOptions:
             scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
         lr_decay: the other rates fall to this share of themselves, along half a cosine from `refine_stop` (not where
             that is 1) to the end.
-        half_size: share of the iterations, the first, that learn from photographs of half the width and height, in
-            little more than half the time: for splats that are few and in rough places yet.
+        half_size: share of the iterations, the first, that learn from photographs of half the width and height: for
+            splats that are few and in rough places yet.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
         opacity_weight: of the mean opacity in the loss (mcmc and fixed).
         scale_weight: of the mean standard deviation in the loss (mcmc and fixed).

@@ -14,7 +14,7 @@ from csplat_tools.files.scenes import LoadedModel, load_model
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
 from csplat_tools.inspect.info import FileFacts
 from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
-from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.bars import attribute_figure
 from csplat_tools.pages.parts import definitions, document, table
 
 __all__ = ["make_page", "write_page"]
@@ -144,13 +144,8 @@ def _source(beside: _Beside | None) -> str:
 
 
 def _bytes(facts: FileFacts) -> str:
-    size = facts.header.file_size
     sizes = {name: one.size_bytes for name, one in facts.attributes.items()}
     sizes["overhead"] = sum(facts.overhead.values())
-    bars = [
-        Bar(name, {name: taken}, f"{format_bytes(taken)}, {100.0 * taken / size:.1f} %")
-        for name, taken in sizes.items()
-    ]
     rows = [
         (name, _ATTRIBUTES.get(name, ""), f"{one.size_bytes:,}", _bits(one.bits_per_splat), coding_words(one))
         for name, one in facts.attributes.items()
@@ -158,8 +153,7 @@ def _bytes(facts: FileFacts) -> str:
     overhead = ", ".join(f"{name} {number}" for name, number in facts.overhead.items())
     rows.append(("overhead", _ATTRIBUTES["overhead"], f"{sizes['overhead']:,}", "", overhead))
     head = ("attribute", "what it says", "bytes", "bits per splat", "how it is coded")
-    picture = f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
-    return f"<h2>Where the bytes are</h2>\n{picture}\n{table(head, rows, words=(1, 4))}"
+    return f"<h2>Where the bytes are</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
 
 
 def _layers(facts: FileFacts) -> str:

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["STANDALONE", "Bar", "draw_bars"]
+from csplat_tools.files.console import format_bytes
+
+__all__ = ["STANDALONE", "Bar", "attribute_figure", "draw_bars"]
 
 # Colours that people tell apart whatever colours they see, on white and on black.
 _COLOURS = {
@@ -72,6 +74,15 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
     box = f"{-air} {-air} {_WIDTH + 2 * air} {top + 2 * air}"
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-size="{_SIZE}"'
     return f'{head} fill="currentColor"{mark}>{ground}{"".join(parts)}</svg>'
+
+
+def attribute_figure(sizes: Mapping[str, int]) -> str:
+    """What each attribute takes, of bytes by attribute that are all of a file: a figure for a page."""
+    whole = sum(sizes.values())
+    bars = [
+        Bar(name, {name: size}, f"{format_bytes(size)}, {100.0 * size / whole:.1f} %") for name, size in sizes.items()
+    ]
+    return f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
 
 
 def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from csplat.model import SplatModel
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.pictures import to_bytes
 from csplat_tools.files.streams import write_bytes
-from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.bars import attribute_figure
 from csplat_tools.pages.hardest import pictures_beside
 from csplat_tools.pages.parts import definitions, document, table
 from csplat_tools.pages.svg import INK, drawn
@@ -61,9 +61,9 @@ def show_views(
     """
     if not views.judges:
         return []
+    places = evenly(range(len(views.judges)), _VIEWS)
+    views = replace(views, judges=[views.judges[place] for place in places])
     judge = views.photograph_judge(threads=threads) if views.photographs else views.judge(source, threads=threads)
-    places = evenly(range(len(judge.cameras)), _VIEWS)
-    judge = judge.some(places)
     wanted = "photograph" if views.photographs else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
@@ -200,13 +200,8 @@ def _plot(draw: Any, name: str) -> str:
 def _bytes(file: Mapping[str, Any] | None) -> str:
     if file is None:
         return ""
-    sizes, whole = {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}, file["size_bytes"]
-    bars = [
-        Bar(name, {name: taken}, f"{format_bytes(taken)}, {100.0 * taken / whole:.1f} %")
-        for name, taken in sizes.items()
-    ]
-    picture = f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
-    return f"<h2>Where the bytes are</h2>\n{picture}"
+    sizes = {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}
+    return f"<h2>Where the bytes are</h2>\n{attribute_figure(sizes)}"
 
 
 def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
