@@ -29,6 +29,11 @@ words = ["--max-splats", "60", "--sh-degree", "0", "--iterations", "60"]
 "trained" = { of = "more", words = ["--keep", "0.5"] }
 "encoded" = { of = "more", by = "encode", words = ["--preset", "small"] }
 "tuned" = { of = "few", by = "finetune", words = ["--data", "FOLDER", "--iterations", "20"] }
+[files.free]
+of = "few"
+by = "finetune"
+without = "a price"
+words = ["--data", "FOLDER", "--iterations", "20", "--set", "byte_cost=0"]
 """
 
 
@@ -41,7 +46,7 @@ def test_files_of_trainings_are_made_judged_and_drawn(tmp_path, capsys):
     assert all(word in printed for word in ("trained: few", "trained, of more", "HAC++", "RDO-Gaussian"))
     known = json.loads((tmp_path / "lego800.json").read_text())
     assert ["few", "more"] == sorted(known["trainings"])
-    assert ["encoded", "trained", "tuned"] == sorted(known["files"])
+    assert ["encoded", "free", "trained", "tuned"] == sorted(known["files"])
     for name, one in known["files"].items():
         path = work / f"lego800-{name}.csplat"
         assert one["size_bytes"] == path.stat().st_size
@@ -53,7 +58,9 @@ def test_files_of_trainings_are_made_judged_and_drawn(tmp_path, capsys):
     assert known["files"]["trained"]["splats"] < known["files"]["encoded"]["splats"]
     assert known["trainings"]["more"]["command"].endswith("--resume lego800-few.npz")
     assert str(tmp_path) not in json.dumps(known)
-    assert "csplat train" in (tmp_path / "lego800.svg").read_text()
+    drawn = (tmp_path / "lego800.svg").read_text()
+    assert "csplat train" in drawn
+    assert "csplat finetune, without a price" in drawn
     shutil.rmtree(work)  # what is known is not made again
     assert not run(main, [str(config), str(data), "--work", str(work), "--files", "tuned"])
     assert printed == capsys.readouterr().out

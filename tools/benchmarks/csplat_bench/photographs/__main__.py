@@ -7,10 +7,10 @@ FOLDER is the data set. A configuration file says with which words `csplat train
 each from nothing or `after` another one, from whose end it goes on; `files`, by name, each `of` a training; `size`, if
 photographs are to be made smaller. Seconds are those of one training, or one file, on top of those before it. A file
 that is not made by `csplat train` says `by` what: `finetune` or `encode` of the trained PLY, FOLDER among its words
-where that is to look at photographs. Trainings lie in --work as NAME-TRAINING.ply, with their checkpoints, files
-beside them. Figures of the held-out photographs are kept in NAME.json beside the configuration file, and drawn in
-NAME.svg: an interrupted run goes on where it ended. PSNR is the mean over the photographs, as papers print it, and
-pooled; LPIPS is AlexNet's.
+where that is to look at photographs. A file `without` what others have is drawn apart from them. Trainings lie in
+--work as NAME-TRAINING.ply, with their checkpoints, files beside them. Figures of the held-out photographs are kept in
+NAME.json beside the configuration file, and drawn in NAME.svg: an interrupted run goes on where it ended. PSNR is the
+mean over the photographs, as papers print it, and pooled; LPIPS is AlexNet's.
 """
 
 from __future__ import annotations
@@ -103,6 +103,7 @@ def _measure(
     def made(file: str) -> dict[str, Any]:
         path, start = work / f"{name}-{file.replace(' ', '')}.csplat", time.perf_counter()
         training, by = wanted["files"][file]["of"], wanted["files"][file].get("by", "train")
+        without = wanted["files"][file].get("without")
         words = ["csplat", by, str(work / f"{name}-{training}.ply")]
         if by == "train":
             words = [*words_of(training), "--resume", str(checkpoint(training))]
@@ -113,10 +114,11 @@ def _measure(
         decoded, stages = decode(path.read_bytes()), found.get("seconds")
         stages = stages if isinstance(stages, dict) else {}
         return {
-            "training": training, "by": by, "command": _said(words, folder).replace(f"{work}/", ""),
+            "training": training, "by": by, "without": without, "command": _said(words, folder).replace(f"{work}/", ""),
             "seconds": round(seconds - stages.get("judging", 0.0)), "stages": stages, "steps": found.get("steps"),
             "splats": len(decoded), "size_bytes": path.stat().st_size,
             "peak_memory_bytes": found.get("peak_memory_bytes"), "attribute_bytes": found.get("bytes_by_attribute"),
+            "size_bytes_before_tuning": found.get("size_bytes_before_tuning"),
             "before_tuning": found.get("scores", {}).get("before tuning"), **_scores(decoded, data, lpips),
         }  # fmt: skip
 

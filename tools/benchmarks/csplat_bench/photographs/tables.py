@@ -73,6 +73,11 @@ def _row(name: str, one: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _series(one: Mapping[str, Any]) -> tuple[str, str | None]:
+    """What a file is drawn with: those that were made by the same command, without the same thing."""
+    return one["by"], one.get("without")
+
+
 def _their_row(one: Published) -> list[str]:
     return [
         one.method,
@@ -106,10 +111,11 @@ def plot(known: Mapping[str, Any], name: str, path: Path) -> None:
             points = sorted((one.size_bytes, one.psnr) for one in PUBLISHED.get(name, ()) if one.method == method)
             if points:
                 axis.plot(*zip(*points, strict=True), f"{marker}--", color=colour, markersize=5, lw=1, label=method)
-        for by, (colour, style) in _OURS.items():
-            points = [(one["size_bytes"], one["psnr_mean"]) for one in files if one["by"] == by]
-            if points:
-                axis.plot(*zip(*points, strict=True), style, color=colour, lw=1.8, label=f"csplat {by}")
+        for by, without in dict.fromkeys(_series(one) for one in files):
+            colour, style = _OURS[by]
+            points = [(one["size_bytes"], one["psnr_mean"]) for one in files if (by, without) == _series(one)]
+            label, face = (f"csplat {by}", colour) if without is None else (f"csplat {by}, without {without}", "none")
+            axis.plot(*zip(*points, strict=True), style, color=colour, mfc=face, lw=1.8, label=label)
         ticks = [tick for tick in _TICKS if axis.get_xlim()[0] <= tick <= axis.get_xlim()[1]]
         axis.set_xticks(ticks, [f"{tick / 1e6:g}" for tick in ticks])
         axis.set_xticks([], minor=True)
