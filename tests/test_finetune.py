@@ -34,6 +34,7 @@ from csplat_tools.training.searching import smallest_reaching
 from csplat_trainer.loss import PhotometricLoss
 from csplat_trainer.pictures import Picture
 from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
+from csplat_trainer.tuning.budget import Budget
 from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
 
@@ -161,6 +162,14 @@ def test_a_run_that_gains_nothing_ends_early(source, views):
     assert log["settled"]
     assert 2 / 3 * 300 < log["steps"] < 300  # not before values have calmed down
     assert not tune(frozen, views, replace(options, patience=0)).log["settled"]
+
+
+def test_a_run_whose_files_are_too_large_yet_goes_on(source, views, monkeypatch):
+    frozen = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
+    options = replace(QUICK, iterations=300, patience=2, byte_cost=0.0).scaled(5.0)
+    assert tune(frozen, views, options, size_bytes=10**9).log["settled"]
+    monkeypatch.setattr(Budget, "overdrawn", lambda *_: 1e-3)
+    assert 300 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
 
 
 # gradients

@@ -279,16 +279,18 @@ class _Run:
             "psnr": psnr,
             "bits_per_splat": costs.bits / len(seen.means),
         }
+        overdrawn = 0.0
         if self._budget is None:
             score = loss + costs.loss
         else:
             size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
             look |= {"size_bytes": size_bytes}
-            score = loss + self._budget.overdrawn(size_bytes, costs.bits)
+            overdrawn = self._budget.overdrawn(size_bytes, costs.bits)
+            score = loss + overdrawn
         self._log["looks"].append(look)
         if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
             self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
-        elif self._options.has_calmed(self._iteration):
+        elif self._options.has_calmed(self._iteration) and not overdrawn:  # what is too large becomes smaller yet
             self._best.since += 1
 
     def _buffers(self, view: View) -> _Buffers:
