@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import csplat_trainer
-from csplat.decoder import decode
+from csplat.decoder import decode, read_options
 from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -52,17 +52,16 @@ LEARNING_FACTOR = {False: 1.0, True: 0.03}
 BYTE_COST = {False: 1e-4, True: 2e-5}
 #: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
 SHAPE_ENTRIES = 4096
-#: Of a splat in a tuned file, about, with all bands and the preset small: 7.6 of Lego at 800x800, 10 of few splats.
-SPLAT_BYTES = 8
+#: Of a splat in a tuned file, about, with all bands and the preset small. Fewer and finer ones are better than those of 8.
+SPLAT_BYTES = 10
 #: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-_TUNED = 0.96  # of the bytes before tuning are left after it, where nothing presses for more,
-_WITHIN = 1.08  # and more or less by so much is what the cost of bytes in the loss brings about
-_FREE = 1.05  # of the bytes that there are, may be had: finer steps are not worth the time
+_WITHIN = 1.02  # by so much more than a file may have the cost of bytes in the loss takes, before pictures suffer
+_FREE = 1.03  # of the bytes that there are, may be had: finer steps are not worth the time
 _TRIES = 3  # counts of splats, each from what the last one took
 _ENTRIES_DOUBLE = 6.0  # dB of all attributes that pay as twice the entries of a codebook of SH do,
-_FEW_OCTAVES, _MOST_OCTAVES = 9, 15  # where those are no more than what the encoder makes of any scene; and at most
+_MOST_ENTRIES = 1 << 15  # at most
 _FINEST = 70.0  # dB of an attribute: renders are as good as the scene's
 
 _RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
@@ -266,38 +265,42 @@ def _fitting(
 ) -> tuple[Chosen, EncodeOptions]:
     """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
-    def room(encoding: EncodeOptions) -> float:
+    def room(encoding: EncodeOptions) -> tuple[float, int]:
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
-        return size_bytes / (_TUNED * len(draft.coded(progress).write().data))
+        data = draft.coded(progress).write().data
+        return size_bytes / len(data), read_options(data)["codebook_size"]
 
     for _ in range(_TRIES):
-        share = room(encoding)
+        share, entries = room(encoding)
         if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
             break
         chosen = choose(max(1, round(share * len(chosen.model))))
     else:
-        share = room(encoding)
-    if share <= _FREE or encoding.attribute_psnr is not None:
+        share, entries = room(encoding)
+    if encoding.attribute_psnr is not None:
         return chosen, encoding
-    usual, finer = encoding, 0.0
-    for _ in range(_TRIES - 1):
-        finer += (math.log(share) - 0.5 * math.log(_FREE)) / BYTES_PER_DB
-        trial = _finer(usual, chosen.model, finer)
-        share = room(trial)
-        if share >= 1.0:
-            encoding = trial
-            if share <= _FREE:
-                break
+    usual, free, finer, slope = encoding, share, 0.0, BYTES_PER_DB
+    for _ in range(_TRIES):
+        if free <= _FREE:
+            break
+        step = math.log(share) / slope
+        finer += step
+        trial = _finer(usual, chosen.model, finer, entries)
+        left, _ = room(trial)
+        slope = min(max(math.log(share / left) / step, 0.5 * BYTES_PER_DB), 4.0 * BYTES_PER_DB)
+        share = left
+        if 1.0 / _WITHIN <= share < free:
+            encoding, free = trial, share
     return chosen, encoding
 
 
-def _finer(encoding: EncodeOptions, model: SplatModel, finer: float) -> EncodeOptions:
+def _finer(encoding: EncodeOptions, model: SplatModel, finer: float, entries: int) -> EncodeOptions:
     """Options whose attributes keep so many dB more, with as many more entries of a codebook of SH as go with that."""
     preset = PRESETS[encoding.preset]
     quality = min(preset.quality[0 if model.sh_degree else 1] + finer, _FINEST)
-    octaves = math.log2(preset.codebook_share * len(model)) + finer / _ENTRIES_DOUBLE
-    if encoding.codebook_size is None and octaves > _FEW_OCTAVES:
-        encoding = replace(encoding, codebook_size=1 << min(round(octaves), _MOST_OCTAVES))
+    if encoding.codebook_size is None and entries:
+        more = round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE))
+        encoding = replace(encoding, codebook_size=min(max(entries, more), _MOST_ENTRIES))
     return replace(encoding, attribute_psnr=quality)
 
 
