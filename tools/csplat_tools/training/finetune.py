@@ -52,7 +52,7 @@ LEARNING_FACTOR = {False: 1.0, True: 0.03}
 BYTE_COST = {False: 1e-4, True: 2e-5}
 #: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
 SHAPE_ENTRIES = 4096
-#: Of a splat in a tuned file, about, with all bands and the preset small. Fewer and finer ones are better than those of 8.
+#: Of a splat in a tuned file with all bands and the preset small: fewer and finer ones are better than those of 8.
 SPLAT_BYTES = 10
 #: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
