@@ -268,7 +268,7 @@ def _fitting(
     def room(encoding: EncodeOptions) -> tuple[float, int]:
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
         data = draft.coded(progress).write().data
-        return size_bytes / len(data), read_options(data)["codebook_size"]
+        return size_bytes / len(data), (read_options(data) or {}).get("codebook_size", 0)
 
     for _ in range(_TRIES):
         share, entries = room(encoding)
