@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import csplat_trainer
-from csplat.decoder import decode, read_options
+from csplat.decoder import decode
 from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -52,16 +52,18 @@ LEARNING_FACTOR = {False: 1.0, True: 0.03}
 BYTE_COST = {False: 1e-4, True: 2e-5}
 #: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
 SHAPE_ENTRIES = 4096
-#: Of a splat in a tuned file with all bands and the preset small: fewer and finer ones are better than those of 8.
+#: Of a splat in a tuned file, measured with all bands and the preset small: more splats of 8 bytes look worse.
 SPLAT_BYTES = 10
 #: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-_WITHIN = 1.02  # by so much more than a file may have the cost of bytes in the loss takes, before pictures suffer
-_FREE = 1.03  # of the bytes that there are, may be had: finer steps are not worth the time
-_TRIES = 3  # counts of splats, each from what the last one took
+_WITHIN = 1.02  # a draft may be so much too large: the price of bytes takes that before pictures suffer,
+_FREE = 1.03  # and so much too small: finer steps are not worth the time
+_TRIES = 3  # counts of splats, each from what the last one took; steps; tunings
+_FIXED = 1.2  # power of a share of bytes that is that of the splats: some bytes do not depend on them,
+_FEWER = 1.05  # and how many fewer stay of a tuned file that is too large
 _ENTRIES_DOUBLE = 6.0  # dB of all attributes that pay as twice the entries of a codebook of SH do,
-_MOST_ENTRIES = 1 << 15  # at most
+_BYTE, _MOST_ENTRIES, _USERS = 255, 1 << 15, 3  # if it has more than one byte tells apart; at most; splats of each
 _FINEST = 70.0  # dB of an attribute: renders are as good as the scene's
 
 _RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
@@ -236,7 +238,7 @@ def choose_and_finetune(
         if not tries:
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
         outputs = replace(outputs, resume=None)  # of the tuning of more splats
-        share = (size_bytes / len(made.data)) ** 2 / _WITHIN  # a part of the bytes does not depend on the count
+        share = (size_bytes / len(made.data)) ** 2 / _FEWER
         with clock.stage("choosing"):
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
@@ -266,26 +268,31 @@ def _fitting(
     """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
     def room(encoding: EncodeOptions) -> tuple[float, int]:
+        """How much larger a file may be than the draft, and entries of the draft's codebook of SH."""
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
-        data = draft.coded(progress).write().data
-        return size_bytes / len(data), (read_options(data) or {}).get("codebook_size", 0)
+        made = draft.coded(progress).write()
+        return size_bytes / len(made.data), int(made.report.options["codebook_size"])
 
     for _ in range(_TRIES):
         share, entries = room(encoding)
         if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
             break
-        chosen = choose(max(1, round(share * len(chosen.model))))
+        chosen = choose(max(1, round(share**_FIXED * len(chosen.model))))
     else:
         share, entries = room(encoding)
     if encoding.attribute_psnr is not None:
         return chosen, encoding
     usual, free, finer, slope = encoding, share, 0.0, BYTES_PER_DB
+    quality = _usual_quality(usual, chosen.model)
     for _ in range(_TRIES):
-        if free <= _FREE:
+        step = min(finer + math.log(share) / slope, _FINEST - quality) - finer
+        if free <= _FREE or step == 0.0 or finer + step <= 0.0:
             break
-        step = math.log(share) / slope
         finer += step
-        trial = _finer(usual, chosen.model, finer, entries)
+        trial = replace(usual, attribute_psnr=quality + finer)
+        if usual.codebook_size is None and entries > _BYTE:
+            more = min(round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE)), _MOST_ENTRIES, len(chosen.model) // _USERS)
+            trial = replace(trial, codebook_size=max(entries, more))
         left, _ = room(trial)
         slope = min(max(math.log(share / left) / step, 0.5 * BYTES_PER_DB), 4.0 * BYTES_PER_DB)
         share = left
@@ -294,14 +301,10 @@ def _fitting(
     return chosen, encoding
 
 
-def _finer(encoding: EncodeOptions, model: SplatModel, finer: float, entries: int) -> EncodeOptions:
-    """Options whose attributes keep so many dB more, with as many more entries of a codebook of SH as go with that."""
-    preset = PRESETS[encoding.preset]
-    quality = min(preset.quality[0 if model.sh_degree else 1] + finer, _FINEST)
-    if encoding.codebook_size is None and entries:
-        more = round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE))
-        encoding = replace(encoding, codebook_size=min(max(entries, more), _MOST_ENTRIES))
-    return replace(encoding, attribute_psnr=quality)
+def _usual_quality(encoding: EncodeOptions, model: SplatModel) -> float:
+    """PSNR that the preset wants of each attribute, dB."""
+    flat = encoding.sh_coding == "none" or 0 in (model.sh_degree, encoding.sh_degree)
+    return PRESETS[encoding.preset].quality[1 if flat else 0]
 
 
 def _state(now: TuningStep) -> str:

@@ -30,6 +30,14 @@ class Budget:
     first_bits: float = 0.0
     goal_bits: float = 0.0
 
+    def __post_init__(self) -> None:
+        self.byte_cost = min(max(self.byte_cost, _COSTS[0]), _COSTS[1])  # of nothing, no factor makes a price
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether bytes cannot be made dearer."""
+        return self.byte_cost >= _COSTS[1]
+
     @classmethod
     def of(cls, stored: Any) -> Budget | None:
         """The budget of a checkpoint; `None` where it holds none, or not all of its numbers."""

@@ -279,18 +279,19 @@ class _Run:
             "psnr": psnr,
             "bits_per_splat": costs.bits / len(seen.means),
         }
-        overdrawn = 0.0
+        shrinks = False
         if self._budget is None:
             score = loss + costs.loss
         else:
             size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
             look |= {"size_bytes": size_bytes}
             overdrawn = self._budget.overdrawn(size_bytes, costs.bits)
+            shrinks = overdrawn > 0.0 and not self._budget.exhausted
             score = loss + overdrawn
         self._log["looks"].append(look)
         if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
             self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
-        elif self._options.has_calmed(self._iteration) and not overdrawn:  # what is too large becomes smaller yet
+        elif self._options.has_calmed(self._iteration) and not shrinks:
             self._best.since += 1
 
     def _buffers(self, view: View) -> _Buffers:

@@ -33,7 +33,8 @@ class FinetuneOptions:
             forth between two integers.
         validate_every: steps between looks at the validation views.
         patience: looks without a gain after which a run ends early, once the learning rates have fallen to a quarter:
-            before, values shake too much to look their best. 0: never.
+            before, values shake too much to look their best. Of a file that is to have a size, those at which it is
+            still too large do not count. 0: never.
         log_every: steps between entries of the log.
 
     Raises:
