@@ -32,7 +32,8 @@ def fit(make_model, monkeypatch):
         def draft(model, encoding, **_):
             data = bytes(bytes_of(len(model), encoding, per_db))
             drafts.append(len(data))
-            made = SimpleNamespace(data=data, report=SimpleNamespace(options={"codebook_size": ENTRIES}))
+            settings = {"codebook_size": ENTRIES, "sh_degree": model.sh_degree}
+            made = SimpleNamespace(data=data, report=SimpleNamespace(options=settings))
             return SimpleNamespace(coded=lambda _: SimpleNamespace(write=lambda: made))
 
         monkeypatch.setattr(finetune, "Draft", SimpleNamespace(of=draft))

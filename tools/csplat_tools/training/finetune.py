@@ -267,23 +267,23 @@ def _fitting(
 ) -> tuple[Chosen, EncodeOptions]:
     """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
-    def room(encoding: EncodeOptions) -> tuple[float, int]:
-        """How much larger a file may be than the draft, and entries of the draft's codebook of SH."""
+    def room(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
+        """How much larger a file may be than the draft, and what the encoder chose for that."""
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
         made = draft.coded(progress).write()
-        return size_bytes / len(made.data), int(made.report.options["codebook_size"])
+        return size_bytes / len(made.data), made.report.options
 
     for _ in range(_TRIES):
-        share, entries = room(encoding)
+        share, settings = room(encoding)
         if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
             break
         chosen = choose(max(1, round(share**_FIXED * len(chosen.model))))
     else:
-        share, entries = room(encoding)
+        share, settings = room(encoding)
     if encoding.attribute_psnr is not None:
         return chosen, encoding
     usual, free, finer, slope = encoding, share, 0.0, BYTES_PER_DB
-    quality = _usual_quality(usual, chosen.model)
+    quality, entries = PRESETS[usual.preset].quality[0 if settings["sh_degree"] else 1], settings["codebook_size"]
     for _ in range(_TRIES):
         step = min(finer + math.log(share) / slope, _FINEST - quality) - finer
         if free <= _FREE or step == 0.0 or finer + step <= 0.0:
@@ -299,12 +299,6 @@ def _fitting(
         if 1.0 / _WITHIN <= share < free:
             encoding, free = trial, share
     return chosen, encoding
-
-
-def _usual_quality(encoding: EncodeOptions, model: SplatModel) -> float:
-    """PSNR that the preset wants of each attribute, dB."""
-    flat = encoding.sh_coding == "none" or 0 in (model.sh_degree, encoding.sh_degree)
-    return PRESETS[encoding.preset].quality[1 if flat else 0]
 
 
 def _state(now: TuningStep) -> str:
