@@ -619,7 +619,7 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
 
 def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--set", "byte-cost=0")
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--lambda", 0)
     call(*words, "-o", tmp_path / "a.csplat", "--importance", tmp_path / "s.npz")
     call(*words, "-o", tmp_path / "b.csplat")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()

@@ -33,7 +33,7 @@ words = ["--max-splats", "60", "--sh-degree", "0", "--iterations", "60"]
 of = "few"
 by = "finetune"
 without = "a price"
-words = ["--data", "FOLDER", "--iterations", "20", "--set", "byte_cost=0"]
+words = ["--data", "FOLDER", "--iterations", "20", "--lambda", "0"]
 """
 
 

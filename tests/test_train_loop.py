@@ -331,6 +331,12 @@ def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tm
     assert trained_with / 2 == pytest.approx(len(decode((tmp_path / "c.csplat").read_bytes())), abs=2)
     told = call(*words, "-o", tmp_path / "d.csplat", "--resume", run, "--target-psnr", "5dB")
     assert "dB on the views that decide" in told.stderr
+    sizes = []
+    for cost in (0, 0.03):
+        told = call(*words, "-o", tmp_path / f"{cost}.csplat", "--resume", run, "--lambda", cost, "--json")
+        assert cost == json.loads(told.stdout)["file"]["log"]["byte_cost"]
+        sizes.append((tmp_path / f"{cost}.csplat").stat().st_size)
+    assert sizes[0] > sizes[1]
     assert trained == run.read_bytes()
 
 
@@ -348,7 +354,8 @@ def test_a_damaged_validation_picture_is_refused_before_training_begins(make_dat
 
 
 @pytest.mark.parametrize(
-    "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)]
+    "words",
+    [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30), ("--lambda", 0)],
 )
 def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
     result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])

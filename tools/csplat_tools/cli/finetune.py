@@ -12,6 +12,7 @@ import typer
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import (
+    ByteCost,
     Checkpoint,
     CheckpointEvery,
     Importance,
@@ -37,6 +38,7 @@ __all__ = ["finetune"]
         ("data", "views"),
         ("data", "view_size"),
         *(("target_psnr", other) for other in ("target_size", "keep", "checkpoint", "resume")),
+        ("byte_cost", "target_size", "target_psnr"),
     ),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
     settings=(ENCODER, "csplat_trainer.tuning.options:FinetuneOptions"),
@@ -86,6 +88,7 @@ def finetune(
         ),
     ] = 0,
     iterations: Annotated[int, typer.Option(metavar="N", min=1, help="Steps at most, one picture each.")] = 1_000,
+    byte_cost: ByteCost = None,
     lr_factor: Annotated[
         float | None,
         typer.Option(metavar="FACTOR", hidden=True, help="Of all learning rates; by default 1, with --self 0.03."),
@@ -132,8 +135,9 @@ def finetune(
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
     if psnr is not None and not math.isfinite(psnr):
         raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
-    rates = {"byte_cost": tuning.BYTE_COST[itself], **settings.of(FinetuneOptions)}
-    options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, **rates)
+    cost = tuning.BYTE_COST[itself] if byte_cost is None else byte_cost
+    rates = settings.of(FinetuneOptions)
+    options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, byte_cost=cost, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)
     encoder = encoding.options(facts, settings)
     if encoder.shape_codebook_size is None:

@@ -76,6 +76,14 @@ Importance = Annotated[
 Checkpoint = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Where checkpoints go.")]
 CheckpointEvery = Annotated[int, typer.Option(metavar="N", min=0, hidden=True, help="Steps; 0: at the end alone.")]
 Resume = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from this checkpoint.")]
+ByteCost = Annotated[
+    float | None,
+    typer.Option(
+        "--lambda",
+        metavar="COST",
+        help="Of a bit per splat in the loss of the tuning, usually 1e-4; targets find their own.",
+    ),
+]
 
 _Set = Annotated[
     list[str] | None,

@@ -10,7 +10,7 @@ import typer
 
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
+from csplat_tools.cli.options import ByteCost, Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
 from csplat_tools.cli.parsing import parse_bytes, parse_decibels, parse_size
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
@@ -28,7 +28,7 @@ _KEEP = 0.8  # of the splats, of a file: of those that training makes some are h
 
 @command(
     needs={"preview_every": ("previews",), "checkpoint_every": ("checkpoint",)},
-    one_of=(("keep", "target_size", "target_psnr"),),
+    one_of=(("keep", "target_size", "target_psnr"), ("byte_cost", "target_size", "target_psnr")),
     settings=("csplat_trainer.options:TrainOptions",),
 )
 def train(
@@ -66,6 +66,7 @@ def train(
         str | None,
         typer.Option(metavar="dB", help="OUT.csplat is the smallest found that has it on photographs that decide."),
     ] = None,
+    byte_cost: ByteCost = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
     test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth picture; 0: none.")] = 8,
@@ -147,8 +148,8 @@ def train(
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
     if psnr is not None and not math.isfinite(psnr):
         raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
-    if not to_file and (preset, keep, size_bytes, psnr) != (None, None, None, None):
-        raise typer.BadParameter("--preset, --keep and targets are about a file: wanted OUT.csplat")
+    if not to_file and (preset, keep, size_bytes, psnr, byte_cost) != (None, None, None, None, None):
+        raise typer.BadParameter("--preset, --keep, --lambda and targets are about a file: wanted OUT.csplat")
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
@@ -186,8 +187,8 @@ def train(
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
     report = run_training_to_file(
-        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, psnr=psnr, facts=facts,
-        plot=plot, page=page, quiet=out.quiet,
+        data, output, options, files, encoding, chosen(tuning_after, training=options, byte_cost=byte_cost),
+        size_bytes=size_bytes, psnr=psnr, facts=facts, plot=plot, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_report(report["file"]))
     out.publish(report)

@@ -304,5 +304,6 @@ def _fitting(
 def _state(now: TuningStep) -> str:
     return (
         f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, validation {now.validation_psnr:.2f} dB"
-        f" (best {now.best_psnr:.2f}), {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
+        f" (best {now.best_psnr:.2f}), {now.size_bytes / 1e6:.3f} MB,"
+        f" {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
     )

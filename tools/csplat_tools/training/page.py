@@ -184,8 +184,8 @@ def _tuning(file: Mapping[str, Any] | None) -> str:
         axes.plot(steps, [one["psnr"] for one in looks], "o-", color=_LINE, markersize=3)
         axes.set(xlabel="step", ylabel="PSNR of views that decide, dB")
         beside = axes.twinx()
-        beside.plot(steps, [one["bits_per_splat"] for one in looks], ":", color=INK)
-        beside.set_ylabel("bits per splat (dotted)")
+        beside.plot(steps, [one["size_bytes"] / 1e6 for one in looks], ":", color=INK)
+        beside.set_ylabel("MB of the file (dotted)")
         beside.grid(visible=False)
 
     text = "Values move, seen through the encoder's quantisers; what looked best for its bytes was kept."

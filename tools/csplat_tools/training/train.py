@@ -126,9 +126,17 @@ def run_training_to_file(
     return {"training": result.log, "file": report}
 
 
-def tuning_after(training: TrainOptions) -> FinetuneOptions:
-    """How a scene is tuned that was trained so: the longer it was, the longer and in the smaller steps."""
-    usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False])
+def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
+    """How a scene is tuned that was trained so: the longer it was, the longer and in the smaller steps.
+
+    Args:
+        training: as it was trained.
+        byte_cost: of a bit per splat in the loss; `None`: the usual one.
+
+    Raises:
+        InputError: the cost is out of its range.
+    """
+    usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
     steps = max(usual.iterations, round(_TUNING * training.iterations))
     return replace(tuning, iterations=steps, lr_exposure=training.lr_exposure)

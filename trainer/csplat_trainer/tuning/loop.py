@@ -44,6 +44,7 @@ class TuningStep:
         loss: mean over the steps since the last report.
         validation_psnr: of the last look at the validation views, pooled, dB.
         best_psnr: the best so far.
+        size_bytes: of the file at that last look.
         seconds, seconds_left: since the start, and at the present pace.
     """
 
@@ -52,6 +53,7 @@ class TuningStep:
     loss: float
     validation_psnr: float
     best_psnr: float
+    size_bytes: int
     seconds: float
     seconds_left: float
 
@@ -273,22 +275,15 @@ class _Run:
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
         psnr = psnr_of_mse(error / count)
-        look = {
-            "iteration": self._iteration,
-            "loss": loss,
-            "psnr": psnr,
-            "bits_per_splat": costs.bits / len(seen.means),
-        }
+        size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
         shrinks = False
         if self._budget is None:
             score = loss + costs.loss
         else:
-            size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
-            look |= {"size_bytes": size_bytes}
             overdrawn = self._budget.overdrawn(size_bytes, costs.bits)
             shrinks = overdrawn > 0.0 and not self._budget.exhausted
             score = loss + overdrawn
-        self._log["looks"].append(look)
+        self._log["looks"].append({"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes})
         if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
             self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
         elif self._options.has_calmed(self._iteration) and not shrinks:
@@ -303,12 +298,14 @@ class _Run:
 
     def _moment(self, window: list[float], left: float) -> TuningStep:
         assert self._best is not None
+        look = self._log["looks"][-1]
         return TuningStep(
             self._iteration,
             self._options.iterations,
             sum(window) / max(1, len(window)),
-            self._log["looks"][-1]["psnr"],
+            look["psnr"],
             self._best.psnr,
+            look.get("size_bytes", 0),  # 0: of an older checkpoint
             self._log["seconds"],
             left,
         )

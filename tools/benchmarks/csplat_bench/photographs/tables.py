@@ -30,6 +30,8 @@ _HEADER = (
     "bytes per splat",
     "minutes",
     "memory, GB",
+    "before tuning, MB",
+    "PSNR mean, dB",
 )
 _THEIR_HEADER = ("published", "MB", "PSNR mean, dB", "SSIM", "LPIPS (VGG)", "networks", "from")
 _TICKS = [factor * decade for decade in (1e4, 1e5, 1e6) for factor in (1, 1.5, 2, 3, 4, 6, 8)]  # bytes
@@ -59,6 +61,7 @@ def _by_size(known: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _row(name: str, one: Mapping[str, Any]) -> list[str]:
+    before = one.get("before_tuning")
     return [
         name,
         f"{one['size_bytes'] / 1e6:.3f}",
@@ -70,6 +73,8 @@ def _row(name: str, one: Mapping[str, Any]) -> list[str]:
         f"{one['size_bytes'] / one['splats']:.2f}",
         f"{one['seconds'] / 60:.0f}",
         optional(one["peak_memory_bytes"], lambda size: f"{size / 1e9:.2f}"),
+        optional(before and one["size_bytes_before_tuning"] / 1e6, ".3f"),
+        optional(before and before["psnr_mean"], ".2f"),
     ]
 
 
