@@ -358,6 +358,19 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
         tune(frozen, views, half, resume=file)
 
 
+def test_bytes_that_are_free_at_first_are_dear_in_time():
+    """A scene whose bits grow while values move far, unless they cost what a run begins with."""
+    budget, bits = Budget(100_000, 1e-4), 470_000.0
+    for count in range(20):
+        done = count / 20
+        budget.overdrawn(round(37_500 + bits / 8), bits)
+        budget.weigh(bits, done)
+        moves = 0.5 + 0.5 * math.cos(math.pi * done)
+        bits *= 1.0 - 0.003 * moves * math.log2(budget.byte_cost / 1e-4)
+    assert 0.0 == budget.overdrawn(round(37_500 + bits / 8), bits)
+    assert 0.98 * 100_000 < 37_500 + bits / 8
+
+
 def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
     frozen, file = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz"
     tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)

@@ -10,8 +10,11 @@ __all__ = ["Budget"]
 
 _REACHED = 0.6  # share of the steps after which the size is to stand: later ones hardly move a value
 _BELOW = 0.002  # of the size that is left free: counts come every few steps, and files grow between them
-_GAIN, _FASTEST = 20.0, 0.5  # of the logarithm of the cost: per share of bits too many, and at most, at each count
+_GAIN, _FASTEST = 40.0, 0.5  # of the logarithm of the cost: per share of bits too many, and at most, at each count
 _COSTS = (1e-7, 1e-2)
+# Of the first cost, what it falls to: files grow while values move far, and a cost that had fallen to nothing, because
+# bytes were free before, rises too late.
+_LEAST = 0.25
 
 
 @dataclass
@@ -23,15 +26,18 @@ class Budget:
         byte_cost: what a bit per splat costs in the loss at present.
         first_bits: of the integers where the run began; 0: not known yet.
         goal_bits: of the integers of a file of that size, by the last file that was made.
+        least_cost: it falls to no less; 0: to a quarter of what the run begins with.
     """
 
     size_bytes: int
     byte_cost: float
     first_bits: float = 0.0
     goal_bits: float = 0.0
+    least_cost: float = 0.0
 
     def __post_init__(self) -> None:
         self.byte_cost = min(max(self.byte_cost, _COSTS[0]), _COSTS[1])  # of nothing, no factor makes a price
+        self.least_cost = self.least_cost or max(_LEAST * self.byte_cost, _COSTS[0])
 
     @property
     def exhausted(self) -> bool:
@@ -68,4 +74,4 @@ class Budget:
         """
         wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _REACHED)
         by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_FASTEST), _FASTEST)
-        self.byte_cost = min(max(self.byte_cost * math.exp(by), _COSTS[0]), _COSTS[1])
+        self.byte_cost = min(max(self.byte_cost * math.exp(by), self.least_cost), _COSTS[1])
