@@ -697,6 +697,8 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
         (("--self", "--lr-factor", "1e9"), "lr_"),
         (("--self", "--near", "0.1"), "--near says nothing without --data"),
+        (("--self", "--lambda", "0", "--target-size", "1MB"), "--lambda and --target-size: give one of them"),
+        (("--self", "--lambda", "2"), "byte_cost is 2.0, wanted 0 to 1"),
     ],
 )
 def test_wrong_words_are_status_2(capture, tmp_path, words, message):

@@ -168,6 +168,8 @@ class _Run:
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
         self._log = checkpoint.log
+        for look in self._log["looks"]:
+            look.setdefault("size_bytes", 0)  # an older checkpoint does not say it where no size was wanted
         self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
         self._best = _Best(checkpoint.best_held, *checkpoint.best)
         self._budget = budget
@@ -305,7 +307,7 @@ class _Run:
             sum(window) / max(1, len(window)),
             look["psnr"],
             self._best.psnr,
-            look.get("size_bytes", 0),  # 0: of an older checkpoint
+            look["size_bytes"],
             self._log["seconds"],
             left,
         )
