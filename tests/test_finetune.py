@@ -364,7 +364,7 @@ def test_bytes_that_are_free_at_first_are_dear_in_time():
     for count in range(20):
         done = count / 20
         budget.overdrawn(round(37_500 + bits / 8), bits)
-        budget.weigh(bits, done)
+        budget.weigh(bits, done, 1e-4)
         moves = 0.5 + 0.5 * math.cos(math.pi * done)
         bits *= 1.0 - 0.003 * moves * math.log2(budget.byte_cost / 1e-4)
     assert 0.0 == budget.overdrawn(round(37_500 + bits / 8), bits)

@@ -26,18 +26,15 @@ class Budget:
         byte_cost: what a bit per splat costs in the loss at present.
         first_bits: of the integers where the run began; 0: not known yet.
         goal_bits: of the integers of a file of that size, by the last file that was made.
-        least_cost: it falls to no less; 0: to a quarter of what the run begins with.
     """
 
     size_bytes: int
     byte_cost: float
     first_bits: float = 0.0
     goal_bits: float = 0.0
-    least_cost: float = 0.0
 
     def __post_init__(self) -> None:
         self.byte_cost = min(max(self.byte_cost, _COSTS[0]), _COSTS[1])  # of nothing, no factor makes a price
-        self.least_cost = self.least_cost or max(_LEAST * self.byte_cost, _COSTS[0])
 
     @property
     def exhausted(self) -> bool:
@@ -65,13 +62,15 @@ class Budget:
         self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), 0.1 * bits)
         return max(0.0, size_bytes / self.size_bytes - 1.0)
 
-    def weigh(self, bits: float, done: float) -> None:
+    def weigh(self, bits: float, done: float, first_cost: float) -> None:
         """Make bytes dearer or cheaper, by how many bits there are and how many should be left.
 
         Args:
             bits: of the integers at present.
             done: share of the steps.
+            first_cost: what a bit per splat cost where the run began.
         """
         wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _REACHED)
         by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_FASTEST), _FASTEST)
-        self.byte_cost = min(max(self.byte_cost * math.exp(by), self.least_cost), _COSTS[1])
+        least = max(_LEAST * min(first_cost, _COSTS[1]), _COSTS[0])
+        self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _COSTS[1])

@@ -220,7 +220,8 @@ class _Run:
         if self._byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
             self._costs = self._scene.count(seen, self._byte_cost)
             if self._budget is not None:
-                self._budget.weigh(self._costs.bits, (self._iteration - 1) / self._options.iterations)
+                done = (self._iteration - 1) / self._options.iterations
+                self._budget.weigh(self._costs.bits, done, self._options.byte_cost)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
         rate = self._options.lr_exposure * self._options.share(self._iteration)
