@@ -1,8 +1,12 @@
 """What several test files need."""
 
 import os
+import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
+import filelock
 import hypothesis
 import numpy as np
 import pytest
@@ -31,11 +35,25 @@ def of_peers(name: str) -> Path:
     return PEERS / name
 
 
+T = TypeVar("T")
+
+#: Files whose tests take longest: pytest-xdist hands these out first, so that no worker ends up alone with one.
+LONGEST = ()
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what takes `data_dir`, so that `-m shared_data` and `-m "not shared_data"` choose."""
+    """Mark tests with `data_dir` as shared_data; keep each file on one worker, the longest files first.
+
+    Tests of several files that share an expensive fixture name a group of their own: `xdist_group("tuned_file")`.
+    """
     for item in items:
         if "data_dir" in getattr(item, "fixturenames", ()):
             item.add_marker("shared_data")
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+    ranks = {name: rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -57,6 +75,22 @@ def data_dir() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"shared scenes are absent ({SHARED}); CSPLAT_DATA names their folder")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[], T]], T]:
+    """Compute an expensive value once for all workers: `once("trained scene", make)`; the value must pickle."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+    def get(name: str, make: Callable[[], T]) -> T:
+        file = folder / f"{name.replace(' ', '-')}.pickle"
+        with filelock.FileLock(f"{file}.lock"):
+            if not file.exists():
+                file.write_bytes(pickle.dumps(make()))
+            return pickle.loads(file.read_bytes())  # noqa: S301  # written by a worker of the same run
+
+    return get
 
 
 @pytest.fixture(scope="session")
