@@ -100,14 +100,6 @@ def test_a_package_index_shows_nothing_that_only_a_checkout_has():
     assert len(text) > 0.7 * len(README)
 
 
-def test_all_files_that_name_the_version_name_the_same():
-    assert csplat.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
-    assert csplat.__version__ == json.loads((ROOT / "codec" / "js" / "package.json").read_text("utf-8"))["version"]
-    built = (ROOT / "codec" / "c" / "CMakeLists.txt").read_text("utf-8")
-    assert f"project(csplat VERSION {csplat.__version__} " in built
-    assert f"\nversion: {csplat.__version__}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
-
-
 def test_the_commands_of_readme_and_guides_are_ones_that_csplat_knows():
     """Their words are parsed, nothing is run: options that are gone are found."""
     from typer.main import get_command
