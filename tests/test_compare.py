@@ -74,6 +74,7 @@ def call(*words):
 # a glance
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_a_glance_sees_what_compare_measures(scene):
     from csplat_render.judge import Judge
@@ -84,6 +85,8 @@ def test_a_glance_sees_what_compare_measures(scene):
     measured = Judge.of_source(scene, comparison_cameras(scene)).psnr(decode(data))
     assert abs(measured - glance(scene, data)) < 0.3
     assert 10.0 < measured < 90.0
+    assert glance(scene, data, splats_max=len(scene) - 1) is None
+    assert glance(scene.select(slice(0)), data) is None
 
 
 @pytest.mark.usefixtures("renderer")
@@ -187,13 +190,12 @@ def test_a_judge_serves_for_many_and_says_of_some_views_what_all_say_of_them(sce
     assert judge.some([1]).psnr(other) == pytest.approx(scores.each[1].psnr)
 
 
-def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras, monkeypatch):
+def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras):
     from csplat_render import judge
 
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
     kept = judge.Judge.of_source(scene, cameras).scores(other)
-    monkeypatch.setattr(judge, "_KEPT_BYTES", 0)
-    again = judge.Judge.of_source(scene, cameras)
+    again = judge.Judge.of_source(scene, cameras, kept_bytes=0)
     assert not any(isinstance(look, judge.Look) for look in again.looks)
     assert kept == again.scores(other)
 

@@ -203,9 +203,8 @@ def test_fewer_than_two_files_are_refused(files, tmp_path):
         csplat.merge(files, tmp_path / "out.csplat")
 
 
-def test_more_codebooks_than_a_file_can_have_are_coded_again(halves, monkeypatch):
-    monkeypatch.setattr("csplat.merging._BOOKS_MAX", 3)
-    done, data = merge(*halves, options=EncodeOptions(preset="fast"))
+def test_more_codebooks_than_a_file_can_have_are_coded_again(halves):
+    done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
     assert "they have 4 codebooks together, and a file at most 3" == done.why
     assert 8929 == len(decode(data))
 
