@@ -226,6 +226,7 @@ def test_no_camera_is_refused(scene):
         compare_models(scene, scene, [])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_the_cameras_of_psnr_come_from_the_source_alone(scene):
     cameras = comparison_cameras(scene)
@@ -261,6 +262,7 @@ def test_json_has_psnr_at_the_top(files, camera_file):
     assert result["seconds"] > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_the_virtual_cameras_are_the_default(files):
     result = json.loads(call("compare", *files, "--json"))

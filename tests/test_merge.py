@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import csplat
 import csplat_conformance
-from csplat import EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
+from csplat import CsplatError, EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
 from csplat.decoder import read_metadata, read_options, read_stated_errors
 from csplat.decoder.references import codebook_references
 from csplat_conformance.validator import validate
@@ -109,8 +109,17 @@ def test_a_vector_beside_itself_is_there_twice(name):
     assert_joined([decode(path)] * 2, decode(data))
 
 
-@pytest.mark.parametrize("path", sorted(VECTORS.glob("*.csplat")), ids=lambda path: path.stem)
-def test_references_to_codebooks_are_found_without_decoding(path):
+def test_references_to_codebooks_are_found_without_decoding():
+    failed = []
+    for path in sorted(VECTORS.glob("*.csplat")):
+        try:
+            check_references(path)
+        except (AssertionError, CsplatError) as error:
+            failed.append(f"{path.stem}: {error!r}")
+    assert [] == failed
+
+
+def check_references(path):
     data = path.read_bytes()
     header = read_header(data)
     found = set()
