@@ -42,16 +42,26 @@ def ply(tmp_path, make_model):
     return path
 
 
+@pytest.fixture(scope="module")
+def encoded_once():
+    """What became of the scene of `ply`, by file name; filled by the first test that wants it."""
+    return {}
+
+
 @pytest.fixture
-def csplat_file(tmp_path, ply):
-    path = tmp_path / "scene.csplat"
-    call("encode", ply, path, "--source-index", tmp_path / "index.npy", "--quiet")
-    return path
+def csplat_file(tmp_path, ply, encoded_once):
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
 
 
 @pytest.fixture(autouse=True)
 def glanced(monkeypatch):
-    """No scene is rendered after encoding, but by the tests that say so; scenes that were to be, and what is seen."""
+    """No scene is looked at after encoding; scenes that were to be, and the PSNR that is seen."""
     seen = {"scenes": [], "psnr": None}
 
     def glance(source, data, *, threads):  # noqa: ARG001  # as the function has them
@@ -59,6 +69,7 @@ def glanced(monkeypatch):
         return seen["psnr"]
 
     monkeypatch.setattr("csplat_tools.cli.encode.glance", glance)
+    monkeypatch.setattr("csplat_tools.cli.encode.seeming_up", lambda _model: None)
     return seen
 
 

@@ -24,11 +24,19 @@ from csplat_tools.cli.app import app
 SMALL = RequestSizes(first=512, batch=20_000, gap=100, request=10_000)
 
 
+class Watched(SplatFile):
+    """A file whose windows can be looked at."""
+
+    def window(self):
+        self.last_window = super().window()
+        return self.last_window
+
+
 def opened(file):
     """Open a file that is asked for small parts."""
     store = store_of(file)
     store.sizes = SMALL
-    return SplatFile(store, Limits())
+    return Watched(store, Limits())
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +95,8 @@ def test_tiles_come_one_after_the_other_and_what_was_before_them_is_let_go_of(da
             assert len(wanted) == len(found)
             for a, b in zip(wanted, found, strict=True):
                 assert_same(a, b)
+            first = file.header.tiles[0].layers[0]
+            assert not any(file.last_window.view[first.offset : first.offset + first.size])
         assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
