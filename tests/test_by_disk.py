@@ -53,7 +53,7 @@ def states(stated, **changes):
 
 @pytest.mark.parametrize("indexed", [True, False])
 def test_what_is_true_is_proved(make_model, indexed):
-    source = make_model(1200, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(1200, dtype=np.int32)})
+    source = make_model(700, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(700, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -76,13 +76,13 @@ def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("attribute", ["means", "sh0", "extra"])
 def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute):
-    source = make_model(900, 1, extra={"label": np.arange(900, dtype=np.int32)})
+    source = make_model(600, 1, extra={"label": np.arange(600, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     if attribute == "extra":
         changed = replace(source, extra={"label": source.extra["label"] // 2})
     else:
         array = getattr(source, attribute).copy()
-        array[[3, 700, 899]] += np.float32(0.7)
+        array[[3, 300, 599]] += np.float32(0.7)
         changed = replace(source, **{attribute: array})
     at_once, in_parts = both(changed, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -90,7 +90,7 @@ def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute)
 
 
 def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_model):
-    source = make_model(700, 0)
+    source = make_model(500, 0)
     result = encode_with_report(source, OPTIONS)
     moved = replace(source, means=source.means + np.float32(0.04))
     stated = open_tiles(result.data).stated_errors
@@ -103,9 +103,9 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
 @pytest.mark.slow
 @pytest.mark.skipif(not CAN_COPY, reason="processes are no copies of each other here")
 def test_processes_find_what_one_finds(make_model, monkeypatch):
-    source = make_model(900, 1)
+    source = make_model(600, 1)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
-    far = np.where(np.arange(900) % 50, np.float32(0.04), np.float32(0.5))
+    far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
     moved = replace(source, means=source.means + far[:, None])
     opened = replace(opened, stated_errors=states(opened.stated_errors, means={"max": 0.07}))
     alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)

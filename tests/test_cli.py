@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -527,13 +528,19 @@ def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_f
     assert [] == list(folder.iterdir())
 
 
-@pytest.mark.slow
-def test_a_full_standard_output_is_one_line(csplat_file):
-    line = b"error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
+def test_a_full_standard_output_is_one_line(csplat_file, monkeypatch, capsys):
+    line = "error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
     for words in (("info", csplat_file), ("--version",)):
-        with Path("/dev/full").open("wb") as full:
-            done = subprocess.run([*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, check=False)
-        assert (1, line) == (done.returncode, done.stderr)
+        full = Path("/dev/full").open("w")  # noqa: SIM115  # what closes it fails as well
+        monkeypatch.setattr(sys, "stdout", full)
+        status = status_of(*words)
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
+        assert (1, line) == (status, capsys.readouterr().err)
+    with Path("/dev/full").open("wb") as full:  # and nothing is added when the process ends
+        done = subprocess.run([*PROGRAM, "--version"], stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (1, line.encode()) == (done.returncode, done.stderr)
     assert refused("decode", csplat_file, "/dev/full").startswith("error: /dev/full: No space left")
 
 
