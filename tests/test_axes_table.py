@@ -27,6 +27,8 @@ from csplat_trainer.data import load
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 
+pytestmark = pytest.mark.slow  # each case takes a third of a second
+
 ALMOST_NONE = {"max_splats": 40, "sh_degree": 0, "iterations": 1, "strategy": "none"}
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # -y to z
 
@@ -52,10 +54,10 @@ def untold(**fields):
 @pytest.mark.parametrize(
     ("make", "words", "axes", "up"),
     [
-        pytest.param(trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1), marks=pytest.mark.slow),
-        pytest.param(trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0), marks=pytest.mark.slow),
-        pytest.param(trained(write_transforms, (0, 0, 1)), [], "unspecified", (0, 0, 1), marks=pytest.mark.slow),
-        pytest.param(trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0), marks=pytest.mark.slow),
+        (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
+        (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
+        (trained(write_transforms, (0, 0, 1)), [], "unspecified", (0, 0, 1)),
+        (trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0)),
         (untold(), [], "unspecified", None),
         (untold(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
         (untold(), ["--axes", "LUF"], "LUF", (0, 1, 0)),

@@ -25,6 +25,8 @@ from csplat_conformance.stated import PartSizes, Source, check_source_index, pro
 from csplat_conformance.stated.cells import Cells
 from csplat_tools.cli.app import app
 
+pytestmark = pytest.mark.slow  # two CPU seconds together
+
 OPTIONS = EncodeOptions(preset="fast", tile_splats=300, keep_extra=True)
 PARTS = PartSizes(least=200, most=200)  # small scenes have several
 
@@ -100,7 +102,6 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
         assert bool(at_once["failures"]) == (most < 0.07)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not CAN_COPY, reason="processes are no copies of each other here")
 def test_processes_find_what_one_finds(make_model, monkeypatch):
     source = make_model(600, 1)

@@ -9,6 +9,8 @@ from csplat_render.cameras import intrinsics, look_at, orbit
 from csplat_render.paths import orbit_cameras
 from csplat_render.virtual import scene_frame
 
+pytestmark = pytest.mark.slow  # two CPU seconds together
+
 K = intrinsics(64, 48, 60.0)
 SLANTED = [0.0, -0.8, 0.6]
 
