@@ -57,7 +57,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests went without the shared scenes: those are no part of a clone."""
+    """Report tests without shared scenes, and behaviour that was compared loosely."""
+    for report in terminalreporter.stats.get("passed", []):
+        for name, value in report.user_properties:
+            if name == "compared loosely":
+                terminalreporter.line(f"{report.nodeid}: sizes and PSNR alone were compared; {value}")
     skipped = [
         one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
     ]
