@@ -1,10 +1,12 @@
 # `make demo` first, `make test` second; `make help` lists the rest.
-# A machine with Python 3.11 or newer is enough; everything else goes into .venv and .venv-wheel.
+# A machine with Python 3.11 or newer is enough; everything else goes into .venv, by uv if it is installed, else by pip.
 
 PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+UV := $(shell command -v uv)
+INSTALL := $(if $(UV),$(UV) pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile)
 BENCH := $(BIN)/python -m csplat_bench
 CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 # Without the tracing of comparisons, which takes three quarters of the time and finds no more.
@@ -12,7 +14,7 @@ FUZZED := -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-reco
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo examples test lint format spec sample docs bench wasm fuzz fuzz-c clean
+.PHONY: help demo examples check test test-all lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
@@ -31,14 +33,19 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
-test: $(VENV)/.dev ## everything that must hold: lint, types, contracts, vectors, fuzzing, tests
-	tests/run.sh
+check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files, fast tests, on the checkout
+	tests/run.sh check
 
-lint: $(VENV)/.dev ## style, types and import contracts
+test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
+	tests/run.sh test
+
+test-all: $(VENV)/.all ## the same and all areas: engines, torch, S3, Dask, peers, benchmarks, long fuzzing; an hour
+	tests/run.sh all
+
+lint: $(VENV)/.dev ## style, types and import contracts alone
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 format: $(VENV)/.dev ## bring the code into its one layout
@@ -52,12 +59,12 @@ sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, trai
 	$(BIN)/python tools/sample/make_sample.py
 
 docs: $(VENV)/.core ## the documentation, as a site in out/site
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	$(BIN)/python tools/docs/make_site.py
 	@echo "open out/site/index.html"
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
-	$(BIN)/pytest -m benchmark
+	$(BIN)/pytest -m "area(name='benchmarks')"
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).codec.formats
@@ -94,18 +101,23 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 	$(BIN)/python tests/fuzz.py --target others --replay out/fuzz/c/corpus
 
 clean: ## remove what the commands above made
-	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 		.import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "csplat needs Python 3.11 or newer" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	$(if $(UV),$(UV) venv --quiet --seed --python $(PYTHON) $(VENV),$(PYTHON) -m venv $(VENV))
 
 $(VENV)/.core: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable .
+	$(INSTALL) --editable .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	@touch $(VENV)/.core $@
+
+# By pip: uv would take a build of torch for CUDA, several gigabytes.
+$(VENV)/.all: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[all-tests]'
+	@touch $(VENV)/.core $(VENV)/.dev $@
