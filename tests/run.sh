@@ -85,9 +85,10 @@ noted() {
 
 # Set CPU to the CPU seconds of this shell and of all children that have ended; a subshell would count its own.
 cpu_seconds() {
-    times >"out/times.$BASHPID"
-    CPU=$(awk -F'[ms ]+' '{ total += 60 * $1 + $2 + 60 * $3 + $4 } END { printf "%d", total + 0.5 }' "out/times.$BASHPID")
-    rm "out/times.$BASHPID"
+    local file=out/times.$BASHPID
+    times >"$file"
+    CPU=$(awk -F'[ms ]+' '{ total += 60 * $1 + $2 + 60 * $3 + $4 } END { printf "%d", total + 0.5 }' "$file")
+    rm "$file"
 }
 
 # background NAME COMMAND...: run a step beside the following ones; `joined` waits for it and prints what it printed.
