@@ -287,7 +287,7 @@ def too_slow(signal_number, frame):  # noqa: ARG001 - the signature of a handler
 
 def limit_memory():
     """Bound the address space of this process; return its resident bytes now."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[0]) if Path("/proc/self/statm").exists() else 0
     if pages:
         limit = pages * resource.getpagesize() + ADDRESS_SPACE_ABOVE_START
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap as mmaps
 import os
+import sys
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Protocol
@@ -62,6 +63,6 @@ class LetGo:
     def after(self, size_bytes: int) -> None:
         """Note that so much has been read, and let go of everything now and then."""
         self._read_bytes += size_bytes
-        if self._file is not None and self._read_bytes >= _STEP_BYTES:
+        if sys.platform != "win32" and self._file is not None and self._read_bytes >= _STEP_BYTES:
             self._read_bytes = 0
             self._file.madvise(mmaps.MADV_DONTNEED)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import select
 import signal
 import sys
@@ -18,6 +17,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from csplat import decoder
+from csplat.errors import InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import Answer
 from csplat_conformance.fuzzing.targets import LIMITS
@@ -26,7 +26,9 @@ from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.mutation.operators import python_mutants
 from csplat_conformance.report import Status
 
-__all__ = ["PythonDecoder"]
+__all__ = ["NO_FORK", "PythonDecoder"]
+
+NO_FORK = "this system cannot copy processes, in which mutants run: use Linux or macOS"
 
 _PROCESSOR_SECONDS = 30  # the right decoder takes five
 _SECONDS = 300.0  # of a clock, for what waits; other processes may be busy
@@ -68,6 +70,8 @@ class PythonDecoder:
 
     def attempt(self, mutant: Mutant) -> Result:
         """Run the vectors, then the fuzzed files; what hangs is noticed."""
+        if sys.platform == "win32":
+            raise InputError(NO_FORK)
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
@@ -155,6 +159,10 @@ class _Finder(MetaPathFinder, Loader):
 
 def _limit() -> None:
     """Let loops without end be ended, and allocations without bound fail."""
+    import resource  # Windows has none
+
+    if sys.platform == "win32":
+        return
     resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_SECONDS, _PROCESSOR_SECONDS))
     statm = Path("/proc/self/statm")
     if statm.exists():
