@@ -6,7 +6,10 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; 
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 UV := $(shell command -v uv)
-INSTALL := $(if $(UV),$(UV) pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile)
+# `make test RESOLUTION=lowest-direct`: the oldest versions that pyproject.toml allows; needs uv.
+RESOLUTION ?= highest
+INSTALL := $(if $(UV),$(UV) pip install --quiet --resolution $(RESOLUTION) --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile)
+CORE = $(VENV)/.core
 BENCH := $(BIN)/python -m csplat_bench
 CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 # Without the tracing of comparisons, which takes three quarters of the time and finds no more.
@@ -14,12 +17,13 @@ FUZZED := -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-reco
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo examples check test test-all lint format spec sample docs bench wasm fuzz fuzz-c clean
+
+.PHONY: help demo examples check test test-all dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
 
-demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
+demo: $(CORE) ## set up, then encode, verify and decode the sample scene
 	@mkdir -p out
 	$(BIN)/csplat encode $(SAMPLE) out/sample.csplat --force
 	$(BIN)/csplat verify out/sample.csplat
@@ -62,6 +66,17 @@ docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(INSTALL) --editable '.[docs]'
 	$(BIN)/python tools/docs/make_site.py
 	@echo "open out/site/index.html"
+
+dist: $(VENV)/.dev ## sdist, wheel and npm package in out/; a release gives TAG and URL, which go into their metadata
+	rm -rf out/dist out/npm && mkdir -p out/npm
+	$(if $(URL),$(BIN)/python tools/release/prepare.py --tag "$(TAG)" --url "$(URL)")
+	$(BIN)/python -m build --no-isolation --outdir out/dist .
+	cd codec/js && npm pack --silent --pack-destination ../../out/npm
+
+test-dist: ## install out/dist/*.whl in an environment of its own, and run the commands of `make demo` there
+	rm -rf out/fresh && $(PYTHON) -m venv out/fresh
+	out/fresh/$(notdir $(BIN))/python -m pip install --quiet --disable-pip-version-check out/dist/csplat-*.whl
+	$(MAKE) --no-print-directory demo BIN=out/fresh/$(notdir $(BIN)) CORE=
 
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/pytest -m "area(name='benchmarks')"
@@ -107,6 +122,7 @@ clean: ## remove what the commands above made
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "csplat needs Python 3.11 or newer" >&2; exit 1; }
+	@test -n "$(UV)" -o "$(RESOLUTION)" = highest || { echo "RESOLUTION=$(RESOLUTION) needs uv" >&2; exit 1; }
 	$(if $(UV),$(UV) venv --quiet --seed --python $(PYTHON) $(VENV),$(PYTHON) -m venv $(VENV))
 
 $(VENV)/.core: pyproject.toml | $(BIN)/python
