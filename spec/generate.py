@@ -1,5 +1,7 @@
 """Write everything that follows from the registry: constants, types, rules of fields, tables of the spec.
 
+The version of csplat, which `codec/csplat/__init__.py` states, is written into the other files that name it.
+
 Usage:
     python spec/generate.py           # write what is out of date
     python spec/generate.py --check   # write nothing, exit 1 and name what is out of date
@@ -26,6 +28,15 @@ JAVASCRIPT = ROOT / "codec" / "js" / "spec.mjs"
 TYPES = ROOT / "codec" / "js" / "decoder.d.ts"
 C = ROOT / "codec" / "c" / "csplat.c"
 C_HEADER = ROOT / "codec" / "c" / "csplat.h"
+
+#: The one place of csplat's own version, and the lines of other files that repeat it.
+VERSIONED = ROOT / "codec" / "csplat" / "__init__.py"
+VERSION_LINES = {
+    ROOT / "CITATION.cff": r"(?m)^(version: )\S+()$",
+    ROOT / "README.md": r"('csplat-)[^'-]+(-py3-none-any\.whl)",
+    ROOT / "codec" / "c" / "CMakeLists.txt": r"(?m)^(project\(csplat VERSION )\S+( )",
+    ROOT / "codec" / "js" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
+}
 
 STRUCT_CODES = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i"} | {
     "u64": "Q",
@@ -72,6 +83,8 @@ def main() -> int:
         C_HEADER: with_c_codes(C_HEADER.read_text(encoding="utf-8"), registry),
         FORMAT: with_tables(FORMAT.read_text(encoding="utf-8"), registry),
     }
+    version = version_of(VERSIONED.read_text(encoding="utf-8"))
+    targets |= {path: with_version(path, line, version) for path, line in VERSION_LINES.items()}
     stale = []
     for path, text in targets.items():
         if path.exists() and path.read_text(encoding="utf-8") == text:
@@ -83,6 +96,22 @@ def main() -> int:
     if stale:
         print(("out of date: " if check else "written: ") + ", ".join(stale), file=sys.stderr)
     return 1 if check and stale else 0
+
+
+def version_of(text: str) -> str:
+    """Return the version that the text of a module states; SystemExit where it states none."""
+    match = re.search(r'(?m)^__version__ = "([^"]+)"$', text)
+    if match is None:
+        raise SystemExit("no line `__version__ = ...`")
+    return match[1]
+
+
+def with_version(path: Path, line: str, version: str) -> str:
+    """Return the text of a file with its version renewed; SystemExit where it does not name one version."""
+    text, count = re.subn(line, rf"\g<1>{version}\g<2>", path.read_text(encoding="utf-8"))
+    if count != 1:
+        raise SystemExit(f"{path.relative_to(ROOT).as_posix()}: {count} places for the version, expected 1")
+    return text
 
 
 def fields_of(structure: Registry) -> list[Field]:

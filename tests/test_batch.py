@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from batch_worker import InThisProcess
 from interrupts import heed_interrupts
 from typer.testing import CliRunner
 
@@ -24,7 +25,6 @@ from csplat_tools.batches.page import make_page
 from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
 from csplat_tools.batches.workers import Worker, WorkerLostError
 from csplat_tools.cli.app import app
-from csplat_tools.cli.serving import answer
 
 FAST = ("encode", "--preset", "fast")
 
@@ -38,20 +38,6 @@ def scenes(tmp_path, make_model):
     csplat.write(folder / "sub" / "b.spz", make_model(30, 0))
     (folder / "text.splat").write_text("no scene")
     return folder
-
-
-class InThisProcess:
-    """Answers as a worker does, without a process. Counts what it ran."""
-
-    ran = 0
-    pid = None
-
-    def ask(self, what, **values):
-        InThisProcess.ran += what == "run"
-        return answer({"ask": what, **json.loads(json.dumps(values))})
-
-    def close(self):
-        pass
 
 
 @pytest.fixture
@@ -216,6 +202,7 @@ def test_other_commands_take_their_turn(scenes, tmp_path):
     assert ["a.splat"] == [one.output for one in done.records]
 
 
+@pytest.mark.area(name="remote")
 @pytest.mark.usefixtures("here")
 def test_a_scene_under_a_url_goes_to_a_url(scenes, tmp_path):
     fsspec = pytest.importorskip("fsspec", reason="URLs want the extra [remote]")
@@ -302,6 +289,7 @@ def test_the_page_escapes_what_scenes_are_called(tmp_path):
 # processes that end
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
     os.mkfifo(tmp_path / "stuck.ply")
     worker = Worker()
@@ -316,6 +304,7 @@ def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
         worker.ask("look", path=str(scenes / "a.ply"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 @pytest.mark.usefixtures("here")
 def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_path, make_model, number):
@@ -342,6 +331,8 @@ def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_
     assert not list(out.rglob(".*"))
 
 
+@pytest.mark.slow
+@pytest.mark.area(name="dask")
 def test_a_cluster_gives_what_a_lost_machine_had_to_another(scenes, tmp_path, make_model):
     distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
     stuck, whole = scenes / "stuck.ply", tmp_path / "whole.ply"

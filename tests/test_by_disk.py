@@ -8,6 +8,7 @@ import signal
 import tempfile
 from collections import namedtuple
 from dataclasses import replace
+from mmap import mmap
 
 import numpy as np
 import pytest
@@ -16,20 +17,16 @@ from typer.testing import CliRunner
 from csplat.decoder import decode, open_tiles
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
+from csplat.files import read_array
 from csplat.ply import write_ply
 from csplat.processes import CAN_COPY
 from csplat.scene import scene_of
-from csplat_conformance.stated import Source, by_disk, check_source_index, prove, prove_by_disk
+from csplat_conformance.stated import PartSizes, Source, check_source_index, prove, prove_by_disk
 from csplat_conformance.stated.cells import Cells
 from csplat_tools.cli.app import app
 
 OPTIONS = EncodeOptions(preset="fast", tile_splats=300, keep_extra=True)
-
-
-@pytest.fixture(autouse=True)
-def small_parts(monkeypatch):
-    """So that small scenes have many."""
-    monkeypatch.setattr(by_disk, "_PART", (200, 200))
+PARTS = PartSizes(least=200, most=200)  # small scenes have several
 
 
 def both(source, data, stated=None, index=None):
@@ -37,7 +34,7 @@ def both(source, data, stated=None, index=None):
     opened = open_tiles(data)
     opened = replace(opened, stated_errors=stated or opened.stated_errors)
     at_once = prove(Source.of(source), decode(data), opened.header, opened.stated_errors, index)
-    in_parts = prove_by_disk(scene_of(source), opened, index, memory_bytes=1)
+    in_parts = prove_by_disk(scene_of(source), opened, index, memory_bytes=1, sizes=PARTS)
     assert at_once.failures == in_parts.failures
     assert at_once.clauses == in_parts.clauses
     return rounded(at_once.as_json()), rounded(in_parts.as_json())
@@ -55,9 +52,8 @@ def states(stated, **changes):
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (1e6, -2.0, 3.5)])
-def test_what_is_true_is_proved(make_model, indexed, origin):
-    source = make_model(2500, 1, origin=origin, extra={"label": np.arange(2500, dtype=np.int32)})
+def test_what_is_true_is_proved(make_model, indexed):
+    source = make_model(1200, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(1200, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -80,13 +76,13 @@ def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("attribute", ["means", "sh0", "extra"])
 def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute):
-    source = make_model(1500, 1, extra={"label": np.arange(1500, dtype=np.int32)})
+    source = make_model(900, 1, extra={"label": np.arange(900, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     if attribute == "extra":
         changed = replace(source, extra={"label": source.extra["label"] // 2})
     else:
         array = getattr(source, attribute).copy()
-        array[[3, 700, 1499]] += np.float32(0.7)
+        array[[3, 700, 899]] += np.float32(0.7)
         changed = replace(source, **{attribute: array})
     at_once, in_parts = both(changed, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -94,7 +90,7 @@ def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute)
 
 
 def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_model):
-    source = make_model(1200, 0)
+    source = make_model(700, 0)
     result = encode_with_report(source, OPTIONS)
     moved = replace(source, means=source.means + np.float32(0.04))
     stated = open_tiles(result.data).stated_errors
@@ -104,18 +100,18 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
         assert bool(at_once["failures"]) == (most < 0.07)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CAN_COPY, reason="processes are no copies of each other here")
 def test_processes_find_what_one_finds(make_model, monkeypatch):
-    source = make_model(1500, 1)
+    source = make_model(900, 1)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
-    far = np.where(np.arange(1500) % 50, np.float32(0.04), np.float32(0.5))
+    far = np.where(np.arange(900) % 50, np.float32(0.04), np.float32(0.5))
     moved = replace(source, means=source.means + far[:, None])
     opened = replace(opened, stated_errors=states(opened.stated_errors, means={"max": 0.07}))
-    alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1)
+    alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)
     assert alone.failures
-    monkeypatch.setattr(by_disk, "_SHARE", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    memory, seen = by_disk._BASE_BYTES + 3 * (by_disk._WORKER_BYTES + 10**6), []
+    memory, sizes, seen = 10**9, replace(PARTS, worth_a_process=1), []
 
     def count(_stage, _done):
         seen.append(len(multiprocessing.active_children()))
@@ -124,10 +120,10 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
         for child in multiprocessing.active_children():
             os.kill(child.pid, signal.SIGKILL)
 
-    assert alone == prove_by_disk(scene_of(moved), opened, memory_bytes=memory, progress=count)
+    assert alone == prove_by_disk(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=count)
     assert max(seen) == 3
     with pytest.raises(OSError, match="a worker process was killed"):
-        prove_by_disk(scene_of(moved), opened, memory_bytes=memory, progress=kill)
+        prove_by_disk(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
 
 
 def test_another_scene_is_told_before_any_splat(make_model):
@@ -171,11 +167,10 @@ def test_cells_have_about_as_many_splats(make_model):
         (np.array([0, 1, 5]), "splat 2 splat 5"),
     ],
 )
-def test_a_source_index_is_looked_at_in_parts(index, words, monkeypatch):
+def test_a_source_index_is_looked_at_in_parts(index, words):
     for block in (1, 2, 3):
-        monkeypatch.setattr("csplat_conformance.stated.pairs._INDEX_BLOCK", block)
         with pytest.raises(InputError, match=words):
-            check_source_index(index, 5, 3)
+            check_source_index(index, 5, 3, block=block)
 
 
 def test_the_disk_is_asked_before_and_nothing_stays_there(make_model, tmp_path, monkeypatch):
@@ -189,14 +184,22 @@ def test_the_disk_is_asked_before_and_nothing_stays_there(make_model, tmp_path, 
         both(source, result.data)
 
 
-def test_the_command_finds_by_way_of_the_disk_what_it_finds_in_memory(make_model, tmp_path, monkeypatch):
+def test_a_source_index_may_be_mapped(make_model, tmp_path):
+    source = make_model(500, 1)
+    result = encode_with_report(source, OPTIONS)
+    np.save(tmp_path / "index.npy", result.source_index)
+    mapped = read_array(str(tmp_path / "index.npy"), most_bytes=0)
+    assert isinstance(mapped.base, mmap)
+    assert both(source, result.data, index=result.source_index) == both(source, result.data, index=mapped)
+
+
+def test_the_command_finds_by_way_of_the_disk_what_it_finds_in_memory(make_model, tmp_path):
     ply, file, index = tmp_path / "scene.ply", tmp_path / "scene.csplat", tmp_path / "index.npy"
     source = make_model(700, 1)
     result = encode_with_report(source, OPTIONS)
     write_ply(ply, source)
     file.write_bytes(result.data)
     np.save(index, result.source_index)
-    monkeypatch.setattr("csplat_tools.inspect.verify._INDEX_BYTES", 0)  # the index is mapped
     for words in ([], ["--source-index", str(index)]):
         found = []
         for memory in ([], ["--memory", "100kB"]):

@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import resource
+import select
 import signal
 import subprocess
 import sys
@@ -21,10 +22,12 @@ from interrupts import heed_interrupts
 from typer.main import get_command
 from typer.testing import CliRunner
 
+import csplat
 from csplat import _spec, decode, read_ply, write_ply
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.cli.encode import encode as encode_command
 from csplat_tools.files.streams import check_output, write_bytes
@@ -39,16 +42,26 @@ def ply(tmp_path, make_model):
     return path
 
 
+@pytest.fixture(scope="module")
+def encoded_once():
+    """What became of the scene of `ply`, by file name; filled by the first test that wants it."""
+    return {}
+
+
 @pytest.fixture
-def csplat_file(tmp_path, ply):
-    path = tmp_path / "scene.csplat"
-    call("encode", ply, path, "--source-index", tmp_path / "index.npy", "--quiet")
-    return path
+def csplat_file(tmp_path, ply, encoded_once):
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
 
 
 @pytest.fixture(autouse=True)
 def glanced(monkeypatch):
-    """No scene is rendered after encoding, but by the tests that say so; scenes that were to be, and what is seen."""
+    """No scene is looked at after encoding; scenes that were to be, and the PSNR that is seen."""
     seen = {"scenes": [], "psnr": None}
 
     def glance(source, data, *, threads):  # noqa: ARG001  # as the function has them
@@ -56,16 +69,17 @@ def glanced(monkeypatch):
         return seen["psnr"]
 
     monkeypatch.setattr("csplat_tools.cli.encode.glance", glance)
+    monkeypatch.setattr("csplat_tools.cli.encode.seeming_up", lambda _model: None)
     return seen
 
 
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
+def invoke(*words, **options):
+    return CliRunner().invoke(app, [str(word) for word in words], **options)
 
 
-def call(*words):
+def call(*words, **options):
     """Run a command that succeeds; return what it printed as data."""
-    result = invoke(*words)
+    result = invoke(*words, **options)
     assert result.exit_code == 0, result.stderr
     return result.stdout
 
@@ -82,6 +96,17 @@ def refused(*words, status=1):
 
 def program(*words, **options):
     return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, check=False, **options)
+
+
+def status_of(*words):
+    """Run the program in this process; return its exit status."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["csplat", *map(str, words)])
+        try:
+            main()
+        except SystemExit as ended:
+            return ended.code or 0
+    return 0
 
 
 # Encode and decode --------------------------------------------------------------------------------
@@ -104,7 +129,7 @@ def test_quiet_says_nothing(tmp_path, ply):
     assert (result.stdout, result.stderr) == ("", "")
 
 
-def test_encode_ends_with_bytes_and_quality(tmp_path, ply, glanced, monkeypatch):
+def test_encode_ends_with_bytes_and_quality(tmp_path, ply, glanced):
     out = tmp_path / "out.csplat"
     glanced["psnr"] = 41.234
     result = invoke("encode", ply, out, "--json")
@@ -117,13 +142,10 @@ def test_encode_ends_with_bytes_and_quality(tmp_path, ply, glanced, monkeypatch)
     glanced["psnr"] = None  # nothing is compiled
     last = invoke("encode", ply, out, "--force").stderr.splitlines()[-1]
     assert last.endswith(f"times smaller; `csplat compare {ply} {out}` says how it looks")
-    assert [200, 200] == glanced["scenes"]
-    monkeypatch.setattr("csplat_tools.cli.encode._SPLATS_LOOKED_AT", 199)
-    for more in ((), ("--quiet",)):
-        assert "about" not in json.loads(call("encode", ply, out, "--force", "--json", *more))
-    monkeypatch.setattr("csplat_tools.cli.encode._SPLATS_LOOKED_AT", 200)
-    call("encode", ply, out, "--force", "--quiet")
-    assert [200, 200] == glanced["scenes"]  # too many, and quiet
+    assert "about" not in json.loads(call("encode", ply, out, "--force", "--json"))
+    assert [200] * 3 == glanced["scenes"]
+    assert "about" not in json.loads(call("encode", ply, out, "--force", "--json", "--quiet"))
+    assert [200] * 3 == glanced["scenes"]
 
 
 def test_reports_as_json(tmp_path, ply):
@@ -176,22 +198,30 @@ def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):
     assert expected in " ".join(result.stderr.replace("│", "").split())
 
 
-@pytest.mark.parametrize("words", [("encode",), ("simplify",), ("finetune",), ("decode",)])
-def test_all_help_is_there_without_the_extra_packages(words):
-    code = "import sys; sys.modules['numba'] = None; from csplat_tools.__main__ import main; main()"
+@pytest.mark.slow
+def test_without_the_extra_packages_all_help_is_there_and_settings_say_what_they_want(ply, tmp_path):
+    code = """
+import contextlib, io, json, sys
+sys.modules["numba"] = None
+from csplat_tools.__main__ import main
+ends = []
+for words in json.loads(sys.argv.pop()):
+    sys.argv[1:], out, err = words, io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.suppress(SystemExit):
+        main()
+    ends.append((out.getvalue(), err.getvalue()))
+print(json.dumps(ends))
+"""
+    commands = [(name, "--help-all") for name in ("encode", "decode", "simplify", "finetune")]
+    commands.append(("simplify", str(ply), str(tmp_path / "o.ply"), "--keep", "0.5", "--set", "rounds=1"))
     done = subprocess.run(
-        [sys.executable, "-c", code, *words, "--help-all"], capture_output=True, text=True, check=True
-    )
-    assert "--report" in done.stdout
-    if words[0] in ("simplify", "finetune"):
-        assert "Settings of --set: this needs numba: pip install 'csplat[render]'" in done.stdout
-
-
-def test_settings_that_want_an_extra_say_so_in_one_line(ply, tmp_path):
-    code = "import sys; sys.modules['numba'] = None; from csplat_tools.__main__ import main; main()"
-    words = ("simplify", ply, tmp_path / "o.ply", "--keep", "0.5", "--set", "rounds=1")
-    done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, check=False)
-    assert (1, "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n") == (done.returncode, done.stderr)
+        [sys.executable, "-c", code, json.dumps(commands)], capture_output=True, text=True, check=True
+    )  # fmt: skip
+    *helps, (_, refused) = json.loads(done.stdout)
+    assert all("--report" in text for text, _ in helps)
+    for text, _ in helps[2:]:
+        assert "Settings of --set: this needs numba: pip install 'csplat[render]'" in text
+    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n" == refused
 
 
 def test_the_output_is_an_argument_or_an_option(tmp_path, ply):
@@ -281,13 +311,15 @@ def test_repairs_are_reported_and_strict_refuses_them(tmp_path, make_model):
     assert sorted(kept) == list(range(20))
 
 
-@pytest.mark.parametrize(("length", "told"), [(0.3, False), (5.0, False), (1e-6, True), (1e6, True)])
-def test_lengths_of_rotations_are_told_where_no_training_leaves_them(tmp_path, ply, length, told):
-    data = bytearray(ply.read_bytes())
-    data[-16:] = np.array([length, 0, 0, 0], "<f4").tobytes()  # the last rotation
-    ply.write_bytes(data)
-    assert told == ("1 rotation not of unit length" in invoke("encode", ply, tmp_path / "out.csplat").stderr)
-    assert "1 rotation not of unit length" in call("lint", ply)
+def test_lengths_of_rotations_are_told_where_no_training_leaves_them(tmp_path, ply):
+    line = "1 rotation not of unit length"
+    for length, told in ((0.3, False), (5.0, False), (1e-6, True), (1e6, True)):
+        data = bytearray(ply.read_bytes())
+        data[-16:] = np.array([length, 0, 0, 0], "<f4").tobytes()  # the last rotation
+        ply.write_bytes(data)
+        encoded = invoke("encode", ply, tmp_path / "out.csplat", "--preset", "fast", "--force")
+        assert (length, told) == (length, line in encoded.stderr)
+        assert line in call("lint", ply)
 
 
 def test_encode_replaces_none_of_its_own_files(tmp_path, ply):
@@ -495,6 +527,7 @@ def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_f
     assert [] == list(folder.iterdir())
 
 
+@pytest.mark.slow
 def test_a_full_standard_output_is_one_line(csplat_file):
     line = b"error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
     for words in (("info", csplat_file), ("--version",)):
@@ -763,9 +796,12 @@ def test_a_filter_that_finds_nothing_fails():
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
 
 
-def test_a_command_imports_itself_alone():
+@pytest.mark.slow
+def test_the_codec_does_not_import_the_program_and_a_command_imports_itself_alone():
     code = (
-        "import sys; from csplat_tools.cli.app import app\n"
+        "import sys, csplat.ply, csplat.encoder, csplat.decoder\n"
+        "assert 'csplat_tools' not in sys.modules\n"
+        "from csplat_tools.cli.app import app\n"
         "app(['info', '--help'], standalone_mode=False)\n"
         "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
     )
@@ -788,45 +824,52 @@ def test_help_gives_an_example(command):
     assert "\\b" not in text  # click's mark for "do not wrap", which typer's rich mode prints as it stands
 
 
-def test_completes_commands_and_options():
+def test_completes_commands_and_options(monkeypatch, capfd):
     def complete(*words):
-        asked = {"_CSPLAT_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
-        return program(env={**os.environ, **asked}).stdout.decode().split()
+        monkeypatch.setenv("_CSPLAT_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", " ".join(words))
+        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        assert 0 == status_of()
+        return capfd.readouterr().out.split()
 
     assert ["encode"] == complete("csplat", "enc")
     assert ["--preset"] == complete("csplat", "encode", "--pre")
 
 
-def test_the_codec_is_the_program_too_and_does_not_import_it():
+def test_the_codec_is_the_program_too():
     done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
     assert call("--version") == done.stdout
-    code = "import sys, csplat.ply, csplat.encoder, csplat.decoder; print('csplat_tools' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "False\n" == done.stdout
 
 
 def test_version_names_program_and_format():
-    assert call("--version").startswith("csplat 0.1.0, format 0.2")
+    assert call("--version").startswith(f"csplat {csplat.__version__}, format 0.2")
 
 
 # As a process -------------------------------------------------------------------------------------
 
 
-def test_works_in_pipes(ply):
-    encoded = program("encode", "-", "-", input=ply.read_bytes())
-    assert encoded.returncode == 0, encoded.stderr
-    assert b"200 splats" in encoded.stderr
-    assert len(decode(encoded.stdout)) == 200
-    for words in (("info", "-"), ("verify", "-")):
-        assert program(*words, input=encoded.stdout).returncode == 0
-    back = program("decode", "-", "-", input=encoded.stdout)
-    assert back.returncode == 0
+@pytest.mark.slow
+def test_works_in_pipes_and_gives_the_same_bytes_in_every_process(ply, csplat_file):
+    encoded = program("encode", "-", "-", "--quiet", "--threads", 1, input=ply.read_bytes())
+    assert (0, b"", csplat_file.read_bytes()) == (encoded.returncode, encoded.stderr, encoded.stdout)
+    back = program("decode", "-", "-", "--quiet", input=encoded.stdout)
+    assert (0, b"") == (back.returncode, back.stderr)
     assert back.stdout.startswith(b"ply\n")
-    linted = program("lint", "-", "--json", input=back.stdout)
-    assert json.loads(linted.stdout)["clean"]
-    assert b"standard input" in program("encode", "-", "-", input=b"nonsense").stderr
 
 
+def test_commands_read_standard_input(tmp_path, ply, csplat_file):
+    data = csplat_file.read_bytes()
+    encoded = invoke("encode", "-", "-", input=ply.read_bytes())
+    assert (0, data) == (encoded.exit_code, encoded.stdout_bytes)
+    assert "200 splats" in encoded.stderr
+    for name in ("info", "verify"):
+        assert call(name, csplat_file).partition("\n")[2] == call(name, "-", input=data).partition("\n")[2]
+    call("decode", "-", tmp_path / "back.ply", input=data)
+    assert json.loads(call("lint", "-", "--json", input=(tmp_path / "back.ply").read_bytes()))["clean"]
+    assert "standard input" in invoke("encode", "-", "-", input=b"nonsense").stderr
+
+
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_traceback(csplat_file):
     with subprocess.Popen(
         [*PROGRAM, "info", str(csplat_file), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -838,23 +881,19 @@ def test_a_closed_pipe_is_no_traceback(csplat_file):
         assert running.wait(20) == 1
 
 
-def test_the_same_input_gives_the_same_bytes(ply):
-    first = program("encode", ply, "-", "-q").stdout
-    assert first == program("encode", ply, "-", "-q", "--threads", 1).stdout
+def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):
+    near, far = pty.openpty()
+    with os.fdopen(far, "w") as terminal, os.fdopen(near, "rb", buffering=0) as shown:
+        for words in (("encode", ply, "-"), ("decode", csplat_file, "-")):
+            monkeypatch.setattr(sys, "stdout", terminal)
+            status = status_of(*words)
+            monkeypatch.undo()
+            assert 1 == status
+            assert "terminal" in capsys.readouterr().err
+        assert not select.select([shown], [], [], 0)[0]
 
 
-def test_writes_no_binary_to_a_terminal(ply, csplat_file):
-    for words in (("encode", ply, "-"), ("decode", csplat_file, "-")):
-        main, terminal = pty.openpty()
-        done = subprocess.run(
-            [*PROGRAM, *map(str, words)], stdout=terminal, stderr=subprocess.PIPE, check=False
-        )  # fmt: skip
-        os.close(terminal)
-        os.close(main)
-        assert done.returncode == 1
-        assert b"terminal" in done.stderr
-
-
+@pytest.mark.slow
 def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
     target = tmp_path / "out.csplat"
     with subprocess.Popen(

@@ -159,7 +159,7 @@ def test_pictures_survive_writing_and_reading():
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
 def test_pictures_of_other_writers_are_read(tmp_path, mode):
-    image = pytest.importorskip("PIL.Image")
+    image = pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
     noise = np.random.default_rng(1).integers(0, 256, (40, 30, 3), np.uint8)
     noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # so that the writer chooses every filter
     picture = image.fromarray(noise).convert(mode)

@@ -5,8 +5,16 @@ import sys
 
 import pytest
 
-from csplat_tools.files import console
-from csplat_tools.files.console import Display, format_range, format_seconds, note, progress_bar, say, step_progress
+from csplat_tools.files.console import (
+    Display,
+    displayed,
+    format_range,
+    format_seconds,
+    note,
+    progress_bar,
+    say,
+    step_progress,
+)
 
 
 class Clock:
@@ -65,10 +73,9 @@ def test_time_left_is_that_of_a_stage_that_began_anew(clock, capsys):
     assert "tiles 50 %, about 20 s left; 17:00 so far\n" == capsys.readouterr().err
 
 
-def test_a_stage_may_have_words_of_its_own(clock, capsys, monkeypatch):
+def test_a_stage_may_have_words_of_its_own(clock, capsys):
     display = Display(terminal=False, clock=clock)
-    monkeypatch.setattr(console, "_displays", [display])
-    with step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
+    with displayed(display), step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
         show(type("Step", (), {"iteration": 40, "iterations": 50})())
     assert ["training step 40, 3 s left; 0:10 so far"] == lines(display, clock, capsys, 11)
 
@@ -108,27 +115,26 @@ def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
 def test_what_is_said_takes_the_bars_away_first(clock, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("TERM", "xterm")
-    display = Display(terminal=True, clock=clock)
-    monkeypatch.setattr(console, "_displays", [display])
-    clock.now += 5.0
-    display.tick()
-    assert display._bars is not None
-    say("data")
-    assert display._bars is None
-    display.tick()
-    note("a remark")
-    assert sys.stderr.getvalue().endswith("a remark\n")
+    with displayed(Display(terminal=True, clock=clock)) as display:
+        clock.now += 5.0
+        display.tick()
+        assert display._bars is not None
+        say("data")
+        assert display._bars is None
+        display.tick()
+        note("a remark")
+        assert sys.stderr.getvalue().endswith("a remark\n")
     assert "data\n" == capsys.readouterr().out  # and not on standard error, where bars are
 
 
 def test_the_quiet_and_the_inner_ones_show_nothing_of_their_own():
     with progress_bar(quiet=True) as tell:
         assert tell is None
-        assert [] == console._displays
-    with progress_bar() as outer, progress_bar() as inner:
+    with progress_bar() as outer, progress_bar() as inner, progress_bar(quiet=True) as silent:
         assert outer == inner
-        assert 1 == len(console._displays)
-    assert [] == console._displays
+        assert silent is None
+    with progress_bar() as later:
+        assert later not in (None, outer)  # the first display went with its work
 
 
 def test_durations_are_short():

@@ -163,6 +163,7 @@ def test_a_ply_that_is_to_be_decoded_is_called_what_it_is(files):
         csplat.decode(files[1])
 
 
+@pytest.mark.slow
 def test_what_wants_an_extra_says_so_and_what_does_not_works_without(files):
     code = f"""
 import sys
@@ -227,6 +228,25 @@ def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, says):
 # the commands call these
 
 
+@pytest.fixture(scope="module")
+def views_once():
+    """Virtual cameras are searched for once: all commands are called with the same scene."""
+    pytest.importorskip("numba", reason="virtual cameras want the extra [render]")
+    from csplat_tools.views import finding
+
+    search, known = finding.virtual_cameras, {}
+
+    def find(model, *args, **named):
+        key = (*args, *sorted(named.items()))
+        if key not in known:
+            known[key] = search(model, *args, **named)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finding, "virtual_cameras", find)
+        yield
+
+
 class Called(Exception):  # noqa: N818  # no error: it ends a command where the interface begins
     """What a command handed over."""
 
@@ -242,8 +262,8 @@ class Called(Exception):  # noqa: N818  # no error: it ends a command where the 
         (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
     ],
 )
+@pytest.mark.usefixtures("views_once")
 def test_commands_call_the_functions_that_programs_call(files, monkeypatch, words, name, given):
-    pytest.importorskip("numba", reason="these commands want the extra [render]")
     monkeypatch.chdir(files[1].parent)
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
 

@@ -4,9 +4,11 @@ import errno
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -18,73 +20,78 @@ from csplat import EncodeOptions, InputError, decode, encode, encode_with_report
 from csplat.encoder import buckets, draft
 from csplat.encoder.buckets import Curve, bucket_rows
 from csplat.formats import open_scene
-from csplat.large import bucket_files, encode_scene, encoding
+from csplat.large import encode_scene, encoding
 from csplat.scene import scene_of
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
+from csplat_tools.files.by_disk import Scale, encode_by_disk, expected
 
-WHOLE = 1500  # splats, in place of half a million
+WHOLE = 600  # splats, in place of half a million
+COUNT = 6 * WHOLE
 FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32)
 
 
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
-    """Scenes of thousands of splats are large, and fit no memory."""
+    """Scenes of thousands of splats are large."""
     for module in (buckets, draft, encoding):
         monkeypatch.setattr(module, "WHOLE", WHOLE)
-    monkeypatch.setattr(encoding, "_WHOLE_ROW", 1e6)
+
+
+encode_large = partial(encode_scene, by_disk=True)
 
 
 @pytest.fixture(scope="module")
 def model(sample_path):
     sample, rng = read_ply(sample_path), np.random.default_rng(5)
-    many = sample.select(rng.integers(0, len(sample), 9000))
+    many = sample.select(rng.integers(0, len(sample), COUNT))
     means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
-    extra = {"confidence": np.arange(9000, dtype=np.uint16)}
+    extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
     return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
 
 
 @pytest.fixture(scope="module")
-def expected(model):
+def whole(model):
+    """The bytes that the scene has in memory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(buckets, "WHOLE", WHOLE)
         patch.setattr(draft, "WHOLE", WHOLE)
         return encode(model, FAST)
 
 
-def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, expected, tmp_path):
+def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, whole, tmp_path):
     stages = {}
-    report = encode_scene(
+    report = encode_large(
         scene_of(model), tmp_path / "out.csplat", FAST, progress=lambda stage, done: stages.update({stage: done})
     )
-    assert expected == (tmp_path / "out.csplat").read_bytes()
+    assert whole == (tmp_path / "out.csplat").read_bytes()
     assert ["out.csplat"] == [path.name for path in tmp_path.iterdir()]
-    assert (len(model), len(expected)) == (report.splat_count, report.size_bytes)
+    assert (len(model), len(whole)) == (report.splat_count, report.size_bytes)
     assert {"looking", "sorting", "codebook", "coding", "writing"} == set(stages)
     assert 1.0 == stages["looking"] == stages["sorting"] == stages["coding"]
 
 
-def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, expected):
-    assert validate(expected).conforms
+def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, whole):
+    assert validate(whole).conforms
     result = encode_with_report(model, FAST)
-    assert 9000 == len(np.unique(result.source_index))
+    assert COUNT == len(np.unique(result.source_index))
     decoded = decode(result.data)
     distance = np.linalg.norm(decoded.means - model.means[result.source_index], axis=1)
     assert distance.max() <= result.report.errors["means"][0]
-    assert 8 <= result.report.tile_count <= 12
+    assert 7 <= result.report.tile_count <= 12
 
 
 def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
     other = draft.Draft.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
-    assert np.array_equal(-model.shN[buckets.sample_rows(9000)], other.sample.model.shN)
+    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT)], other.sample.model.shN)
     decoded = decode(other.coded().write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
 
-def test_two_processes_give_the_bytes_of_one(model, expected, tmp_path):
-    encode_scene(scene_of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
-    assert expected == (tmp_path / "out.csplat").read_bytes()
+def test_two_processes_give_the_bytes_of_one(model, whole, tmp_path):
+    encode_large(scene_of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
+    assert whole == (tmp_path / "out.csplat").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -96,7 +103,7 @@ def test_two_processes_give_the_bytes_of_one(model, expected, tmp_path):
     ],
 )
 def test_options_are_those_of_memory(model, options, tmp_path):
-    encode_scene(scene_of(model), tmp_path / "out.csplat", options)
+    encode_large(scene_of(model), tmp_path / "out.csplat", options)
     assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -104,11 +111,11 @@ def test_positions_in_doubles_huge_values_and_huge_sh_are_those_of_memory(model,
     origin = (4.5e5, 5.4e6, 100.0)
     doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9
     scales, shN = model.scales.copy(), model.shN.copy()
-    scales[17], scales[4000], shN[8000] = 95.0, 1e5, 3e8
+    scales[17], scales[1600], shN[3200] = 95.0, 1e5, 3e8
     means = (doubles - np.array(origin)).astype(np.float32)
     hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
-    encode_scene(scene_of(hard), tmp_path / "out.csplat", options)
+    encode_large(scene_of(hard), tmp_path / "out.csplat", options)
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -126,25 +133,25 @@ class Interrupt:
 
 
 @pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
-def test_an_interrupted_encoding_goes_on(model, expected, tmp_path, stage, after):
+def test_an_interrupted_encoding_goes_on(model, whole, tmp_path, stage, after):
     target, scene = tmp_path / "out.csplat", scene_of(model)
     with pytest.raises(KeyboardInterrupt):
-        encode_scene(scene, target, FAST, progress=Interrupt(stage, after=after))
+        encode_large(scene, target, FAST, progress=Interrupt(stage, after=after))
     assert not target.exists()
     assert (tmp_path / "out.csplat.work").is_dir()
     with pytest.raises(InputError, match="left of an interrupted encoding"):
-        encode_scene(scene, target, FAST)
+        encode_large(scene, target, FAST)
     with pytest.raises(InputError, match="another options"):
-        encode_scene(scene, target, replace(FAST, seed=1), resume=True)
+        encode_large(scene, target, replace(FAST, seed=1), resume=True)
     coded = []
-    encode_scene(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
-    assert expected == target.read_bytes()
+    encode_large(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
+    assert whole == target.read_bytes()
     if stage == "coding":
         assert "sorting" not in coded
     assert [target] == list(tmp_path.iterdir())
 
 
-def test_a_killed_worker_is_said_and_nothing_is_lost(model, expected, tmp_path):
+def test_a_killed_worker_is_said_and_nothing_is_lost(model, whole, tmp_path):
     target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
 
     def kill(stage, _done):
@@ -153,45 +160,48 @@ def test_a_killed_worker_is_said_and_nothing_is_lost(model, expected, tmp_path):
                 os.kill(child.pid, signal.SIGKILL)
 
     with pytest.raises(OSError, match="a worker process was killed") as error:
-        encode_scene(scene_of(model), target, two, progress=kill)
+        encode_large(scene_of(model), target, two, progress=kill)
     assert errno.ENOMEM == error.value.errno
     assert not target.exists()
-    encode_scene(scene_of(model), target, two, resume=True)
-    assert expected == target.read_bytes()
+    encode_large(scene_of(model), target, two, resume=True)
+    assert whole == target.read_bytes()
 
 
-def test_a_full_disk_is_said_before_and_survived_within(model, expected, tmp_path, monkeypatch):
+def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, monkeypatch):
     target = tmp_path / "out.csplat"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
-        with pytest.raises(InputError, match="0 MB free, and 3 are wanted"):
-            encode_scene(scene_of(model), target, FAST)
+        with pytest.raises(InputError, match="0 MB free, and 1 are wanted"):
+            encode_large(scene_of(model), target, FAST)
     assert not list(tmp_path.iterdir())
-    with monkeypatch.context() as patch:
-        patch.setattr(bucket_files, "_append", full)
-        with pytest.raises(OSError, match="No space left"):
-            encode_scene(scene_of(model), target, FAST)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, _done):
+        if stage == "sorting":  # of each bucket a part can be written
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            encode_large(scene_of(model), target, FAST, progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not target.exists()
-    encode_scene(scene_of(model), target, FAST, resume=True)
-    assert expected == target.read_bytes()
-
-
-def full(stream, _arrays):
-    stream.write(b"half of it")
-    raise OSError(errno.ENOSPC, "No space left on device", stream.name)
+    assert [10_000] == [path.stat().st_size for path in (tmp_path / "out.csplat.work").glob("bucket-*")]
+    encode_large(scene_of(model), target, FAST, resume=True)
+    assert whole == target.read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["sample", "bucket-000003", "chunks-000001", "tiles-000001", "state.json"])
 def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
-        encode_scene(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
+        encode_large(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
     path = tmp_path / "out.csplat.work" / kind
     data = bytearray(path.read_bytes())
     data[len(data) // 2 if kind != "state.json" else 0] ^= 0x10
     path.write_bytes(data)
     with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
-        encode_scene(scene_of(model), target, FAST, resume=True)
+        encode_large(scene_of(model), target, FAST, resume=True)
     assert not target.exists()
 
 
@@ -201,20 +211,19 @@ def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
     (folder / "one.jpg").write_bytes(b"dear to somebody")
     for resume in (False, True):
         with pytest.raises(InputError, match="photographs holds something else"):
-            encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
+            encode_large(scene_of(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
     assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
 
 
-def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model, expected, tmp_path, monkeypatch):
+def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model, whole, tmp_path):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
-        encode_scene(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
-    monkeypatch.setattr(encoding, "_WHOLE_ROW", 1.0)
+        encode_large(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
     stages = []
     encode_scene(scene_of(model), target, FAST, resume=True, progress=lambda stage, _done: stages.append(stage))
     assert "coding" in stages
     assert "sorting" not in stages
-    assert expected == target.read_bytes()
+    assert whole == target.read_bytes()
     assert [target] == list(tmp_path.iterdir())
 
 
@@ -223,18 +232,18 @@ def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
 
     def blocks():
         times.append(1)
-        yield model.select(slice(0, 9000 if len(times) == 1 else 8000))
+        yield model.select(slice(0, COUNT if len(times) == 1 else 3000))
 
-    with pytest.raises(InputError, match="8,000 splats came where 9,000 were announced"):
-        encode_scene(replace(scene_of(model), blocks=blocks), tmp_path / "out.csplat", FAST)
+    with pytest.raises(InputError, match="3,000 splats came where 3,600 were announced"):
+        encode_large(replace(scene_of(model), blocks=blocks), tmp_path / "out.csplat", FAST)
     assert not (tmp_path / "out.csplat").exists()
 
 
 def test_too_little_memory_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which wants 2"):
-        encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
+        encode_large(scene_of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
     with pytest.raises(InputError, match="a codebook of shapes wants the scene in memory"):
-        encode_scene(scene_of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
+        encode_large(scene_of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
     assert not list(tmp_path.iterdir())
 
 
@@ -243,20 +252,20 @@ def test_buckets_are_neighbours_and_hold_every_splat_once(model):
     assert np.array_equal(np.arange(len(model)), np.sort(np.concatenate(rows)))
     assert max(map(len, rows)) <= WHOLE
     assert all((np.diff(part) > 0).all() for part in rows)
-    whole = np.ptp(model.means, axis=0).prod()
-    assert np.median([np.ptp(model.means[part], axis=0).prod() for part in rows]) < whole / 4
+    volume = np.ptp(model.means, axis=0).prod()
+    assert np.median([np.ptp(model.means[part], axis=0).prod() for part in rows]) < volume / 4
 
 
 def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
     rng = np.random.default_rng(1)
-    means = rng.normal(0, 1, (9000, 3)).astype(np.float32)
-    means[buckets.sample_rows(9000)] += 100.0  # what is looked at lies where nothing else is
+    means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
+    means[buckets.sample_rows(COUNT)] += 100.0  # what is looked at lies where nothing else is
     parts = bucket_rows(means)
-    assert np.array_equal(np.arange(9000), np.sort(np.concatenate(parts)))
+    assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
-    same = bucket_rows(np.ones((4000, 3), np.float32))
-    assert [1333, 1333, 1334] == [len(part) for part in same]
-    assert [0, 1333, 2666, 4000] == [part[0] for part in same] + [4000]
+    same = bucket_rows(np.ones((1600, 3), np.float32))
+    assert [533, 533, 534] == [len(part) for part in same]
+    assert [0, 533, 1066, 1600] == [part[0] for part in same] + [1600]
     assert all(first[-1] < second[0] for first, second in pairwise(same))
 
 
@@ -264,8 +273,10 @@ def test_a_small_scene_has_one_bucket():
     assert 1 == Curve.through(np.zeros((10, 3), np.float32), WHOLE).count
 
 
-def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, expected, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="the extra `scale` is not installed")
+@pytest.mark.slow
+@pytest.mark.area(name="dask")
+def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
     target = tmp_path / "out.csplat"
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
@@ -277,38 +288,75 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, expecte
                 os.kill(victims.pop(), signal.SIGKILL)
                 victims.clear()
 
-        encode_scene(scene_of(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
+        encode_large(scene_of(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
     assert not victims
-    assert expected == target.read_bytes()
+    assert whole == target.read_bytes()
 
 
+@pytest.mark.area(name="dask")
 def test_a_cluster_that_does_not_answer_is_said(model, tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="the extra `scale` is not installed")
+    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
     with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
-        encode_scene(scene_of(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
+        encode_large(scene_of(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
 
 
 def partial_client(client):
     return lambda address, **options: client(address, **{**options, "timeout": 0.2})
 
 
-def test_the_command_goes_by_the_disk_where_it_is_told(model, tmp_path, monkeypatch):
-    source, target = tmp_path / "scene.ply", tmp_path / "out.csplat"
-    write_ply(source, replace(model, extra={}, metadata={}))
+@pytest.fixture
+def ply(model, tmp_path):
+    write_ply(tmp_path / "scene.ply", replace(model, extra={}, metadata={}))
+    return tmp_path / "scene.ply"
+
+
+def test_a_file_goes_by_way_of_the_disk_where_it_is_told(ply, tmp_path):
+    target, scale = tmp_path / "out.csplat", Scale(memory_bytes=300_000_000, by_disk=True)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    foretold = expected(ply, options, scale)
+    assert (COUNT, 1, False) == (foretold.count, foretold.sh_degree, foretold.needs.in_memory)
+    assert 0 < foretold.needs.memory_bytes <= 300e6
+    stages = []
+    encoded = encode_by_disk(
+        ply, str(target), options, None, scale, strict=False, progress=lambda stage, _done: stages.append(stage)
+    )
+    assert {"sorting", "coding"} <= set(stages)
+    assert encoded.report.size_bytes == target.stat().st_size
+    with open_scene(ply) as scene:
+        assert encode(scene.model(), options) == target.read_bytes()
+
+
+def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeypatch):
+    target, asked = tmp_path / "out.csplat", []
+
+    def encode_here(_local, _target, _options, _facts, scale, **_):
+        asked.append(scale)
+
+    monkeypatch.setattr("csplat_tools.files.convert.encode_by_disk", encode_here)
     run = CliRunner().invoke
-    foretold = run(app, ["encode", str(source), str(target), "--memory", "300MB", "--dry-run", "--json"])
+    foretold = run(app, ["encode", str(ply), str(target), "--memory", "300MB", "--dry-run", "--json"])
     assert 0 == foretold.exit_code
     said = json.loads(foretold.stdout)
-    assert (9000, 3, False) == (said["splats"], said["sh_degree"], said["in_memory"])
-    assert 0 < said["memory_bytes"] <= 300e6
+    assert (COUNT, 3, True) == (said["splats"], said["sh_degree"], said["in_memory"])
     assert not target.exists()
-    options = ["--memory", "300MB", "--preset", "fast", "--sh-degree", "1", "--threads", "1"]
-    monkeypatch.setattr("csplat_tools.files.by_disk._SMALL", 0)
-    monkeypatch.setattr("csplat_tools.files.by_disk._FOLDS", 1000)
-    found = run(app, ["encode", str(source), str(target), *options])
-    assert 0 == found.exit_code, found.output
-    with open_scene(source) as scene:
-        assert encode(scene.model(), EncodeOptions(preset="fast", sh_degree=1)) == target.read_bytes()
-    refused = run(app, ["encode", str(source), str(target), "--resume", "--target-psnr", "40", "--force"])
+    words = ["--memory", "300MB", "--resume", "--work", "w", "--preset", "fast", "--quiet"]
+    done = run(app, ["encode", str(ply), str(target), *words])
+    assert 0 == done.exit_code, done.output
+    assert [Scale(memory_bytes=300_000_000, folder="w", resume=True)] == asked
+    refused = run(app, ["encode", str(ply), str(target), "--resume", "--target-psnr", "40", "--force"])
     assert 2 == refused.exit_code
+
+
+def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene_fits(ply, tmp_path):
+    def may_leave(path, size, **scale):
+        os.truncate(path, size)  # no byte of the rest takes room
+        return Scale(**scale).may_leave_memory(path)
+
+    assert not may_leave(ply, 4 << 20, memory_bytes=1)
+    assert may_leave(ply, 5 << 20, memory_bytes=19 << 20)
+    assert not may_leave(ply, 5 << 20, memory_bytes=21 << 20)
+    assert may_leave(ply, 4 << 20, memory_bytes=1, resume=True)
+    csplat_file = tmp_path / "scene.csplat"
+    csplat_file.write_bytes(b"CSPLAT")
+    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # how large it becomes, its size does not say

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import csplat
 import csplat_conformance
-from csplat import EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
+from csplat import CsplatError, EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
 from csplat.decoder import read_metadata, read_options, read_stated_errors
 from csplat.decoder.references import codebook_references
 from csplat_conformance.validator import validate
@@ -43,7 +43,7 @@ def assert_joined(parts, whole):
 
 @pytest.fixture(scope="module")
 def sample(sample_path):
-    return read_ply(sample_path)
+    return read_ply(sample_path).select(slice(0, None, 3))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def halves(sample):
     order = np.argsort(sample.means[:, 0])
     options = EncodeOptions(
         preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
-        shape_escape_fraction=0.05, tile_splats=1500, keep_extra=True, **STEPS,
+        shape_escape_fraction=0.05, tile_splats=500, keep_extra=True, **STEPS,
     )  # fmt: skip
     ids = np.arange(len(sample), dtype=np.uint32)
     model = replace(sample, extra={"id": ids})
@@ -64,7 +64,7 @@ def halves(sample):
 
 def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(halves):
     done, data = merge(*halves)
-    assert ("", 8929) == (done.why, done.splat_count)
+    assert ("", 2977) == (done.why, done.splat_count)
     assert () == validate(data).violations
     assert_joined([decode(one) for one in halves], decode(data))
     header = read_header(data)
@@ -83,7 +83,7 @@ def test_what_nobody_has_proved_of_the_whole_is_left_out(halves):
 
 
 def test_parts_of_a_file_share_their_codebooks_again(sample):
-    whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=1000))
+    whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=350))
     middle = float(np.median(sample.means[:, 0]))
     parts = []
     for box in ((-1e3, -1e3, -1e3, middle, 1e3, 1e3), (middle, -1e3, -1e3, 1e3, 1e3, 1e3)):
@@ -109,8 +109,17 @@ def test_a_vector_beside_itself_is_there_twice(name):
     assert_joined([decode(path)] * 2, decode(data))
 
 
-@pytest.mark.parametrize("path", sorted(VECTORS.glob("*.csplat")), ids=lambda path: path.stem)
-def test_references_to_codebooks_are_found_without_decoding(path):
+def test_references_to_codebooks_are_found_without_decoding():
+    failed = []
+    for path in sorted(VECTORS.glob("*.csplat")):
+        try:
+            check_references(path)
+        except (AssertionError, CsplatError) as error:
+            failed.append(f"{path.stem}: {error!r}")
+    assert [] == failed
+
+
+def check_references(path):
     data = path.read_bytes()
     header = read_header(data)
     found = set()
@@ -203,11 +212,10 @@ def test_fewer_than_two_files_are_refused(files, tmp_path):
         csplat.merge(files, tmp_path / "out.csplat")
 
 
-def test_more_codebooks_than_a_file_can_have_are_coded_again(halves, monkeypatch):
-    monkeypatch.setattr("csplat.merging._BOOKS_MAX", 3)
-    done, data = merge(*halves, options=EncodeOptions(preset="fast"))
+def test_more_codebooks_than_a_file_can_have_are_coded_again(halves):
+    done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
     assert "they have 4 codebooks together, and a file at most 3" == done.why
-    assert 8929 == len(decode(data))
+    assert 2977 == len(decode(data))
 
 
 # the command
@@ -219,7 +227,7 @@ def test_the_command_says_what_it_did(halves, make_model, tmp_path):
     a, b, c, out = (str(tmp_path / f"{name}.csplat") for name in ("a", "b", "c", "out"))
     done = CliRunner().invoke(app, ["merge", a, b, "-o", out])
     assert 0 == done.exit_code, done.stderr
-    assert "8,929 splats in 6 tiles, copied: " in done.stderr
+    assert "2,977 splats in 6 tiles, copied: " in done.stderr
     assert merge(*halves)[1] == (tmp_path / "out.csplat").read_bytes()
     assert 1 == CliRunner().invoke(app, ["merge", a, b, "-o", out]).exit_code  # it is there
     refused = CliRunner().invoke(app, ["merge", a, b, "-o", a, "--force"])

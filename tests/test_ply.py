@@ -508,16 +508,16 @@ def test_refuses_every_prefix_of_a_file(tmp_path):
             read_ply(tmp_path / "b.ply")
 
 
+@pytest.mark.slow
 def test_every_flipped_header_bit_is_read_or_refused(tmp_path):
-    names = columns_of(0)
+    names = columns_of(0, normals=False)
     write_rows(tmp_path / "a.ply", names, random_rows(names, 2))
     data = (tmp_path / "a.ply").read_bytes()
     for bit in range(8 * (data.index(b"end_header\n") + 11)):
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
-        (tmp_path / "b.ply").write_bytes(flipped)
         with suppress(InputError):
-            read_ply(tmp_path / "b.ply")
+            read_ply(flipped)
 
 
 def test_a_missing_file_is_an_os_error(tmp_path):
@@ -526,34 +526,36 @@ def test_a_missing_file_is_an_os_error(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def million(tmp_path_factory):
-    path = tmp_path_factory.mktemp("million") / "a.ply"
+def many(tmp_path_factory):
+    """A PLY of 400,000 splats."""
+    path = tmp_path_factory.mktemp("many") / "a.ply"
     names = columns_of(3)
     block = random_rows(names, 10_000)
     write_rows(path, names, block)
-    data = path.read_bytes().replace(b"vertex 10000\n", b"vertex 1000000\n")
+    data = path.read_bytes().replace(b"vertex 10000\n", b"vertex 400000\n")
     head = data.index(b"end_header\n") + 11
     with path.open("wb") as stream:
         stream.write(data[:head])
-        for _ in range(100):
+        for _ in range(40):
             stream.write(data[head:])
     yield path
     path.unlink()
 
 
-def test_a_million_splats_read_in_under_a_second_of_cpu(million):
+@pytest.mark.slow
+def test_a_million_splats_are_read_in_under_a_second_of_cpu(many):
     times = []
-    for _ in range(3):
+    while len(times) < 5 and min(times, default=1.0) >= 0.4 * 0.8:  # until one was undisturbed
         start = time.process_time()
-        model = read_ply(million)
+        model = read_ply(many)
         times.append(time.process_time() - start)
-    assert (1_000_000, 3) == (len(model), model.sh_degree)
-    assert min(times) < 0.8
+    assert (400_000, 3) == (len(model), model.sh_degree)
+    assert min(times) < 0.4 * 0.8
 
 
-def test_reading_allocates_little_more_than_the_arrays(million):
+def test_reading_allocates_little_more_than_the_arrays(many):
     tracemalloc.start()
-    model = read_ply(million)
+    model = read_ply(many)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     size = sum(getattr(model, name).nbytes for name in (*ARRAYS, "opacities"))

@@ -1,26 +1,42 @@
-"""Files that are read in parts, from a disk, from memory, from the web and from S3."""
+"""Files that are read in parts, from a disk, from memory and from a store; servers: `test_remote_servers.py`."""
 
 import io
 import math
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from stores import Web, s3
+from stores import FileSystem, assert_same, box_of
 from typer.testing import CliRunner
 
 import csplat
 from csplat import EncodeOptions, FormatError, InputError, LimitError, StoreError, _spec, decode, encode, read_header
-from csplat import stores as module
 from csplat.decoder import Limits, iter_tiles
+from csplat.inputs import LetGo, mapped
+from csplat.opened import SplatFile
+from csplat.remote import store_of
+from csplat.stores import Memory, RequestSizes, Window
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
-ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+#: So small that a file of some hundred kB takes several requests.
+SMALL = RequestSizes(first=512, batch=20_000, gap=100, request=10_000)
 
 
-def assert_same(a, b):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+class Watched(SplatFile):
+    """A file whose windows can be looked at."""
+
+    def window(self):
+        self.last_window = super().window()
+        return self.last_window
+
+
+def opened(file):
+    """Open a file that is asked for small parts."""
+    store = store_of(file)
+    store.sizes = SMALL
+    return Watched(store, Limits())
 
 
 @pytest.fixture(scope="module")
@@ -30,30 +46,17 @@ def data(sample_path):
 
 @pytest.fixture(scope="module")
 def box(data):
-    """That of the third tile, which others touch."""
-    header = read_header(data)
-    tile, step = header.tiles[2], header.attributes[3].step
-    low = [corner * step * 2.0**tile.exponent for corner in tile.corner]
-    return (*low, *(a + b * step * 2.0**tile.exponent for a, b in zip(low, tile.extent, strict=True)))
+    return box_of(data, 2)  # others touch it
 
 
 @pytest.fixture
-def small_steps(monkeypatch):
-    """Parts so small that a file of some hundred kB takes several requests."""
-    monkeypatch.setattr("csplat.opened._FIRST", 512)
-    monkeypatch.setattr("csplat.opened._BATCH", 60_000)
-    monkeypatch.setattr("csplat.parts._BATCH", 20_000)
-    monkeypatch.setattr("csplat.inputs._STEP_BYTES", 1)
-    monkeypatch.setattr(module, "_GAP", 100)
-    monkeypatch.setattr(module, "_REQUEST", 10_000)
-
-
-@pytest.fixture
-def web(data):
-    server = Web({"/scene.csplat": data})
-    with server.serve() as address:
-        server.url = f"{address}/scene.csplat"
-        yield server
+def store(data, monkeypatch):
+    """A file system that fsspec has for URLs of `store://`, and for those of the web."""
+    system = FileSystem({"scene.csplat": data})
+    core = SimpleNamespace(url_to_fs=lambda url, **_: (system, url.partition("://")[2].rpartition("/")[2]))
+    monkeypatch.setitem(sys.modules, "fsspec", SimpleNamespace(core=core))
+    monkeypatch.setitem(sys.modules, "fsspec.core", core)
+    return system
 
 
 # what is read
@@ -84,41 +87,67 @@ def test_boxes_are_those_of_the_splats(data):
             np.testing.assert_array_equal(box[1].astype(np.float32), tile.means.max(axis=0))
 
 
-@pytest.mark.usefixtures("small_steps")
 def test_tiles_come_one_after_the_other_and_what_was_before_them_is_let_go_of(data, box):
-    with csplat.open(io.BytesIO(data)) as file:
+    with opened(io.BytesIO(data)) as file:
         for degree in (None, 0, 2):
             wanted = list(iter_tiles(data, sh_degree=degree))
             found = list(file.tiles(sh_degree=degree))
             assert len(wanted) == len(found)
             for a, b in zip(wanted, found, strict=True):
                 assert_same(a, b)
+            first = file.header.tiles[0].layers[0]
+            assert not any(file.last_window.view[first.offset : first.offset + first.size])
         assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
-@pytest.mark.usefixtures("small_steps")
 def test_bands_that_are_not_wanted_are_not_fetched(data):
     layers = {layer: sum(tile.layers[layer].size for tile in read_header(data).tiles) for layer in range(4)}
-    with csplat.open(data) as file:
+    with opened(data) as file:
         before = file.bytes_read
         file.read(sh_degree=0)
         assert layers[0] <= file.bytes_read - before < layers[0] + layers[1] / 2
 
 
-@pytest.mark.usefixtures("small_steps")
-def test_what_was_not_fetched_is_never_taken_for_data(data, monkeypatch):
-    monkeypatch.setattr("csplat.opened._layers", lambda *_: [])
-    with csplat.open(data) as file:
+def test_what_was_not_fetched_is_never_taken_for_data(data):
+    with opened(data) as file:
+        window = file.window()
+        window.fetch([(0, _spec.HEADER_SIZE + file.header.index_size)])
         with pytest.raises(FormatError, match="E_CRC"):
-            file.read(tiles=[4])
+            decode(window.view, tiles=[4])
         with pytest.raises(FormatError, match="E_CRC"):
-            list(file.tiles())
+            list(iter_tiles(window.view))
+
+
+def test_a_mapped_file_is_let_go_of_and_a_window_keeps_what_was_fetched(data, tmp_path):
+    (tmp_path / "scene.csplat").write_bytes(data)
+    window = Window(Memory(data))
+    window.fetch([(0, len(data))])
+    for view in (window.view, memoryview(mapped(tmp_path / "scene.csplat"))):
+        LetGo(view, step_bytes=1).after(1)
+        assert data == view
+
+
+def test_an_index_that_is_longer_than_the_first_request_takes_a_second_one(data):
+    with opened(data) as file:
+        assert 2 <= file.requests
+        assert _spec.HEADER_SIZE + file.header.index_size == file.bytes_read
+        assert read_header(data) == file.header
+
+
+def test_a_part_is_cut_out_in_small_requests_as_in_large_ones(data, box):
+    parts = []
+    for file in (csplat.open(data), opened(data)):
+        with file:
+            parts.append(io.BytesIO())
+            file.extract(box, parts[-1])
+            requests = file.requests
+    assert parts[0].getvalue() == parts[1].getvalue()
+    assert requests > 10
 
 
 def test_parts_that_lie_together_are_read_in_one_request(data):
-    store = module.Memory(data)
-    window = module.Window(store)
-    gap = module._GAP
+    store = Memory(data)
+    window, gap = Window(store), store.sizes.gap
     window.fetch([(10, 5), (0, 10), (15 + gap, 5)])
     assert (1, 20 + gap) == (store.requests, store.bytes_read)
     window.fetch([(12, gap)])  # is there
@@ -184,76 +213,88 @@ def test_a_damaged_file_is_named(data, tmp_path):
     assert str(tmp_path / "scene.csplat") == raised.value.path
 
 
-# the web
+# a store that fsspec knows
 
 
-def test_the_web_gives_the_parts_that_are_wanted(web, data, box):
-    with csplat.open(web.url) as file:
-        assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
+def test_a_store_gives_the_parts_that_are_wanted(store, data, box):
+    with csplat.open("store://scenes/scene.csplat") as file:
+        assert (2, 65536) == (file.requests, file.bytes_read)
         chosen = [tile.tile.index for tile in file.tiles(box)]
         assert_same(decode(data, tiles=chosen), file.read(box))
-        assert (len(web.asked), web.sent) == (file.requests, file.bytes_read)
+        assert (store.asked, store.sent) == (file.requests, file.bytes_read)
         assert_same(decode(data), file.read())
 
 
-@pytest.mark.usefixtures("small_steps")
-def test_an_index_that_is_longer_than_the_first_request_takes_a_second_one(web, data):
-    with csplat.open(web.url) as file:
-        assert 2 <= len(web.gets)
-        assert _spec.HEADER_SIZE + file.header.index_size == file.bytes_read
-        assert read_header(data) == file.header
-
-
-def test_a_server_without_parts_is_refused(web):
-    web.ranges = False
-    with csplat.open(web.url) as file, pytest.raises(StoreError, match=r"/scene\.csplat: the server sends whole files"):
-        file.read(sh_degree=0)
-
-
-def test_a_lost_connection_is_a_typed_error(web):
-    web.cut_after = 0
-    with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-        csplat.open(web.url)
-    web.cut_after = 1 + len(web.gets)
-    with csplat.open(web.url) as file:
-        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-            file.read(sh_degree=0)
-        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-            list(file.tiles())
-
-
 @pytest.mark.parametrize("size", [None, 70_000])
-def test_a_file_that_changes_between_requests_is_told(web, data, size):
-    with csplat.open(web.url) as file:
-        web.files["/scene.csplat"] = bytes(reversed(data))[:size]
+def test_a_file_of_a_store_that_changes_between_requests_is_told(store, data, size):
+    with csplat.open("store://scene.csplat") as file:
+        store.files["scene.csplat"] = bytes(reversed(data))[:size]
         with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
+            file.read(tiles=[5])
+        del store.files["scene.csplat"]
+        with pytest.raises(FileNotFoundError, match=r"store://scene\.csplat"):
             file.read(tiles=[5])
 
 
-def test_a_file_of_the_web_that_is_damaged_is_named(web, data):
-    web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
-    with csplat.open(web.url) as file, pytest.raises(FormatError, match="E_CRC") as raised:
+def test_a_store_that_breaks_off_is_a_typed_error(store):
+    store.cut_after = 0
+    with pytest.raises(StoreError, match=r"/scene\.csplat gave 32768 bytes where 65536 from byte 0 were asked for"):
+        csplat.open("store://scene.csplat")
+    store.cut_after = None
+    with csplat.open("store://scene.csplat") as file:
+        store.answer = ConnectionError("lost")
+        with pytest.raises(StoreError, match=r"/scene\.csplat: lost"):
+            file.read(sh_degree=0)
+
+
+def test_a_web_server_without_parts_is_refused(store):
+    store.protocol, store.ranges = ("http", "https"), False
+    with (
+        csplat.open("https://example.org/scene.csplat") as file,
+        pytest.raises(StoreError, match=r"/scene\.csplat: the server sends whole files"),
+    ):
+        file.read(sh_degree=0)
+
+
+def test_a_web_server_that_gives_parts_is_asked_for_them(store, data):
+    store.protocol = ("http", "https")
+    with csplat.open("https://example.org/scene.csplat") as file:
+        assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
+
+
+def test_a_damaged_file_of_a_store_is_named(store, data):
+    store.files["scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
+    with csplat.open("store://scene.csplat") as file, pytest.raises(FormatError, match="E_CRC") as raised:
         file.read()
-    assert web.url == raised.value.path
+    assert "store://scene.csplat" == raised.value.path
 
 
 @pytest.mark.parametrize(
-    ("answer", "error", "says"),
+    ("status", "error", "says"),
     [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
 )
-def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, says):
-    web.files["/other.csplat?key=secret"] = answer
-    address = web.url.replace("://", "://somebody:password@").replace("scene", "other")
+def test_what_a_store_refuses_is_said_without_secrets(store, status, error, says):
+    store.answer = Refused("store://scene.csplat?key=secret")
+    store.answer.status = status
     with pytest.raises(error, match=says) as raised:
-        csplat.open(address + "?key=secret")
-    assert "other.csplat" in str(raised.value)
+        csplat.open("store://somebody:password@scenes/scene.csplat?key=secret")
+    assert "scene.csplat" in str(raised.value)
     assert "secret" not in str(raised.value)
     assert "password" not in str(raised.value)
 
 
-def test_a_url_that_nothing_knows_is_refused():
+class Refused(Exception):  # noqa: N818  # as libraries of stores have them
+    """What a store answers in place of a file."""
+
+
+def test_a_url_that_fsspec_does_not_know_is_refused(store, monkeypatch):
+    def refuse(url, **_):
+        raise ValueError(f"Protocol not known: {url}")
+
+    monkeypatch.setattr(sys.modules["fsspec.core"], "url_to_fs", refuse)
     with pytest.raises(InputError, match="nowhere://scene"):
         csplat.open("nowhere://scene.csplat")
+    assert 0 == store.asked
 
 
 def test_without_the_extra_a_url_says_what_is_missing(monkeypatch):
@@ -262,59 +303,22 @@ def test_without_the_extra_a_url_says_what_is_missing(monkeypatch):
         csplat.open("https://example.org/scene.csplat")
 
 
-def test_other_file_systems_of_fsspec_serve_too(data, box, tmp_path):
-    import fsspec
-
-    (tmp_path / "scene.csplat").write_bytes(data)
-    fsspec.filesystem("memory").pipe("/scene.csplat", data)
-    for url in ("memory://scene.csplat", f"file://{tmp_path}/scene.csplat"):
-        with csplat.open(url) as file:
-            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
-
-
-# S3
-
-
-def test_s3_gives_the_parts_that_are_wanted(data, box):
-    with s3({"scene.csplat": data}) as storage:
-        with csplat.open("s3://scenes/scene.csplat", storage=storage) as file:
-            assert 65536 == file.bytes_read
-            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
-            stream = io.BytesIO()
-            part = file.extract(box, stream)
-            file._store._fs.pipe("scenes/scene.csplat", bytes(reversed(data)))
-            with pytest.raises(StoreError, match="has changed while it was read"):
-                file.read(tiles=[5])
-            file._store._fs.rm("scenes/scene.csplat")
-            with pytest.raises(FileNotFoundError, match=r"s3://scenes/scene\.csplat"):
-                file.read(tiles=[5])
-        assert part.splat_count == len(decode(stream.getvalue()))
-        with pytest.raises(FileNotFoundError, match="s3://scenes/absent"):
-            csplat.open("s3://scenes/absent", storage=storage)
-
-
 # the command
 
 
-def test_extract_takes_a_url_and_says_what_it_read(web, data, box, tmp_path):
-    out = tmp_path / "part.csplat"
-    words = ["extract", web.url, str(out), f"--box={','.join(map(repr, box))}"]
+def test_extract_takes_a_url_and_leaves_no_half_of_a_file(store, data, box, tmp_path):
+    out, local = tmp_path / "part.csplat", tmp_path / "local.csplat"
+    words = ["extract", "store://scenes/scene.csplat", str(out), f"--box={','.join(map(repr, box))}"]
     done = CliRunner().invoke(app, words)
     assert 0 == done.exit_code, done.stderr
-    assert "; read " in done.stderr
-    local = tmp_path / "local.csplat"
     csplat.extract(data, box, local)
     assert local.read_bytes() == out.read_bytes()
     assert () == validate(out.read_bytes()).violations
-    web.cut_after = 0
+    store.cut_after = store.asked + 2
     refused = CliRunner().invoke(app, [*words, "--force"])
-    assert 1 == refused.exit_code
-    assert 1 == len(refused.stderr.splitlines())
-    assert web.url in refused.stderr
+    assert (1, 1) == (refused.exit_code, len(refused.stderr.splitlines()))
+    assert "store://scenes/scene.csplat" in refused.stderr
     assert local.read_bytes() == out.read_bytes()  # the one that was there
-    web.cut_after = 1 + len(web.gets)
-    refused = CliRunner().invoke(app, ["extract", web.url, "-", *words[3:]])
-    assert (1, b"") == (refused.exit_code, refused.stdout_bytes)
 
 
 def test_extract_reads_standard_input_and_writes_standard_output(data, box):

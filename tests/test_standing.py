@@ -52,6 +52,7 @@ def test_what_a_scene_says_is_not_doubted(said):
     assert standing(model) is model
 
 
+@pytest.mark.slow
 def test_pictures_to_look_at_stand_upright_and_the_judges_stay():
     model = photographed_from((0, 1, 0))
     views = find_view_set(model, count=0)

@@ -2,15 +2,17 @@
 
 import io
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import csplat
-from csplat import formats, inputs
+from csplat import formats
 from csplat.decoder import Limits, decode, open_tiles, read_header
 from csplat.errors import CsplatError, LimitError
+from csplat.inputs import LetGo
 from csplat.ply import write_ply
 from csplat_conformance.manifest import load
 from csplat_tools.cli.app import app
@@ -87,7 +89,7 @@ def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(ve
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
 def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, monkeypatch):
-    monkeypatch.setattr(inputs, "_STEP_BYTES", 1)
+    monkeypatch.setattr("csplat.decoder.tilewise.LetGo", partial(LetGo, step_bytes=1))
     expected = decode(many_tiles)
     opened = open_tiles(many_tiles, threads=threads)
     for _ in range(2):

@@ -12,9 +12,6 @@ from typing import Protocol
 __all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped"]
 
 
-_STEP_BYTES = 1 << 25  # of a file are read from one time that it is let go of to the next
-
-
 class BinaryFile(Protocol):
     """What `open(path, "rb")`, `io.BytesIO` and `gzip.open` give: it is read from where it stands to its end."""
 
@@ -51,18 +48,19 @@ class LetGo:
 
     Args:
         view: the file.
+        step_bytes: how much is read from one time that it is let go of to the next.
     """
 
-    def __init__(self, view: memoryview) -> None:
+    def __init__(self, view: memoryview, step_bytes: int = 1 << 25) -> None:
         known = hasattr(mmap, "madvise") and hasattr(mmaps, "MADV_DONTNEED")
         file = view.obj if known and isinstance(view.obj, mmap) else None
         # What somebody may have written there is nowhere else.
         self._file = file if file is not None and memoryview(file).readonly else None
-        self._read_bytes = 0
+        self._read_bytes, self._step_bytes = 0, step_bytes
 
     def after(self, size_bytes: int) -> None:
         """Note that so much has been read, and let go of everything now and then."""
         self._read_bytes += size_bytes
-        if sys.platform != "win32" and self._file is not None and self._read_bytes >= _STEP_BYTES:
+        if sys.platform != "win32" and self._file is not None and self._read_bytes >= self._step_bytes:
             self._read_bytes = 0
             self._file.madvise(mmaps.MADV_DONTNEED)

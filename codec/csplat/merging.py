@@ -32,7 +32,6 @@ from csplat.scene import Scene
 
 __all__ = ["Merged", "merge"]
 
-_BOOKS_MAX = (1 << 16) - 1  # codebook_count is a u16
 #: What must not differ, for it says how all splats of a file are to be shown: words for it, and the field.
 _FACTS = (
     ("axes", "coordinate_system"),
@@ -67,6 +66,7 @@ def merge(
     *,
     options: EncodeOptions | None = None,
     storage: Mapping[str, Any] | None = None,
+    codebooks_max: int = (1 << 16) - 1,
 ) -> Merged:
     """Join files: the splats of the first, then those of the second, and so on.
 
@@ -84,6 +84,7 @@ def merge(
         output: a path, which the file takes when it is complete, replacing an older one; or an open binary file.
         options: of the encoder, where scenes are coded again; by default the preset "balanced" and extra columns.
         storage: as of `csplat.open`, of all files.
+        codebooks_max: with more than these together, scenes are coded again; a file can have no more than the default.
 
     Examples:
         >>> import csplat
@@ -110,8 +111,8 @@ def merge(
         books = Books(spool)
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
-            if len(books.tables) > _BOOKS_MAX:
-                why = f"they have {len(books.tables):,} codebooks together, and a file at most {_BOOKS_MAX:,}"
+            if len(books.tables) > codebooks_max:
+                why = f"they have {len(books.tables):,} codebooks together, and a file at most {codebooks_max:,}"
         if why:
             return _coded_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
         tiles = [

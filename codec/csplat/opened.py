@@ -38,9 +38,6 @@ from csplat.stores import Store, Window
 
 __all__ = ["SplatFile", "extract", "open"]
 
-_FIRST = 1 << 16  # the index of a scene of some twenty million splats
-_BATCH = 1 << 23  # bytes of tiles that are fetched together where tiles come one after the other
-
 
 class SplatFile:
     """A `.csplat` file of which parts are read. `csplat.open` makes it; it is a context manager.
@@ -202,7 +199,7 @@ class SplatFile:
 
     def _iterate(self, window: Window, job: Job, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
         side = _side(job)
-        for batch in _batches(job.tiles, job.degree):
+        for batch in _batches(job.tiles, job.degree, self._store.sizes.batch):
             if not self._open:
                 raise InputError(f"{self.name} is closed")
             window.forget()
@@ -287,7 +284,7 @@ def extract(
 
 def _read_head(store: Store, window: Window) -> bytes:
     """Read what stands in front of the chunks, and as much behind it as came along."""
-    first = min(store.size, _FIRST)
+    first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
     head = read_file_header(window.view)
     check_length(window.view, head.file_size)
@@ -307,13 +304,13 @@ def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
     return [(layer.offset, layer.size) for tile in tiles for layer in wanted_layers(tile, degree)]
 
 
-def _batches(tiles: Sequence[Tile], degree: int) -> Iterator[list[Tile]]:
+def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[list[Tile]]:
     """Tiles that are fetched together; a first batch in any case."""
     batch: list[Tile] = []
     size = 0
     for tile in tiles:
         added = sum(layer.size for layer in wanted_layers(tile, degree))
-        if batch and size + added > _BATCH:
+        if batch and size + added > size_bytes:
             yield batch
             batch, size = [], 0
         batch.append(tile)

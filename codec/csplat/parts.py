@@ -20,8 +20,7 @@ __all__ = ["InTurn", "Part", "TileCopies", "chunk_payload", "scene_fields", "wri
 #: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
 _TILE_FLAGS = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
-_BATCH = 1 << 23  # bytes of one file that are fetched together, and of all files
-_ALL = 1 << 26
+_ALL = 1 << 26  # bytes of all files that are fetched together
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class InTurn:
     def __init__(self, window: Window, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
         self._window = window
         self._records = records
-        self._batch = min(_BATCH, _ALL // files)
+        self._batch = min(window.store.sizes.batch, _ALL // files)
         self._here = range(0)
 
     def take(self, place: int, beside: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,26 @@ from csplat.errors import CsplatError, FormatError, LimitError, StoreError
 from csplat.inputs import File
 from csplat.system import Pages, read_at
 
-__all__ = ["Disk", "Memory", "Store", "Window"]
+__all__ = ["Disk", "Memory", "RequestSizes", "Store", "Window"]
 
-#: Bytes between two parts that are read along: they take less time than a request of their own.
-_GAP = 1 << 16
-#: Bytes of one request at most, and how many are under way together.
-_REQUEST, _AT_ONCE = 1 << 23, 8
+
+@dataclass(frozen=True)
+class RequestSizes:
+    """How a file is asked for.
+
+    Attributes:
+        first: bytes of the first request: the index of a scene of some twenty million splats.
+        batch: bytes of tiles that are fetched together where tiles come one after the other.
+        gap: bytes between two parts that are read along: they take less time than a request of their own.
+        request: bytes of one request at most.
+        at_once: requests that are under way together.
+    """
+
+    first: int = 1 << 16
+    batch: int = 1 << 23
+    gap: int = 1 << 16
+    request: int = 1 << 23
+    at_once: int = 8
 
 
 class Store:
@@ -30,7 +45,10 @@ class Store:
         size: its bytes.
         requests: how often the store was asked, for its size too.
         bytes_read: bytes that it gave.
+        sizes: how it is asked; may be replaced before the first request.
     """
+
+    sizes = RequestSizes()
 
     def __init__(self, name: str, size: int, requests: int = 0) -> None:
         self.name = name
@@ -152,12 +170,13 @@ class Window:
         Raises:
             StoreError, OSError: as of `Store.read`.
         """
+        sizes = self.store.sizes
         wanted = _missing(((at, at + size) for at, size in parts), self._here)
         waiting: list[tuple[int, int]] = []
-        for start, stop in _missing(_joined(wanted, _GAP), self._here):
-            for at in range(start, stop, _REQUEST):
-                waiting.append((at, min(at + _REQUEST, stop)))
-                if len(waiting) == _AT_ONCE:
+        for start, stop in _missing(_joined(wanted, sizes.gap), self._here):
+            for at in range(start, stop, sizes.request):
+                waiting.append((at, min(at + sizes.request, stop)))
+                if len(waiting) == sizes.at_once:
                     self._take(waiting)
                     waiting = []
         self._take(waiting)

@@ -28,8 +28,6 @@ F64 = NDArray[np.float64]
 #: Is shown each view: its number, what is wanted and what is seen, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 
-_KEPT_BYTES = 1 << 30  # of a source's pictures; where they are more, they are rendered anew for each scene
-
 
 class Drawable(Protocol):
     """A scene that draws itself, because it is not in memory."""
@@ -103,6 +101,7 @@ class Judge:
         *,
         mode: Mode = "standard",
         threads: int | None = None,
+        kept_bytes: int = 1 << 30,
         progress: Callable[[str, float], None] | None = None,
     ) -> Judge:
         """Judge by what the source looks like.
@@ -111,11 +110,12 @@ class Judge:
             source: the scene that others are compared with.
             cameras: where to stand, relative to the source's origin.
             background, mode, threads: see above.
+            kept_bytes: of the source's renders; if they are more, they are made anew for each scene.
             progress: is told how much of it is drawn.
         """
         draw = renderer(source, background, mode=mode, threads=threads)
         looks: list[Look | Callable[[], Look]] = [partial(_rendered, draw, camera) for camera in cameras]
-        if sum(12 * camera.W * camera.H for camera in cameras) <= _KEPT_BYTES:
+        if sum(12 * camera.W * camera.H for camera in cameras) <= kept_bytes:
             looks = []
             for camera in cameras:
                 if progress is not None:

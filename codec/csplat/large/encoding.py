@@ -107,6 +107,7 @@ def encode_scene(
     options: EncodeOptions | None = None,
     *,
     memory_bytes: int | None = None,
+    by_disk: bool = False,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
     cluster: str | None = None,
@@ -125,6 +126,7 @@ def encode_scene(
         options: presets and knobs.
         memory_bytes: a bound on what all processes take together; `None`: half of what is free. The file does not
             depend on it.
+        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
         folder: the working folder; `None`: beside the target, its name and `.work`.
         resume: go on with what an interrupted encoding left in the folder, if it left anything.
         cluster: address of a Dask scheduler, whose workers see the folder under the same name; they code the buckets.
@@ -143,7 +145,7 @@ def encode_scene(
     options = options or EncodeOptions()
     path = Path(target)
     work_folder = path.with_name(path.name + ".work") if folder is None else Path(folder)
-    by_disk = cluster is not None or (resume and work_folder.exists())
+    by_disk = by_disk or cluster is not None or (resume and work_folder.exists())
     needs = needs_of(scene, options, memory_bytes, by_disk=by_disk)
     if needs.in_memory:
         result = encode_with_report(scene.model(), options, progress=progress)

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from csplat_conformance.stated.by_disk import fits_memory, prove_by_disk
+from csplat_conformance.stated.by_disk import PartSizes, fits_memory, prove_by_disk
 from csplat_conformance.stated.matching import lattice_radii, match
 from csplat_conformance.stated.pairs import check_source_index, measure_pairs, wrong_extras
 from csplat_conformance.stated.proof import prove
@@ -18,6 +18,7 @@ from csplat_conformance.stated.verdict import MeasureProof, Proof, Worst
 
 __all__ = [
     "MeasureProof",
+    "PartSizes",
     "Proof",
     "Source",
     "Worst",

@@ -33,7 +33,7 @@ from csplat_conformance.stated.source import Source
 from csplat_conformance.stated.spool import Rows, Spool, opened_spool
 from csplat_conformance.stated.verdict import Proof, Worst
 
-__all__ = ["fits_memory", "prove_by_disk"]
+__all__ = ["PartSizes", "fits_memory", "prove_by_disk"]
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -43,9 +43,22 @@ _SPLAT_BYTES = 80  # of the source, beside its arrays: keys, order, centres in d
 _PART_FOLDS = 5  # of a part's arrays: records, source, tiles and their selection
 _BASE_BYTES = 200_000_000  # program, tiles that are being decoded, splats that wait for being written
 _WORKER_BYTES = 50_000_000  # of a process beside its part
-_SHARE = 1 << 18  # splats of a part, so that a process is worth it: at the rims of parts work is done twice
-_PART = (1 << 14, 1 << 20)  # splats that are compared at a time: more are hardly faster, for caches are small
 _INDEX_BLOCK = 1 << 20  # numbers of a source index
+
+
+@dataclass(frozen=True)
+class PartSizes:
+    """How many splats are compared at a time.
+
+    Attributes:
+        least: however little memory there is.
+        most: however much there is: more are hardly faster, for caches are small.
+        worth_a_process: with fewer, one more process does not pay: at the rims of parts work is done twice.
+    """
+
+    least: int = 1 << 14
+    most: int = 1 << 20
+    worth_a_process: int = 1 << 18
 
 
 def fits_memory(opened: Opened, source_count: int, source_bytes: int, memory_bytes: int | None) -> bool:
@@ -74,6 +87,7 @@ def prove_by_disk(
     source_index: NDArray[Any] | None = None,
     *,
     memory_bytes: int | None = None,
+    sizes: PartSizes | None = None,
     progress: Progress | None = None,
 ) -> Proof:
     """Compare a file's stated errors with its source, as `prove` does, and find the same.
@@ -86,13 +100,14 @@ def prove_by_disk(
         opened: the file.
         source_index: as of `prove`; it may be mapped.
         memory_bytes: bound, about; `None`: half of what is free. A few bytes of each splat come to it.
+        sizes: of the parts; the proof does not depend on them.
         progress: is told how far comparing has come.
 
     Raises:
         InputError: as of `prove`; the source is not whole; or the disk has no room.
         OSError: the disk cannot be written or read.
     """
-    with closing(_ByDisk(scene, opened, memory_bytes, progress)) as way:
+    with closing(_ByDisk(scene, opened, memory_bytes, sizes or PartSizes(), progress)) as way:
         return prove_by(way, opened.header, opened.stated_errors, source_index)
 
 
@@ -103,6 +118,7 @@ class _ByDisk:
     scene: Scene
     opened: Opened
     memory_bytes: int | None
+    sizes: PartSizes
     progress: Progress | None
     _spool: Spool | None = field(default=None, init=False)
     _reach: float = field(default=0.0, init=False)
@@ -135,7 +151,7 @@ class _ByDisk:
     @property
     def _most(self) -> int:
         """Splats of a part."""
-        return max(_PART[0], min(_PART[1], self._memory // self._row_bytes))
+        return max(self.sizes.least, min(self.sizes.most, self._memory // self._row_bytes))
 
     @property
     def _row_bytes(self) -> int:
@@ -146,8 +162,8 @@ class _ByDisk:
         """Processes, and splats of the part that each has: as many as have parts that are large enough."""
         for workers in range(os.cpu_count() or 1, 1, -1):
             most = (self._memory // workers - _WORKER_BYTES) // self._row_bytes
-            if CAN_COPY and most >= _SHARE:
-                return workers, min(most, _PART[1])
+            if CAN_COPY and most >= self.sizes.worth_a_process:
+                return workers, min(most, self.sizes.most)
         return 1, self._most
 
     def _tell(self, stage: str, done: float) -> None:

@@ -25,7 +25,6 @@ F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # integers that name splats
 
 _NORMALS = frozenset(("nx", "ny", "nz"))
-_INDEX_BLOCK = 1 << 20  # numbers
 _BLOCK = 4096  # splats: 45 float64 SH coefficients of each are 1.5 MB
 
 
@@ -149,7 +148,9 @@ def differences(
     return result
 
 
-def check_source_index(index: Rows, source_count: int, decoded_count: int, *, once: bool = True) -> None:
+def check_source_index(
+    index: Rows, source_count: int, decoded_count: int, *, once: bool = True, block: int = 1 << 20
+) -> None:
     """See to it that a source index may be one (SRC-4).
 
     Args:
@@ -157,6 +158,7 @@ def check_source_index(index: Rows, source_count: int, decoded_count: int, *, on
         source_count: splats of the source.
         decoded_count: splats of the file.
         once: no number occurs twice.
+        block: numbers that are checked at a time.
 
     Raises:
         InputError: it is not one number of a splat of the source for each splat of the file, or one occurs twice.
@@ -165,8 +167,8 @@ def check_source_index(index: Rows, source_count: int, decoded_count: int, *, on
         found = f"{index.dtype} of shape {list(index.shape)}"
         raise InputError(f"the source index is {found}, wanted integers of shape [{decoded_count}]")
     seen = np.zeros(source_count if once else 0, bool)
-    for start in range(0, decoded_count, _INDEX_BLOCK):  # it may be larger than memory
-        part = index[start : start + _INDEX_BLOCK]
+    for start in range(0, decoded_count, block):  # it may be larger than memory
+        part = index[start : start + block]
         outside = (part < 0) | (part >= source_count)
         if outside.any():
             first = int(outside.argmax())

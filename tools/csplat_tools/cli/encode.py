@@ -26,7 +26,7 @@ from csplat_tools.files.console import Progress, format_about, format_bytes, for
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import check_name, source_path
-from csplat_tools.inspect.glance import SIZE, glance
+from csplat_tools.inspect.glance import SIZE, SPLATS_MAX, glance
 
 if TYPE_CHECKING:
     from csplat_tools.optimise.target import Target
@@ -37,7 +37,6 @@ _TARGET = "Targets (one of the first four, which want the render extra)"
 _ROOM = "Large scenes"
 _RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
 _WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # what wants the scene in memory
-_SPLATS_LOOKED_AT = 1_000_000  # more take longer to render than anybody wants to wait for a remark
 
 
 @dataclass(frozen=True)
@@ -260,7 +259,7 @@ def encode(
             progress("eight small renders", 0.0)
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
-    if not out.quiet and encoded.made is not None and len(encoded.source) <= _SPLATS_LOOKED_AT:
+    if not out.quiet and encoded.made is not None and len(encoded.source) <= SPLATS_MAX:
         facts.seeming(seeming_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
@@ -335,8 +334,6 @@ def _psnr(encoded: Encoded, threads: int | None) -> float | None:
     """About how like its source a scene looks that is not too large; `None` where that is known, or not soon."""
     made = encoded.made
     if made is None or made.said.get("psnr") is not None or find_spec("numba") is None:
-        return None
-    if not 0 < len(encoded.source) <= _SPLATS_LOOKED_AT:
         return None
     return glance(encoded.source, made.result.data, threads=threads)
 

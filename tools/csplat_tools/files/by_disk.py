@@ -38,16 +38,18 @@ class Scale:
         folder: the working folder; `None`: beside the file.
         resume: go on with what the folder has.
         cluster: address of a Dask scheduler.
+        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
     """
 
     memory_bytes: int | None = None
     folder: str | None = None
     resume: bool = False
     cluster: str | None = None
+    by_disk: bool = False
 
     def may_leave_memory(self, path: Path) -> bool:
         """Whether it has to be found out if a scene fits the memory."""
-        if self.cluster is not None or self.resume:
+        if self.cluster is not None or self.resume or self.by_disk:
             return True
         bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
         size = size_of(path)
@@ -91,7 +93,7 @@ def encode_by_disk(
     if progress is not None:
         progress("opening", 0.0)
     with open_scene(local) as opened:
-        in_memory = needs_of(opened, options, scale.memory_bytes).in_memory
+        in_memory = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
             return None
         if target == STANDARD_STREAM:
@@ -100,8 +102,8 @@ def encode_by_disk(
         scene = (facts or SceneOverrides()).applied_to_all(opened)
         try:
             report = encode_scene(
-                scene, target, options, memory_bytes=scale.memory_bytes, folder=scale.folder, resume=scale.resume,
-                cluster=scale.cluster, progress=progress,
+                scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.by_disk, folder=scale.folder,
+                resume=scale.resume, cluster=scale.cluster, progress=progress,
                 source={"name": local.name, "size": size_of(local), "changed": local.stat().st_mtime_ns},
             )  # fmt: skip
         except (KeyboardInterrupt, OSError):
@@ -151,7 +153,8 @@ def expected(local: Path, options: EncodeOptions, scale: Scale) -> Expected:
         OSError: it cannot be read.
     """
     with open_scene(local) as opened:
-        needs, count = needs_of(opened, options, scale.memory_bytes), opened.count
+        needs = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
+        count = opened.count
         degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
     passes = 1 if needs.in_memory else 4

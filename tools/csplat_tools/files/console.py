@@ -23,6 +23,7 @@ __all__ = [
     "WORTH_SAYING",
     "Display",
     "Progress",
+    "displayed",
     "finite",
     "format_about",
     "format_bytes",
@@ -250,6 +251,17 @@ _displays: list[Display] = []  # the one that is shown: there is one standard er
 
 
 @contextmanager
+def displayed(display: Display) -> Iterator[Display]:
+    """Show progress on this display until the end; `say` and `note` take its bars away first."""
+    _displays.append(display)
+    try:
+        yield display
+    finally:
+        _displays.remove(display)
+        display.close()
+
+
+@contextmanager
 def _displayed(*, quiet: bool) -> Iterator[Display | None]:
     if quiet:
         yield None
@@ -257,22 +269,21 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
     if _displays:
         yield _displays[0]
         return
-    display, ended = Display(terminal=sys.stderr.isatty()), threading.Event()
+    ended = threading.Event()
 
-    def look() -> None:
-        while not ended.wait(_LOOK):
-            display.tick()
+    with displayed(Display(terminal=sys.stderr.isatty())) as display:
 
-    thread = threading.Thread(target=look, name="csplat progress", daemon=True)
-    thread.start()
-    try:
-        _displays.append(display)
-        yield display
-    finally:
-        _displays.clear()
-        ended.set()
-        thread.join()
-        display.close()
+        def look() -> None:
+            while not ended.wait(_LOOK):
+                display.tick()
+
+        thread = threading.Thread(target=look, name="csplat progress", daemon=True)
+        thread.start()
+        try:
+            yield display
+        finally:
+            ended.set()
+            thread.join()
 
 
 def _words(stage: _Stage, now: float) -> str:

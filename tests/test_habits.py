@@ -1,0 +1,152 @@
+"""Habits of the tests: no test replaces what is private to the product, and whatever is skipped says why."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parent
+
+#: Files that still replace something private, and what: the list only ever gets shorter.
+ALLOWED = {
+    "conftest.py": {"csplat_tools.views.finding._DECIDING", "csplat_tools.views.finding._JUDGING"},
+    "test_distortion_benchmark.py": {"scenes._SAMPLE", "distortion._GRID"},
+    "test_encoder_judging.py": {"figures._FILE"},
+    "test_fuzz.py": {"targets._MEMORY"},
+    "test_lpips.py": {"module._from_torch", "module._heads_path"},
+    "test_mutation.py": {"python._PROCESSOR_SECONDS"},
+    "test_sliced.py": {"sliced._LEAST_BYTES", "sliced._Picture._draw", "scenes._SAMPLE", "sliced._Picture._read"},
+}
+
+#: Calls that skip, or expect a failure; all but the first take the reason as an argument of its place.
+CALLS = ("pytest.importorskip", "pytest.skip", "pytest.xfail")
+
+
+@pytest.fixture(scope="module")
+def trees():
+    """The nodes that matter of each Python file of the tests, by its name."""
+    return {path.name: nodes_of(path.read_text("utf-8")) for path in sorted(TESTS.rglob("*.py"))}
+
+
+def nodes_of(text):
+    """Return calls, decorators, imports and assignments of a file."""
+    kinds = (ast.Call, ast.FunctionDef, ast.Import, ast.ImportFrom, ast.Assign, ast.AugAssign, ast.AnnAssign)
+    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+
+
+def name_of(node):
+    """Return the dotted name of an expression, as `os.path`; an empty string for anything else."""
+    if isinstance(node, ast.Attribute):
+        base = name_of(node.value)
+        return f"{base}.{node.attr}" if base else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def imported(nodes):
+    """Return the names that a file binds to modules, classes and functions of others."""
+    found = set()
+    for node in nodes:
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            found |= {(one.asname or one.name).partition(".")[0] for one in node.names}
+        elif isinstance(node, ast.Assign) and is_module(node.value):
+            found |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+    return found
+
+
+def is_module(node):
+    """Return whether an expression looks a module up: `sys.modules[...]` or `import_module(...)`."""
+    if isinstance(node, ast.Subscript):
+        return name_of(node.value).endswith("sys.modules")
+    return isinstance(node, ast.Call) and name_of(node.func).rpartition(".")[2] in ("import_module", "__import__")
+
+
+def is_private(name):
+    return name.startswith("_") and not name.endswith("__")
+
+
+def replaced(nodes):
+    """Yield the line and the name of each private attribute of a module or class that a file replaces."""
+    known = imported(nodes)
+
+    def is_foreign(node):
+        return is_module(node) or name_of(node).partition(".")[0] in known
+
+    for node in nodes:
+        if isinstance(node, ast.Call):
+            function = name_of(node.func).rpartition(".")
+            text = node.args[0].value if node.args and isinstance(node.args[0], ast.Constant) else None
+            if function[2] in ("setattr", "delattr", "patch") and isinstance(text, str):
+                if is_private(text.rpartition(".")[2]):
+                    yield node.lineno, text
+            elif function[2] in ("setattr", "delattr", "object") and len(node.args) > 1 and is_foreign(node.args[0]):
+                name = node.args[1].value if isinstance(node.args[1], ast.Constant) else ""
+                if is_private(str(name)):
+                    yield node.lineno, f"{ast.unparse(node.args[0])}.{name}"
+        elif isinstance(node, (ast.Assign, ast.AugAssign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            for target in targets:
+                if isinstance(target, ast.Attribute) and is_private(target.attr) and is_foreign(target.value):
+                    yield node.lineno, ast.unparse(target)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("import a\nmonkeypatch.setattr(a, '_SIZE', 1)", ["a._SIZE"]),
+        ("from a import b as c\npatch.setattr(c.Thing, '_draw', f)", ["c.Thing._draw"]),
+        ("monkeypatch.setattr('a.b._SIZE', 1)", ["a.b._SIZE"]),
+        ("monkeypatch.setattr(\n    sys.modules[name],\n    '_SIZE', 1)", ["sys.modules[name]._SIZE"]),
+        ("module = importlib.import_module(name)\nmodule._SIZE = 1", ["module._SIZE"]),
+        ("mock.patch('a._f')\nimport a\nmock.patch.object(a, '_f')", ["a._f", "a._f"]),
+        ("import a\nmonkeypatch.setattr(a, 'SIZE', 1)\nmonkeypatch.setattr('a.f', g)", []),
+        ("import sys\nmonkeypatch.setattr(sys, '__stdin__', f)", []),
+        ("double = Double()\ndouble._state = 1\nmonkeypatch.setattr(double, '_state', 2)", []),
+    ],
+)
+def test_what_is_private_is_found_in_all_ways_of_replacing_it(text, names):
+    assert names == [name for _, name in replaced(nodes_of(text))]
+
+
+@pytest.mark.slow
+def test_no_test_replaces_what_is_private_to_a_module(trees):
+    found = [
+        f"{file}:{line}: {name}"
+        for file, nodes in trees.items()
+        for line, name in replaced(nodes)
+        if name not in ALLOWED.get(file, ())
+    ]
+    assert not found, "\n".join(["make it a parameter, a field or a fixture:", *found])
+
+
+def unexplained(nodes):
+    """Yield the line and the name of each skip and expected failure without a reason."""
+    marks = [f"pytest.mark.{name}" for name in ("skip", "skipif", "xfail")]
+    for node in nodes:
+        if isinstance(node, ast.FunctionDef):
+            yield from ((node.lineno, name_of(one)) for one in node.decorator_list if name_of(one) in marks)
+        elif isinstance(node, ast.Call) and name_of(node.func) in (*marks, *CALLS):
+            reasons = [one.value for one in node.keywords if one.arg == "reason"]
+            if name_of(node.func) in CALLS[1:]:
+                reasons += node.args
+            if not any(not isinstance(one, ast.Constant) or one.value for one in reasons):
+                yield node.lineno, name_of(node.func)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("@pytest.mark.skip\ndef f(): pass", 1),
+        ("@pytest.mark.skipif(True, reason='no such thing here')\ndef f(): pass", 0),
+        ("@pytest.mark.xfail(reason='')\ndef f(): pass", 1),
+        ("pytest.importorskip('numba')\npytest.skip()", 2),
+        ("pytest.importorskip('numba', reason='it renders')\npytest.skip(f'{name} is absent')", 0),
+    ],
+)
+def test_skips_without_a_reason_are_found(text, count):
+    assert count == len(list(unexplained(nodes_of(text))))
+
+
+@pytest.mark.slow
+def test_every_skip_and_expected_failure_carries_its_reason(trees):
+    found = [f"{file}:{line}: {name}" for file, nodes in trees.items() for line, name in unexplained(nodes)]
+    assert not found, "\n".join(found)

@@ -1,0 +1,154 @@
+"""Files at URLs, from a web server and an S3 on this machine: what fsspec and its file systems make of requests."""
+
+import io
+
+import pytest
+from stores import Web, assert_same, box_of, s3
+from typer.testing import CliRunner
+
+import csplat
+from csplat import EncodeOptions, FormatError, InputError, StoreError, decode, encode
+from csplat_conformance.validator import validate
+from csplat_tools.cli.app import app
+
+pytestmark = pytest.mark.area(name="remote")
+pytest.importorskip("fsspec", reason="URLs want the extra [remote]")
+pytest.importorskip("aiohttp", reason="URLs want the extra [remote]")
+
+
+@pytest.fixture(scope="module")
+def data(sample_path):
+    return encode(csplat.read_ply(sample_path), EncodeOptions(preset="fast", tile_splats=1000))
+
+
+@pytest.fixture(scope="module")
+def box(data):
+    return box_of(data, 2)  # others touch it
+
+
+@pytest.fixture
+def web(data):
+    server = Web({"/scene.csplat": data})
+    with server.serve() as address:
+        server.url = f"{address}/scene.csplat"
+        yield server
+
+
+# the web
+
+
+def test_the_web_gives_the_parts_that_are_wanted(web, data, box):
+    with csplat.open(web.url) as file:
+        assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
+        chosen = [tile.tile.index for tile in file.tiles(box)]
+        assert_same(decode(data, tiles=chosen), file.read(box))
+        assert (len(web.asked), web.sent) == (file.requests, file.bytes_read)
+        assert_same(decode(data), file.read())
+
+
+def test_a_server_without_parts_is_refused(web):
+    web.ranges = False
+    with csplat.open(web.url) as file, pytest.raises(StoreError, match=r"/scene\.csplat: the server sends whole files"):
+        file.read(sh_degree=0)
+
+
+def test_a_lost_connection_is_a_typed_error(web):
+    web.cut_after = 0
+    with pytest.raises(StoreError, match=r"/scene\.csplat: "):
+        csplat.open(web.url)
+    web.cut_after = 1 + len(web.gets)
+    with csplat.open(web.url) as file:
+        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
+            file.read(sh_degree=0)
+        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
+            list(file.tiles())
+
+
+@pytest.mark.parametrize("size", [None, 70_000])
+def test_a_file_that_changes_between_requests_is_told(web, data, size):
+    with csplat.open(web.url) as file:
+        web.files["/scene.csplat"] = bytes(reversed(data))[:size]
+        with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
+            file.read(tiles=[5])
+
+
+def test_a_file_of_the_web_that_is_damaged_is_named(web, data):
+    web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
+    with csplat.open(web.url) as file, pytest.raises(FormatError, match="E_CRC") as raised:
+        file.read()
+    assert web.url == raised.value.path
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "says"),
+    [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
+)
+def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, says):
+    web.files["/other.csplat?key=secret"] = answer
+    address = web.url.replace("://", "://somebody:password@").replace("scene", "other")
+    with pytest.raises(error, match=says) as raised:
+        csplat.open(address + "?key=secret")
+    assert "other.csplat" in str(raised.value)
+    assert "secret" not in str(raised.value)
+    assert "password" not in str(raised.value)
+
+
+def test_a_url_that_nothing_knows_is_refused():
+    with pytest.raises(InputError, match="nowhere://scene"):
+        csplat.open("nowhere://scene.csplat")
+
+
+def test_other_file_systems_of_fsspec_serve_too(data, box, tmp_path):
+    import fsspec
+
+    (tmp_path / "scene.csplat").write_bytes(data)
+    fsspec.filesystem("memory").pipe("/scene.csplat", data)
+    for url in ("memory://scene.csplat", f"file://{tmp_path}/scene.csplat"):
+        with csplat.open(url) as file:
+            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
+
+
+# S3
+
+
+def test_s3_gives_the_parts_that_are_wanted(data, box):
+    pytest.importorskip("moto", reason="an S3 wants the extra [remote-tests]")
+    with s3({"scene.csplat": data}) as storage:
+        with csplat.open("s3://scenes/scene.csplat", storage=storage) as file:
+            assert 65536 == file.bytes_read
+            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
+            stream = io.BytesIO()
+            part = file.extract(box, stream)
+            file._store._fs.pipe("scenes/scene.csplat", bytes(reversed(data)))
+            with pytest.raises(StoreError, match="has changed while it was read"):
+                file.read(tiles=[5])
+            file._store._fs.rm("scenes/scene.csplat")
+            with pytest.raises(FileNotFoundError, match=r"s3://scenes/scene\.csplat"):
+                file.read(tiles=[5])
+        assert part.splat_count == len(decode(stream.getvalue()))
+        with pytest.raises(FileNotFoundError, match="s3://scenes/absent"):
+            csplat.open("s3://scenes/absent", storage=storage)
+
+
+# the command
+
+
+def test_extract_takes_a_url_and_says_what_it_read(web, data, box, tmp_path):
+    out = tmp_path / "part.csplat"
+    words = ["extract", web.url, str(out), f"--box={','.join(map(repr, box))}"]
+    done = CliRunner().invoke(app, words)
+    assert 0 == done.exit_code, done.stderr
+    assert "; read " in done.stderr
+    local = tmp_path / "local.csplat"
+    csplat.extract(data, box, local)
+    assert local.read_bytes() == out.read_bytes()
+    assert () == validate(out.read_bytes()).violations
+    web.cut_after = 0
+    refused = CliRunner().invoke(app, [*words, "--force"])
+    assert 1 == refused.exit_code
+    assert 1 == len(refused.stderr.splitlines())
+    assert web.url in refused.stderr
+    assert local.read_bytes() == out.read_bytes()  # the one that was there
+    web.cut_after = 1 + len(web.gets)
+    refused = CliRunner().invoke(app, ["extract", web.url, "-", *words[3:]])
+    assert (1, b"") == (refused.exit_code, refused.stdout_bytes)
