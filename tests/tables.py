@@ -22,7 +22,9 @@ def failures(cases: Mapping[str, T] | Iterable[T], check: Callable[[T], None]) -
     """
     pairs = [*cases.items()] if isinstance(cases, Mapping) else [(case.name, case) for case in cases]
     if not pairs or len(dict(pairs)) < len(pairs):
-        raise ValueError(f"{len(dict(pairs))} names of {len(pairs)} cases, expected one or more, each with its own name")
+        raise ValueError(
+            f"{len(dict(pairs))} names of {len(pairs)} cases, expected one or more, each with its own name"
+        )
     failing = []
     for name, case in pairs:
         try:

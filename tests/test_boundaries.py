@@ -13,6 +13,7 @@ from csplat_conformance.recipes import sound_recipes
 from csplat_conformance.report import Status
 from csplat_conformance.validator import validate
 
+
 @pytest.fixture(scope="module")
 def beyond():
     """Each case and its file, by name."""
