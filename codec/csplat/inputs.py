@@ -11,7 +11,7 @@ from typing import Protocol
 __all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped"]
 
 
-_STEP_BYTES = 1 << 25  # of a file are read from one time that it is let go of to the next
+_STEP_BYTES = 1 << 25  # read between two releases of a mapped file: 32 MB of resident memory at most
 
 
 class BinaryFile(Protocol):
@@ -50,18 +50,20 @@ class LetGo:
 
     Args:
         view: the file.
+        step_bytes: bytes that are read between two releases of the mapping; 32 MB if left out.
     """
 
-    def __init__(self, view: memoryview) -> None:
+    def __init__(self, view: memoryview, step_bytes: int | None = None) -> None:
         known = hasattr(mmap, "madvise") and hasattr(mmaps, "MADV_DONTNEED")
         file = view.obj if known and isinstance(view.obj, mmap) else None
         # What somebody may have written there is nowhere else.
         self._file = file if file is not None and memoryview(file).readonly else None
+        self._step_bytes = _STEP_BYTES if step_bytes is None else step_bytes
         self._read_bytes = 0
 
     def after(self, size_bytes: int) -> None:
         """Note that so much has been read, and let go of everything now and then."""
         self._read_bytes += size_bytes
-        if self._file is not None and self._read_bytes >= _STEP_BYTES:
+        if self._file is not None and self._read_bytes >= self._step_bytes:
             self._read_bytes = 0
             self._file.madvise(mmaps.MADV_DONTNEED)
