@@ -132,6 +132,7 @@ def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_source
     assert (tmp_path / "wasm.mjs").read_bytes() == committed, "make wasm"
 
 
+@pytest.mark.slow
 def test_the_example_tells_what_is_in_a_file(decoder, tmp_path):
     example = compiled(tmp_path, "example", decoder, C / "example.c")
     told = subprocess.run(
@@ -143,6 +144,7 @@ def test_the_example_tells_what_is_in_a_file(decoder, tmp_path):
     assert re.fullmatch(r"E_CRC at byte \d+ \(CHK-1\): .+\n", refused.stderr)
 
 
+@pytest.mark.slow
 def test_the_sample_of_the_guide_decodes(decoder, tmp_path):
     sample = (ROOT / "codec" / "EMBEDDING.md").read_text(encoding="utf-8").split("```c\n")[1].split("```")[0]
     source = tmp_path / "sample.c"

@@ -64,12 +64,17 @@ def test_integers_are_refused_with_the_same_code():
     assert [] == failures(INVALID, check)
 
 
-def test_the_built_in_run_passes_every_vector():
-    report = runner.run_builtin()
+def test_the_built_in_run_passes_every_vector_once_per_level():
+    # Of the vectors named from a to c; a step of the gate, `csplat conformance decoder`, takes all of them.
+    report = runner.run_builtin(Choice(pattern="*/[a-c]*"))
+    valid, invalid = (
+        [one.name for one in vectors if one.name.split("/")[1][0] in "abc"] for vectors in (VALID, INVALID)
+    )
 
-    assert [vector.name for vector in VECTOR_LIST] == [one.name for one in report.outcomes if one.level == "L1"]
-    assert len(VECTOR_LIST) == report.levels()["L1"]["checks"]
-    assert len(VALID) == report.levels()["L2"]["checks"] == report.levels()["L3"]["checks"]
+    assert sorted(valid + invalid) == sorted(one.name for one in report.outcomes if one.level == "L1")
+    assert valid == [one.name for one in report.outcomes if one.level == "L2"]
+    assert valid == [one.name for one in report.outcomes if one.level == "L3"]
+    assert min(len(valid), len(invalid)) > 20
     assert [] == report.failures
 
 

@@ -152,6 +152,7 @@ def test_our_encoder_keeps_the_picture(preset, decibels):
 # Refusals ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_who_refuses_everything_passes_only_where_that_is_allowed():
     refuses = program("import sys; sys.exit('error: not today')")
     report = run_encoder(refuses, EncoderChoice("[nb][ar]*/[ncdo]*"))
@@ -170,6 +171,7 @@ def test_a_traceback_is_a_crash():
     ]
 
 
+@pytest.mark.slow
 def test_broken_inputs_must_not_be_taken(tmp_path):
     sound = tmp_path / "sound.csplat"
     sound.write_bytes(csplat.encode(ENCODABLE["ordinary/one_splat"].source().model((0.0, 0.0, 0.0))))
@@ -268,6 +270,7 @@ def test_the_report_explains_itself():
     assert 0 == doctest.testmod(report_module).failed
 
 
+@pytest.mark.slow
 def test_the_encoder_suite_loads_neither_encoder_nor_renderer():
     code = "import sys, csplat_conformance.encoders; print(*sorted(sys.modules))"
     ended = run_program(f"{shlex.quote(sys.executable)} -c {shlex.quote(code)}", {}, 60.0)

@@ -86,6 +86,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     name, change = MISTAKES[mistake]
@@ -101,6 +102,7 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     assert min(scores) < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "status", "message"),
     [
@@ -145,6 +147,7 @@ def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
     assert "SKIPPED: reference pictures" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ellipsoids")
 def test_a_picture_that_looks_different_is_out_of_date(monkeypatch, capsys):
     assert 0 == recipes.main()

@@ -34,9 +34,9 @@ def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 7)], ids=["small", "rich"])
+@pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 19)], ids=["small", "rich"])
 def test_every_flipped_bit_is_refused(data, stride):
-    # CNF-3; of the larger file every seventh bit, which reaches each place within a byte. Behind magic and version
+    # CNF-3; of the larger file every 19th bit, which reaches each place within a byte. Behind magic and version
     # it is a CRC that refuses (HDR-12).
     named = 8 * _spec.HEADER_OFFSETS["profile"]
     for bit in range(0, 8 * len(data), stride):
@@ -48,6 +48,7 @@ def test_every_flipped_bit_is_refused(data, stride):
         assert 0 <= caught.value.offset <= len(data)
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_of_a_part_is_refused_by_who_reads_that_part_alone():
     # HDR-12
     layer = read_header(SMALL).tiles[0].layers[0]
@@ -60,9 +61,10 @@ def test_every_flipped_bit_of_a_part_is_refused_by_who_reads_that_part_alone():
 
 
 @pytest.mark.slow
-def test_every_flipped_bit_with_all_checksums_repaired_is_refused_or_decoded():
+def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
     records = chunk_records(SMALL)
-    for bit in range(8 * len(SMALL)):
+    # Every third bit, which reaches each place within a byte.
+    for bit in range(0, 8 * len(SMALL), 3):
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
         try:

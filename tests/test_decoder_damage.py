@@ -119,6 +119,7 @@ def error_of(function, data: bytes) -> FormatError | UnsupportedError | LimitErr
     return None
 
 
+@pytest.mark.slow
 def test_mutations_with_all_checksums_repaired():
     rng = random.Random(0)  # noqa: S311 - no secrets here
     for _ in range(int(os.environ.get("CSPLAT_MUTATIONS", "400"))):

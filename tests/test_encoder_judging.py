@@ -26,6 +26,8 @@ from csplat_conformance.process import Ended
 from csplat_conformance.report import Outcome, Report, Status, to_json, to_junit, to_table
 from csplat_conformance.stated import Source
 
+pytestmark = pytest.mark.slow  # together: tests of the encoder suite
+
 INPUTS = {one.name: one for one in all_inputs()}
 PLAIN = "ordinary/degree_1"
 L3 = ("L1", "L2", "L3")

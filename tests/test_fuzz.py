@@ -30,6 +30,8 @@ from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 from csplat_conformance.samples import rich_scene
 
+pytestmark = pytest.mark.slow  # together: tests of the fuzzer
+
 PROGRAM = Path(__file__).parent / "fuzz.py"
 SPEC = importlib.util.spec_from_file_location("fuzz", PROGRAM)
 fuzz = importlib.util.module_from_spec(SPEC)
@@ -220,7 +222,8 @@ def test_a_javascript_process_that_hangs_is_a_finding(tmp_path):
     for path in node.js_folder().glob("*.mjs"):
         shutil.copy(path, tmp_path)
     (tmp_path / "decoder.mjs").write_text(
-        "export class CsplatError extends Error {}\nexport const decode = () => { for (;;); };\n"
+        "export class CsplatError extends Error {}\n"
+        "export const decode = () => Atomics.wait(new Int32Array(new SharedArrayBuffer(4)), 0, 0);\n"
     )
     with node.JsDecoder(tmp_path, timeout=1.5) as hanging:
         assert Status.HUNG == hanging.ask(b"").status

@@ -19,6 +19,8 @@ from csplat_conformance.mutation.tokens import c_mutants
 from csplat_conformance.native import missing_c
 from csplat_conformance.node import missing_javascript
 
+pytestmark = pytest.mark.slow  # together: tests of the mutants
+
 BY_NAME = {vector.name: vector for vector in load()}
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 

@@ -208,6 +208,7 @@ def test_an_empty_source_has_no_partners(make_model):
 # Proofs -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small"])
 def test_what_the_encoder_states_is_proved(make_model, preset):
     source = make_model(3000, 3)

@@ -121,6 +121,7 @@ def test_the_first_damaged_tile_is_told_and_those_before_it_come(many_tiles, thr
         next(models)
 
 
+@pytest.mark.slow
 def test_nothing_of_a_damaged_file_goes_to_standard_output(many_tiles):
     data = bytearray(many_tiles.read_bytes())
     whole = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
