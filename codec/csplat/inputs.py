@@ -48,7 +48,7 @@ class LetGo:
 
     Args:
         view: the file.
-        step_bytes: how much is read from one time that it is let go of to the next.
+        step_bytes: bytes that are read between two releases of the mapping.
     """
 
     def __init__(self, view: memoryview, step_bytes: int = 1 << 25) -> None:

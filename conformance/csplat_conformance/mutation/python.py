@@ -43,10 +43,12 @@ class PythonDecoder:
 
     Args:
         files: fuzzed ones.
+        processor_seconds: that a mutant may take for all vectors and files.
     """
 
-    def __init__(self, files: Sequence[bytes]) -> None:
+    def __init__(self, files: Sequence[bytes], processor_seconds: int = _PROCESSOR_SECONDS) -> None:
         self._files = files
+        self._processor_seconds = processor_seconds
         self._mutants: list[Mutant] = []
         self._folder = Path(decoder.__file__).parent
         self.texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(self._folder.glob("*.py"))}
@@ -94,7 +96,7 @@ class PythonDecoder:
 
     def _in_child(self, mutant: Mutant, writing: int) -> None:
         """Write two lines: the vector that fails, the file that differs; empty ones for none."""
-        _limit()
+        _limit(self._processor_seconds)
         warnings.simplefilter("ignore")
         try:
             self._load(mutant)
@@ -157,13 +159,13 @@ class _Finder(MetaPathFinder, Loader):
         exec(self.codes[module.__name__], module.__dict__)  # noqa: S102 - code of our own
 
 
-def _limit() -> None:
+def _limit(processor_seconds: int) -> None:
     """Let loops without end be ended, and allocations without bound fail."""
     import resource  # Windows has none
 
     if sys.platform == "win32":
         return
-    resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_SECONDS, _PROCESSOR_SECONDS))
+    resource.setrlimit(resource.RLIMIT_CPU, (processor_seconds, processor_seconds))
     statm = Path("/proc/self/statm")
     if statm.exists():
         held = int(statm.read_text(encoding="ascii").split()[0]) * resource.getpagesize()
