@@ -23,7 +23,8 @@ the fact, or the change makes no difference.
    of a module: for these run the tests that reach any function of the module, then those that reach modules that
    import it.
 
-By default the tests of `make test` judge: not those of areas, unless their sources have changed.
+`--budget SECONDS` leaves out the slowest tests of each mutant, and the verdict holds how many. By default the tests of
+`make test` judge: not those of areas, unless their sources have changed.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ import functools
 import hashlib
 import importlib
 import json
+import math
 import multiprocessing
 import signal
 import subprocess
@@ -76,13 +78,15 @@ class Verdict:
     Attributes:
         fate: what became of it.
         by: the test that fails.
-        tests: number of tests that reach it.
+        tests: number of tests that were to judge it.
+        left_out: number of tests that reach it, but are beyond the budget.
         seconds: processor time.
     """
 
     fate: Fate
     by: str = ""
     tests: int = 0
+    left_out: int = 0
     seconds: float = 0.0
 
 
@@ -131,6 +135,7 @@ class Task:
         file: the file, relative to the root.
         text: its changed text.
         tests: the tests that reach the mutant, in the order in which they run.
+        left_out: number of tests that reach it, but are beyond the budget.
         limit: seconds after which it counts as caught.
         stale: files whose compiled kernels may contain what is changed.
     """
@@ -139,6 +144,7 @@ class Task:
     file: str
     text: str
     tests: Sequence[str]
+    left_out: int
     limit: float
     stale: Sequence[str]
 
@@ -176,7 +182,7 @@ def judge(tree: Tree, task: Task) -> Verdict:
             by = answer.failure or answer.value["failed"]
             if by:
                 break
-    return Verdict(Fate.CAUGHT if by else Fate.SURVIVED, by, len(task.tests), round(seconds, 2))
+    return Verdict(Fate.CAUGHT if by else Fate.SURVIVED, by, len(task.tests), task.left_out, round(seconds, 2))
 
 
 def _failed(tree: Tree, tests: Sequence[str]) -> dict[str, str]:
@@ -208,12 +214,14 @@ class Suite:
         trees: a copy of it with these tests for each job.
         map: which tests reach which lines.
         importers: who imports which module of the packages.
+        budget: seconds that the tests of a mutant may take, by what they took on the unchanged tree.
     """
 
     project: Project
     trees: Sequence[Tree]
     map: Map
     importers: Importers
+    budget: float
 
     @classmethod
     def load(
@@ -224,6 +232,7 @@ class Suite:
         *,
         expression: str,
         patterns: Sequence[str],
+        budget: float,
         folder: Path,
     ) -> Suite:
         """Bring the trees up to date, and read or make the map.
@@ -234,6 +243,7 @@ class Suite:
             packages: names of the packages that are mapped.
             expression: which tests, as of pytest's `-m`.
             patterns: names of files in `tests`; none for all.
+            budget: seconds that the tests of a mutant may take.
             folder: of maps.
         """
         for tree in trees:
@@ -243,28 +253,31 @@ class Suite:
                 with contextlib.suppress(ImportError):
                     importlib.import_module(module)
         mapped = Map.make(trees[0], packages, expression, patterns, folder)
-        return cls(project, trees, mapped, Importers(project, packages))
+        return cls(project, trees, mapped, Importers(project, packages), budget)
 
     def verdicts(self, package: Package, mutants: Sequence[Mutant]) -> Iterator[tuple[Mutant, Verdict]]:
         """Yield what becomes of each mutant, in the order in which they are done."""
         tasks = [self._task(package, mutant) for mutant in mutants]
-        yield from ((task.mutant, Verdict(Fate.UNREACHED)) for task in tasks if not task.tests)
+        unreached = [task for task in tasks if not task.tests and not task.left_out]
+        yield from ((task.mutant, Verdict(Fate.UNREACHED)) for task in unreached)
         context = multiprocessing.get_context("fork")
         trees = context.SimpleQueue()
         for tree in self.trees:
             trees.put(tree)
         with context.Pool(len(self.trees), _claim, (trees,)) as pool:
-            yield from pool.imap_unordered(_judged, [task for task in tasks if task.tests])
+            yield from pool.imap_unordered(_judged, [task for task in tasks if task not in unreached])
 
     def _task(self, package: Package, mutant: Mutant) -> Task:
         text, file = package.texts[mutant.file], f"{package.folder}/{mutant.file}"
         place = place_of(text, mutant.start)
         levels = [{one: self.project.text(one) for one in level} for level in self.importers.levels(file)]
-        tests = self.map.reaching(place, levels)
+        reaching = self.map.reaching(place, levels)
+        tests = self.map.affordable(reaching, self.budget)
         changed = levels[:1] if place.is_traced else levels
         texts = {name: source for level in changed for name, source in level.items()}
         stale = [*texts] if any(has_kernels(source) for source in texts.values()) else []
-        return Task(mutant, file, mutant.apply(text), tests, self.map.limit(tests), stale)
+        left_out, limit = len(reaching) - len(tests), self.map.limit(tests)
+        return Task(mutant, file, mutant.apply(text), tests, left_out, limit, stale)
 
 
 # What is kept ----------------------------------------------------------------------------------------
@@ -359,6 +372,9 @@ def main(words: list[str] | None = None) -> int:
     option("--select", action="append", default=[], metavar="GLOB", help="files of the package to change (default all)")
     option("--tests", action="append", default=[], metavar="GLOB", help="files in tests that judge (default all)")
     option("-m", dest="expression", metavar="MARKEXPR", help="tests that judge (default those of `make test`)")
+    option(
+        "--budget", type=float, default=math.inf, help="seconds of tests for a mutant, the quickest first (default all)"
+    )
     option("--jobs", type=int, default=1, help="mutants at a time (default 1)")
     option("--state", type=Path, metavar="FILE", help="where verdicts are kept (default out/mutants/PACKAGE.json)")
     option("--survivors", action="store_true", help="run again those that were not caught")
@@ -403,6 +419,7 @@ def _run(args: argparse.Namespace, project: Project, states: Sequence[State], fo
         sorted(packages),
         expression=usual if args.expression is None else args.expression,
         patterns=args.tests,
+        budget=args.budget,
         folder=folder / "maps",
     )
     _say(f"{len(suite.map.tests)} tests judge; {len(suite.map.failed)} fail on the unchanged tree and judge nothing")
@@ -420,8 +437,11 @@ def _run(args: argparse.Namespace, project: Project, states: Sequence[State], fo
             state.data["map"] = suite.map.key
         for number, (mutant, verdict) in enumerate(suite.verdicts(state.package, chosen), 1):
             state.note(mutant, verdict, name)
-            words = f"{verdict.seconds:.1f} s, {mutant.file}:{mutant.line} {verdict.by}".strip()
-            _say(f"{state.package.name} {number} of {len(chosen)}: {verdict.fate}, {words}")
+            left_out = f", {verdict.left_out} left out" if verdict.left_out else ""
+            words = (
+                f"{verdict.seconds:.1f} s, {verdict.tests} tests{left_out}, {mutant.file}:{mutant.line} {verdict.by}"
+            )
+            _say(f"{state.package.name} {number} of {len(chosen)}: {verdict.fate}, {words.strip()}")
 
 
 def _revision(checkout: Path) -> str:

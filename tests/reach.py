@@ -196,10 +196,10 @@ class Tree:
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(0)
-        ended, seconds, end = 0, limit, time.monotonic() + limit
+        ended, status, seconds, end = 0, 0, limit, time.monotonic() + limit
         try:
             while not ended and time.monotonic() < end:
-                ended, _, usage = os.wait4(child, os.WNOHANG)
+                ended, status, usage = os.wait4(child, os.WNOHANG)
                 seconds = usage.ru_utime + usage.ru_stime if ended else limit
                 time.sleep(0 if ended else 0.01)
         finally:
@@ -209,8 +209,10 @@ class Tree:
                 os.waitpid(child, 0)
         if not ended:
             return Answer(failure="hangs", seconds=seconds)
+        if os.WIFSIGNALED(status):
+            return Answer(failure=f"ends with {signal.Signals(os.WTERMSIG(status)).name}", seconds=seconds)
         if not file.is_file():
-            return Answer(failure="ends the process", seconds=seconds)
+            return Answer(failure="ends without an answer", seconds=seconds)
         return Answer(json.loads(file.read_text(encoding="utf-8")), seconds=seconds)
 
     def pytest(self, arguments: Sequence[str], plugin: object) -> int:
@@ -227,14 +229,14 @@ class Tree:
         for source, target in ((os.open(os.devnull, os.O_RDONLY), 0), (log, 1), (log, 2)):
             os.dup2(source, target)
         resource.setrlimit(resource.RLIMIT_DATA, (_DATA_BYTES, resource.getrlimit(resource.RLIMIT_DATA)[1]))
-        os.chdir(self.root)
         # Nothing comes from the checkout that this file belongs to, not even what is already imported.
         own = [ROOT / "tests", *(ROOT / one for one in Project.load(ROOT).folders)]
         paths = [str(self.root / one) for one in self.project.folders]
         sys.path[:] = [*paths, *(one for one in sys.path if Path(one).absolute() not in own)]
         for name, module in list(sys.modules.items()):
-            if any(Path(getattr(module, "__file__", None) or "/").is_relative_to(one) for one in own):
+            if any(Path(getattr(module, "__file__", None) or "/").absolute().is_relative_to(one) for one in own):
                 del sys.modules[name]
+        os.chdir(self.root)
         sys.modules["__main__"] = types.ModuleType("__main__")  # which multiprocessing would import again
         os.environ |= {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(numba_cache)}
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -516,6 +518,15 @@ class Map:
             }
             chosen |= dict.fromkeys(self._ordered(self._tests_of(near) - set(chosen)))
         return list(chosen)
+
+    def affordable(self, tests: Sequence[str], seconds: float) -> list[str]:
+        """Return the first of the tests, as many as take no longer than this together, fixtures included."""
+        parts: set[str] = set()
+        for count, test in enumerate(tests):
+            parts |= {test} | self._closure(test)
+            if self._sum(parts) > seconds:
+                return list(tests[:count])
+        return list(tests)
 
     def limit(self, tests: Sequence[str]) -> float:
         """Return after how many seconds tests are ended."""

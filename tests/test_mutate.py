@@ -110,7 +110,7 @@ def shop(tmp_path_factory):
     package = Package(project, "shop")
     half = State(state(root), package, SETTINGS)
     half.note(next(one for one in package.mutants if one.new == "(19 + 1)"), Verdict(Fate.CAUGHT, "of another run"))
-    command(root, *CHANGED)
+    command(root, *CHANGED, "--jobs", "2")
     return root
 
 
