@@ -198,11 +198,16 @@ _tree: Tree  # of a worker
 
 def _claim(trees: Any) -> None:
     global _tree  # noqa: PLW0603  # a worker keeps its tree
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a worker that waits for a task runs no handler
     _tree = trees.get()
 
 
 def _judged(task: Task) -> tuple[Mutant, Verdict]:
-    return task.mutant, judge(_tree, task)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the tests end, too
+    try:
+        return task.mutant, judge(_tree, task)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @dataclass(frozen=True)
@@ -386,7 +391,7 @@ def main(words: list[str] | None = None) -> int:
         parser.error("--state is the file of one package")
     folder = args.state.absolute().parent if args.state else args.root.absolute() / "out" / "mutants"
     folder.mkdir(parents=True, exist_ok=True)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that it ends the workers, too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the workers end, too
     try:
         project = Project.load(args.root.absolute())
         packages = [Package(project, name, args.select) for name in args.packages]

@@ -202,8 +202,14 @@ def test_a_tree_changes_one_file_for_a_while_and_forgets_kernels_of_files(tmp_pa
     (tree.root / "tests" / "left.txt").write_text("by a test")
     prices = tree.root / "src" / "shop" / "prices.py"
     before = prices.stat().st_mtime_ns
+    bytecode = prices.parent / "__pycache__" / "prices.cpython-311.pyc"
+    bytecode.parent.mkdir()
+    bytecode.touch()
     with tree.changed("src/shop/prices.py", "TAX = 7"):
         assert "TAX = 7" == prices.read_text()
+        assert not bytecode.exists()
+        bytecode.touch()
+    assert not bytecode.exists()
     tree.refresh()
     assert before == prices.stat().st_mtime_ns
     assert not (tree.root / "tests" / "left.txt").exists()
