@@ -198,7 +198,6 @@ _tree: Tree  # of a worker
 
 def _claim(trees: Any) -> None:
     global _tree  # noqa: PLW0603  # a worker keeps its tree
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a worker that waits for a task runs no handler
     _tree = trees.get()
 
 
@@ -269,7 +268,9 @@ class Suite:
         trees = context.SimpleQueue()
         for tree in self.trees:
             trees.put(tree)
+        handler = signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a worker that waits could not run a handler
         with context.Pool(len(self.trees), _claim, (trees,)) as pool:
+            signal.signal(signal.SIGTERM, handler)
             yield from pool.imap_unordered(_judged, [task for task in tasks if task not in unreached])
 
     def _task(self, package: Package, mutant: Mutant) -> Task:
