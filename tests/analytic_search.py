@@ -69,10 +69,7 @@ def search(
     judge, decider = _Judge(scene, judging or Views()), _Judge(scene, Views())
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
     trials = Trials(encoding, judge, decider, photographs, decode=lambda data: data)
-    removal = None
-    if not keep_all:
-        how = SimplifyOptions(effort=effort)
-        removal = _Removal(model, None, how, grades=grades, progress=None, psnr=asked.psnr, scene=scene)
+    removal = None if keep_all else analytic_removal(scene, grades=grades, effort=effort)
     whole = _Splats(scene, model, refits=False, gradable=grades)
     goal = goal_of(asked, model, photographs)
     moves = Moves(Solver(trials, goal), Codings(model, encoding, grades), whole, removal)
@@ -87,6 +84,12 @@ def search(
     )  # fmt: skip
     made = [one.result.data for one in trials.made]
     return Found(best.result.data, made, judge.shown, report)
+
+
+def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Removal:
+    """Return who says how many splats may go."""
+    how = SimplifyOptions(effort=effort)
+    return _Removal(scene.model(), None, how, grades=grades, progress=None, psnr=None, scene=scene)
 
 
 @dataclass(eq=False)
