@@ -105,10 +105,12 @@ def sample_path() -> Path:
 
 @pytest.fixture(scope="module")
 def small_views():
-    """Virtual views that decide and judge are small: for searches and reports whose figures nobody reads."""
+    """Make virtual views that decide and judge small: for searches and reports whose figures nobody reads."""
+    from csplat_tools.views.placing import VirtualSizes
+
+    small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(4, 80, 60))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.views.finding._DECIDING", (12, 80, 60))
-        patch.setattr("csplat_tools.views.finding._JUDGING", (8, 160, 120))
+        patch.setattr("csplat_tools.views.placing.VIRTUAL_SIZES", small)
         yield
 
 
@@ -151,3 +153,33 @@ def tuned_file(once, trained_scene, tmp_path_factory):
     from trained import make_tuned, run_here
 
     return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
+
+
+@pytest.fixture(scope="session")
+def search_at_psnr(once):
+    """The smallest file of `captures.crowded()` at 30 dB, by a real search: `Optimised`."""
+    return _searched(once, "psnr", psnr=30.0)
+
+
+@pytest.fixture(scope="session")
+def search_at_size(once):
+    """The best file of `captures.crowded()` within 1,500 bytes, by a real search: `Optimised`."""
+    return _searched(once, "size", size=1500)
+
+
+@pytest.fixture(scope="session")
+def search_at_loss(once):
+    """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it: `Optimised`."""
+    return _searched(once, "loss", loss=0.5)
+
+
+def _searched(once, name: str, **goal: float):
+    pytest.importorskip("numba", reason="targets want the extra [render]")
+    import captures
+
+    def find():
+        scene = captures.crowded()
+        views = captures.photographed(scene) if name == "loss" else None
+        return captures.found_within(scene, views, **goal)
+
+    return once(f"search at a {name}", find)
