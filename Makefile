@@ -1,10 +1,15 @@
 # `make demo` first, `make test` second; `make help` lists the rest.
-# A machine with Python 3.11 or newer is enough; everything else goes into .venv and .venv-wheel.
+# A machine with Python 3.11 or newer is enough; everything else goes into .venv, by uv if it is installed, else by pip.
 
 PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+UV := $(shell command -v uv)
+# `make test RESOLUTION=lowest-direct`: the oldest versions that pyproject.toml allows; needs uv.
+RESOLUTION ?= highest
+INSTALL := $(if $(UV),$(UV) pip install --quiet --resolution $(RESOLUTION) --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile)
+CORE = $(VENV)/.core
 BENCH := $(BIN)/python -m csplat_bench
 CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 # Without the tracing of comparisons, which takes three quarters of the time and finds no more.
@@ -12,12 +17,13 @@ FUZZED := -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-reco
 SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
-.PHONY: help demo examples test lint format spec sample docs bench wasm fuzz fuzz-c clean
+
+.PHONY: help demo examples check test test-all dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
 
-demo: $(VENV)/.core ## set up, then encode, verify and decode the sample scene
+demo: $(CORE) ## set up, then encode, verify and decode the sample scene
 	@mkdir -p out
 	$(BIN)/csplat encode $(SAMPLE) out/sample.csplat --force
 	$(BIN)/csplat verify out/sample.csplat
@@ -31,14 +37,19 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
-test: $(VENV)/.dev ## everything that must hold: lint, types, contracts, vectors, fuzzing, tests
-	tests/run.sh
+check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files, fast tests, on the checkout
+	tests/run.sh check
 
-lint: $(VENV)/.dev ## style, types and import contracts
+test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
+	tests/run.sh test
+
+test-all: $(VENV)/.all ## the same and all areas: engines, torch, S3, Dask, peers, benchmarks, long fuzzing; an hour
+	tests/run.sh all
+
+lint: $(VENV)/.dev ## style, types and import contracts alone
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 format: $(VENV)/.dev ## bring the code into its one layout
@@ -52,12 +63,23 @@ sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, trai
 	$(BIN)/python tools/sample/make_sample.py
 
 docs: $(VENV)/.core ## the documentation, as a site in out/site
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	$(BIN)/python tools/docs/make_site.py
 	@echo "open out/site/index.html"
 
+dist: $(VENV)/.dev ## sdist, wheel and npm package in out/; a release gives TAG and URL, which go into their metadata
+	rm -rf out/dist out/npm && mkdir -p out/npm
+	$(if $(URL),$(BIN)/python tools/release/prepare.py --tag "$(TAG)" --url "$(URL)")
+	$(BIN)/python -m build --no-isolation --outdir out/dist .
+	cd codec/js && npm pack --silent --pack-destination ../../out/npm
+
+test-dist: ## install out/dist/*.whl in an environment of its own, and run the commands of `make demo` there
+	rm -rf out/fresh && $(PYTHON) -m venv out/fresh
+	out/fresh/$(notdir $(BIN))/python -m pip install --quiet --disable-pip-version-check out/dist/csplat-*.whl
+	$(MAKE) --no-print-directory demo BIN=out/fresh/$(notdir $(BIN)) CORE=
+
 bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
-	$(BIN)/pytest -m benchmark
+	$(BIN)/pytest -m "area(name='benchmarks')"
 	$(BENCH).codec
 	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
 	$(BENCH).codec.formats
@@ -94,18 +116,24 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 	$(BIN)/python tests/fuzz.py --target others --replay out/fuzz/c/corpus
 
 clean: ## remove what the commands above made
-	rm -rf $(VENV) .venv-wheel out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 		.import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "csplat needs Python 3.11 or newer" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@test -n "$(UV)" -o "$(RESOLUTION)" = highest || { echo "RESOLUTION=$(RESOLUTION) needs uv" >&2; exit 1; }
+	$(if $(UV),$(UV) venv --quiet --seed --python $(PYTHON) $(VENV),$(PYTHON) -m venv $(VENV))
 
 $(VENV)/.core: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable .
+	$(INSTALL) --editable .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	@touch $(VENV)/.core $@
+
+# By pip: uv would take a build of torch for CUDA, several gigabytes.
+$(VENV)/.all: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[all-tests]'
+	@touch $(VENV)/.core $(VENV)/.dev $@

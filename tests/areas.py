@@ -5,6 +5,7 @@ to an area by `@pytest.mark.area(name="engines")`. `make test` leaves out every 
 recorded hash; `make test-all` runs all of them.
 
     python tests/areas.py list                # each area, and whether its sources have changed
+    python tests/areas.py changed             # names of those that have
     python tests/areas.py expression          # the -m expression of `make test`
     python tests/areas.py expression --fast   # the same of `make check`: without slow tests and without any area
     python tests/areas.py extras              # the extras of pyproject.toml that changed areas need
@@ -119,6 +120,7 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="each area, and whether its sources have changed")
+    commands.add_parser("changed", help="names of areas whose sources have changed")
     tier = commands.add_parser("expression", help="the marker expression of a tier")
     tier.add_argument("--fast", action="store_true", help="of `make check`")
     commands.add_parser("extras", help="extras that changed areas need, separated by commas")
@@ -131,6 +133,8 @@ def main(words: list[str] | None = None) -> int:
         case "list":
             for area in areas:
                 print(f"{area.name:12} {'changed' if area.is_changed() else 'as recorded':12} {area.guards}")
+        case "changed":
+            print(" ".join(area.name for area in areas if area.is_changed()))
         case "expression":
             print(expression(areas, fast=args.fast))
         case "extras":

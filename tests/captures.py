@@ -11,8 +11,12 @@ from scipy.spatial.transform import Rotation
 from csplat import write_ply
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
-from csplat_render.cameras import intrinsics, look_at
-from csplat_tools.views import BLACK, ViewSet, with_deciders
+from csplat_render.cameras import intrinsics, look_at, resized
+from csplat_render.judge import renderer
+from csplat_tools.optimise.reaching import encode_to
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_deciders
+from csplat_trainer.pictures import Picture
 
 W, H = 48, 40
 
@@ -90,3 +94,52 @@ def photograph_object(scene, folder):
         angle = 2.0 * math.atan(W / 2 / cameras(1)[0].K[0, 0])
         (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return folder
+
+
+SMALL = (32, 24)  # pixels of views in which a search takes a second
+
+
+def crowded():
+    """Return a shell, and twice as many splats that hardly anybody sees."""
+    rng, scene = np.random.default_rng(1), shell(3)
+    faint = {
+        "means": (0.5 * rng.standard_normal((600, 3))).astype(np.float32),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (600, 1)),
+        "scales": np.full((600, 3), -4.0, np.float32),
+        "opacities": np.full(600, 0.02, np.float32),
+        "sh0": np.zeros((600, 3), np.float32),
+        "shN": np.zeros((600, 3, 3), np.float32),
+    }
+    return SplatModel(**{name: np.concatenate([getattr(scene, name), array]) for name, array in faint.items()})
+
+
+def around(source, count=24):
+    """Return small virtual views of a scene."""
+    views = find_view_set(source, count=count, size=SMALL)
+    judges, decides = ([resized(camera, 48, 36) for camera in part] for part in (views.judges, views.decides))
+    return replace(views, judges=judges, decides=decides)
+
+
+def judged_by(seen_from):
+    """Return views of which every fourth judges, and the others teach."""
+    teaches = [camera for number, camera in enumerate(seen_from) if number % 4]
+    return ViewSet("cameras", BLACK, teaches, (), seen_from[::4])
+
+
+def photographed(scene):
+    """Return photographs that a scene misses by 25 dB, every eighth of which judges."""
+    seen_from = camera_sequence(scene, 96, SMALL, seed=3)
+    rng, draw = np.random.default_rng(1), renderer(scene, BLACK)
+    noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
+    pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]
+    teaches = [camera for number, camera in enumerate(seen_from) if number % 8]
+    return ViewSet("made", BLACK, teaches, (), seen_from[::8], pictures)
+
+
+def found_within(source, views=None, encoding=None, *, keep_all=False, importance=None, **goal):
+    """Return the file on a target, by a brief search in small views: those of forty cameras unless others are given."""
+    views = views or judged_by(cameras(40))
+    # Fits of larger pictures take fewer steps; these are small all the same, unless virtual ones are to be added.
+    simplifying = SimplifyOptions(effort=1, rounds=2, view_size=SMALL if views.virtual else (960, 720))
+    chosen = {"keep_all": keep_all, "importance": importance, "simplifying": simplifying}
+    return encode_to(source, views=views, options=encoding, **chosen, **goal)

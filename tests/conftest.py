@@ -57,7 +57,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests went without the shared scenes: those are no part of a clone."""
+    """Report tests without shared scenes, and behaviour that was compared loosely."""
+    for report in terminalreporter.stats.get("passed", []):
+        for name, value in report.user_properties:
+            if name == "compared loosely":
+                terminalreporter.line(f"{report.nodeid}: sizes and PSNR alone were compared; {value}")
     skipped = [
         one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
     ]
@@ -101,10 +105,12 @@ def sample_path() -> Path:
 
 @pytest.fixture(scope="module")
 def small_views():
-    """Virtual views that decide and judge are small: for searches and reports whose figures nobody reads."""
+    """Make virtual views that decide and judge small: for searches and reports whose figures nobody reads."""
+    from csplat_tools.views.placing import VirtualSizes
+
+    small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(4, 80, 60))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.views.finding._DECIDING", (12, 80, 60))
-        patch.setattr("csplat_tools.views.finding._JUDGING", (8, 160, 120))
+        patch.setattr("csplat_tools.views.placing.VIRTUAL_SIZES", small)
         yield
 
 
@@ -129,3 +135,51 @@ def make_model():
         return SplatModel(**{**arrays, **fields})
 
     return make
+
+
+@pytest.fixture(scope="session")
+def trained_scene(once, tmp_path_factory):
+    """A scene that was trained for 300 steps on small photographs, see trained.py; its files are everybody's."""
+    pytest.importorskip("numba", reason="training wants the extra [render]")
+    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    from trained import make_trained, run_here
+
+    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained"), run_here))
+
+
+@pytest.fixture(scope="session")
+def tuned_file(once, trained_scene, tmp_path_factory):
+    """A file of the trained scene that was tuned for 100 steps; its files are everybody's."""
+    from trained import make_tuned, run_here
+
+    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
+
+
+@pytest.fixture(scope="session")
+def search_at_psnr(once):
+    """The smallest file of `captures.crowded()` at 30 dB, by a real search: `Optimised`."""
+    return _searched(once, "psnr", psnr=30.0)
+
+
+@pytest.fixture(scope="session")
+def search_at_size(once):
+    """The best file of `captures.crowded()` within 1,500 bytes, by a real search: `Optimised`."""
+    return _searched(once, "size", size=1500)
+
+
+@pytest.fixture(scope="session")
+def search_at_loss(once):
+    """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it: `Optimised`."""
+    return _searched(once, "loss", loss=0.5)
+
+
+def _searched(once, name: str, **goal: float):
+    pytest.importorskip("numba", reason="targets want the extra [render]")
+    import captures
+
+    def find():
+        scene = captures.crowded()
+        views = captures.photographed(scene) if name == "loss" else None
+        return captures.found_within(scene, views, **goal)
+
+    return once(f"search at a {name}", find)

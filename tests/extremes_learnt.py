@@ -1,4 +1,4 @@
-"""What learning makes of scenes at the extremes: simplified, trained on, tuned. Wants the extra [render].
+"""Scenes at the extremes after learning: simplified, trained on, tuned. Needs the extra [render].
 
 `python tests/extremes_learnt.py` prints the figures of the guide's second table.
 """
@@ -8,10 +8,11 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from extremes import COUNT, DRAWN, NAMES, judge, scene
+from extremes import COPIES, COUNT, DRAWN, NAMES, judge, scene
 
 from csplat import EncodeOptions, SplatModel, decode
 from csplat.encoder import Draft, Frozen
+from csplat_render import Camera
 from csplat_render.judge import Judge, Look
 from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
@@ -23,7 +24,6 @@ from csplat_trainer.outputs import TrainResult
 from csplat_trainer.pictures import Picture
 from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, renders_of, split_views, tune
 
-COPIES = 2_000  # of a million: learning looks at each splat again and again, and all are alike
 SMALL = (160, 120)
 FEW = SimplifyOptions(views=10, view_size=(60, 45))
 QUICK = TrainOptions(
@@ -55,12 +55,19 @@ def half(name: str) -> Simplified:
 
 
 def photographs(name: str, points: np.ndarray | None = None) -> DataSet:
-    """Photographs of a scene in front of black, and points."""
-    model, rasteriser, shots = learnt_from(name), Rasteriser(gradients=False), []
-    for camera in virtual_cameras(model, 12, 48, 40):
+    """Return photographs of a condition in front of black, and points."""
+    model = learnt_from(name)
+    return photographs_of(model, virtual_cameras(model, 12, 48, 40), points)
+
+
+def photographs_of(model: SplatModel, cameras: list[Camera], points: np.ndarray | None = None) -> DataSet:
+    """Return photographs of a scene in front of black, three of four to be learnt from, and points."""
+    rasteriser, shots = Rasteriser(gradients=False), []
+    for camera in cameras:
         pixels = np.clip(rasteriser.forward(model, camera).rgb, 0.0, 1.0)
         shots.append(Picture(camera, np.rint(pixels * 255).astype(np.uint8)))
-    return DataSet("made", shots[:9], shots[9:], points)
+    count = 3 * len(shots) // 4
+    return DataSet("made", shots[:count], shots[count:], points)
 
 
 @cache

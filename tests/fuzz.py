@@ -147,16 +147,21 @@ def run(name, args):
         for process in processes:
             if process is not None:
                 process.join()
-        target = made(name, Path(scratch))
-        edges = Edges(target.watched)
-        every = edges.all_lines()
-        reached = [] if args.plain else [f"{len(lines & every):,} of {len(every):,} lines of functions"]
-        reached += [text for text in (target.coverage(),) if text]
-        missing = sorted(f"{Path(file).name}:{line}" for file, line in every - lines)
-        args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / f"{name}-unreached.txt").write_text("\n".join(missing) + "\n", encoding="utf-8")
-        target.close()
+        reached = [] if args.plain else covered(name, args, lines, Path(scratch))
     return tally, findings, reached
+
+
+def covered(name, args, lines, scratch):
+    """Write which lines nothing reached; return what is known of the coverage, a line each."""
+    target = made(name, scratch)
+    every = Edges(target.watched).all_lines()
+    reached = [f"{len(lines & every):,} of {len(every):,} lines of functions"]
+    reached += [text for text in (target.coverage(),) if text]
+    missing = sorted(f"{Path(file).name}:{line}" for file, line in every - lines)
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / f"{name}-unreached.txt").write_text("\n".join(missing) + "\n", encoding="utf-8")
+    target.close()
+    return reached
 
 
 def gathered(args, processes, clocks, results, stop):
@@ -287,7 +292,7 @@ def too_slow(signal_number, frame):  # noqa: ARG001 - the signature of a handler
 
 def limit_memory():
     """Bound the address space of this process; return its resident bytes now."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[0]) if Path("/proc/self/statm").exists() else 0
     if pages:
         limit = pages * resource.getpagesize() + ADDRESS_SPACE_ABOVE_START
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -1,50 +1,122 @@
 #!/usr/bin/env bash
-# Everything that must hold, the quick things first and pytest last. `make test` sets up .venv and
-# calls this. The Python tests run against the built wheel, installed in a place of its own.
-# With CI=true in the environment nothing may be skipped for want of a program.
+# The three tiers of tests; `make check`, `make test` and `make test-all` set up .venv and call this.
+#
+#   tests/run.sh check   the checkout: style, types, import contracts, generated files, fast tests; a minute
+#   tests/run.sh test    the built wheel: everything that an ordinary change can break; minutes
+#   tests/run.sh all     the same, and every area of tests/areas.toml, pyright, long fuzzing
+#
+# Further words go to pytest. With CI=true in the environment nothing may be skipped because a program is absent.
+# Each step prints its seconds of wall time and of CPU time, children included; a table at the end repeats them.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-DEV=.venv/bin
-WHEEL=.venv-wheel/bin
+BIN=$PWD/.venv/bin
+[ -d "$BIN" ] || BIN=$PWD/.venv/Scripts # Windows
+WHEEL=out/wheel
+TIER=${1:-test}
+shift || true
 
-main() {
-    step "style" "$DEV/ruff" check .
-    step "layout" "$DEV/ruff" format --check .
-    step "types (mypy)" "$DEV/mypy"
-    step "import contracts" "$DEV/lint-imports"
-    step "generated files" "$DEV/python" spec/generate.py --check
-    step "vectors and annexes" "$DEV/python" -m csplat_conformance.recipes --check
-    if have node "pyright and the JavaScript tests"; then
-        step "types (pyright)" "$DEV/pyright"
-        if have npm "the types of the JavaScript, and SPZ's own library"; then
-            step "types of the decoder (tsc)" npm run --silent --prefix codec/js types
-            step "types of the viewer (tsc)" npm run --silent --prefix codec/js types -- --project ../../tools/viewer
-            step "SPZ's own library" npm install --silent --no-audit --no-fund --prefix out/peers @adobe/spz@0.2.3
-        fi
-        step "JavaScript" javascript_tests
-        if have chromium "the decoder in a browser"; then
-            step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
-        fi
-    fi
-    step "wheel" build_and_install_wheel
-    step "conformance of the decoder" "$WHEEL/csplat" conformance decoder --level 4
-    # Two as processes: tests/test_conformance_encoder.py takes all at every preset, in its own.
-    step "conformance of the encoder" "$WHEEL/csplat" conformance encoder --level 3 --filter '*/double,*/duplicates'
-    # Unguided: so few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
-    step "fuzzing" "$WHEEL/python" tests/fuzz.py --target all --count 1500 --jobs 1 --plain
-    step "Python tests" "$WHEEL/pytest" -m "not benchmark" "$@"
+check_tier() {
+    static_checks
+    step "fast tests" "$BIN/python" -m pytest -q -n auto -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
 }
+
+# test_tier EXPRESSION [WORDS...]: EXPRESSION selects Python tests by their markers.
+test_tier() {
+    step "wheel" build_and_unpack_wheel
+    # Kernels are compiled once, here, and not by each worker of pytest; meanwhile other steps use the other core.
+    background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "not area"
+    static_checks
+    step "vectors and annexes" "$BIN/python" -m csplat_conformance.recipes --check
+    javascript
+    # Every vector by the command, as an author of a decoder runs it.
+    step "conformance of the decoder" "$BIN/csplat" conformance decoder --level 4
+    # Two inputs, as processes: tests/test_conformance_encoder.py takes them all, in its own process.
+    step "conformance of the encoder" "$BIN/csplat" conformance encoder --level 3 --filter '*/double,*/duplicates'
+    # Unguided: few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
+    step "fuzzing" "$BIN/python" tests/fuzz.py --target all --count "${FUZZ_COUNT:-300}" --jobs 1 --plain
+    joined
+    step "Python tests" "$BIN/python" -m pytest -q -n auto -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+}
+
+all_tier() {
+    step "types (pyright)" "$BIN/pyright"
+    FUZZ_COUNT=1500
+    test_tier "" "$@"
+    "$BIN/python" tests/areas.py record
+}
+
+static_checks() {
+    step "style" "$BIN/ruff" check .
+    step "layout" "$BIN/ruff" format --check .
+    step "types (mypy)" "$BIN/mypy"
+    step "import contracts" "$BIN/lint-imports"
+    step "generated files" "$BIN/python" spec/generate.py --check
+}
+
+javascript() {
+    have node "the JavaScript tests" || return 0
+    if have npm "the types of the JavaScript"; then
+        step "types (tsc)" javascript_types
+    fi
+    step "JavaScript" javascript_tests
+    if have chromium "the decoder in a browser"; then
+        step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
+    fi
+}
+
+SUMMARY=""
 
 step() {
-    printf '\n== %s\n' "$1"
-    local began=$SECONDS
+    local name=$1 began cpu
     shift
+    printf '\n== %s\n' "$name"
+    began=$SECONDS
+    cpu_seconds && cpu=$CPU
     "$@"
-    printf -- '-- %d s\n' $((SECONDS - began))
+    cpu_seconds && noted "$name" $((SECONDS - began)) $((CPU - cpu))
 }
 
-# have PROGRAM WHAT: false, with one loud line, where WHAT must be skipped; a failure where CI=true.
+# noted NAME WALL CPU: print the seconds of a step, and keep them for the table.
+noted() {
+    printf -- '-- %d s, CPU %d s\n' "$2" "$3"
+    SUMMARY+=$(printf '%-28s %5d %5d' "$1" "$2" "$3")$'\n'
+}
+
+# Set CPU to the CPU seconds of this shell and of all children that have ended; a subshell would count its own.
+cpu_seconds() {
+    local file=out/times.$BASHPID
+    times >"$file"
+    CPU=$(awk -F'[ms ]+' '{ total += 60 * $1 + $2 + 60 * $3 + $4 } END { printf "%d", total + 0.5 }' "$file")
+    rm "$file"
+}
+
+# background NAME COMMAND...: run a step beside the following ones; `joined` waits for it and prints what it printed.
+background() {
+    BACKGROUND_NAME=$1
+    shift
+    (
+        began=$SECONDS
+        status=0
+        "$@" >out/background.log 2>&1 || status=$?
+        cpu_seconds
+        echo "$((SECONDS - began)) $CPU" >out/background.seconds
+        exit $status
+    ) &
+    BACKGROUND=$!
+}
+
+joined() {
+    local status=0
+    wait "$BACKGROUND" || status=$?
+    printf '\n== %s\n' "$BACKGROUND_NAME"
+    cat out/background.log
+    [ $status = 0 ] || exit $status
+    # shellcheck disable=SC2046  # two numbers
+    noted "$BACKGROUND_NAME" $(cat out/background.seconds)
+}
+
+# have PROGRAM WHAT: false, with one loud line, if WHAT must be skipped; a failure if CI=true.
 have() {
     command -v "$1" >/dev/null && return 0
     printf '\n==== SKIPPED: %s, because %s is not installed ====\n' "$2" "$1"
@@ -53,6 +125,10 @@ have() {
         exit 1
     fi
     return 1
+}
+
+javascript_types() {
+    npm run --silent --prefix codec/js types
 }
 
 # The counts when all is well, every failure in full otherwise.
@@ -66,24 +142,38 @@ javascript_tests() {
     grep -E '(tests|pass|fail|skipped) [0-9]+' "$log"
 }
 
-build_and_install_wheel() {
+# The wheel's files go before the checkout on the path of every process: what is tested is what users install.
+build_and_unpack_wheel() {
     rm -rf out/dist
-    "$DEV/python" -m build --wheel --outdir out/dist . >out/build.log 2>&1 || {
+    "$BIN/python" -m build --wheel --no-isolation --outdir out/dist . >out/build.log 2>&1 || {
         cat out/build.log
         return 1
     }
-    [ -x "$WHEEL/python" ] || "$DEV/python" -m venv --without-pip .venv-wheel
-    # Modules are compiled when they are imported: of torch alone there are thousands that never are.
-    local pip=("$DEV/python" -m pip --python "$WHEEL/python" install --quiet --disable-pip-version-check --no-compile)
-    local wheel
-    wheel=$(echo out/dist/csplat-*.whl)
-    "${pip[@]}" "${wheel}[render,film,scale,torch-tests,remote-tests,browser-tests]" pytest hypothesis jsonschema
-    "${pip[@]}" --force-reinstall --no-deps "$wheel"
-    "$WHEEL/python" -c 'import csplat; print("testing", csplat.__file__); assert ".venv-wheel" in csplat.__file__'
+    NUMBA_CACHE_DIR=$("$BIN/python" tests/wheel.py out/dist/csplat-*.whl "$WHEEL")
+    export NUMBA_CACHE_DIR PYTHONPATH=$PWD/$WHEEL
+    "$BIN/python" -c 'import csplat; print("testing", csplat.__file__); assert "wheel" in csplat.__file__'
 }
 
-# Many tests start processes of their own: what one of them has compiled the next one takes.
-unset PYTHONDONTWRITEBYTECODE
+unset PYTHONDONTWRITEBYTECODE # many tests start processes: what one of them has compiled the next one takes
 
 mkdir -p out
-main "$@"
+BEGAN=$SECONDS
+case $TIER in
+check) check_tier "$@" ;;
+test)
+    changed=$("$BIN/python" tests/areas.py changed)
+    extras=$("$BIN/python" tests/areas.py extras)
+    [ -z "$changed" ] || printf 'changed areas, whose tests run too: %s\n' "$changed"
+    [ -z "$extras" ] || step "extras of changed areas" "$BIN/python" -m pip install --quiet --editable ".[$extras]"
+    test_tier "$("$BIN/python" tests/areas.py expression)" "$@"
+    # What has passed is recorded, to be committed with the change.
+    [ -z "$changed" ] || "$BIN/python" tests/areas.py record $changed
+    ;;
+all) all_tier "$@" ;;
+*)
+    echo "usage: tests/run.sh check|test|all [words for pytest]" >&2
+    exit 2
+    ;;
+esac
+cpu_seconds
+printf '\n%-28s %5s %5s\n%s%-28s %5d %5d\n' step wall CPU "$SUMMARY" "$TIER" $((SECONDS - BEGAN)) "$CPU"

@@ -10,6 +10,8 @@ import pytest
 from csplat_bench.viewer.arrival import Watched
 from csplat_bench.viewer.line import Line
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 BODY = bytes(range(256)) * 200
 
 

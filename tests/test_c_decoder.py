@@ -21,7 +21,7 @@ C = ROOT / "codec" / "c"
 VECTORS = Path(csplat_conformance.__file__).parent / "vectors"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 COMPILER = shutil.which("cc")
-SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -46,11 +46,18 @@ def compiled(folder, name, *arguments):
 
 @pytest.fixture(scope="module")
 def decoder(tmp_path_factory):
+    """The decoder that inflates by zlib, optimised: some warnings need it."""
+    return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", "-O1", C / "csplat.c")
+
+
+@pytest.fixture(scope="module")
+def sanitized(tmp_path_factory):
     """The decoder and its inflate with sanitizers, which take some seconds to compile."""
-    folder = tmp_path_factory.mktemp("c")
-    for name in ("csplat", "inflate"):
+    folder = tmp_path_factory.mktemp("sanitized")
+    return [
         compiled(folder, f"{name}.o", "-c", *SANITIZED, "-DCSPLAT_NO_ZLIB", C / f"{name}.c")
-    return [folder / "csplat.o", folder / "inflate.o"]
+        for name in ("csplat", "inflate")
+    ]
 
 
 @contextmanager
@@ -74,27 +81,48 @@ def asked(adapter):
         assert process.wait() == 0  # AddressSanitizer found no leak
 
 
-def test_passes_the_conformance_suite_under_sanitizers(decoder, tmp_path):
-    with asked(compiled(tmp_path, "adapter", *SANITIZED, *decoder, C / "tools" / "adapter.c")):
+#: With sanitizers, or another compiler: it runs when a source in C changes.
+in_depth = pytest.mark.area(name="native")
+
+
+def assert_passes(adapter):
+    with asked(adapter):
         report = run_command("adapter {input} {outdir}", Choice(jobs=1))
     assert report.failures == []
     assert len(report.outcomes) > 1000
     assert not [note for note in report.notes if "unread" in note]
 
 
-def test_reads_and_refuses_the_same_streams_by_zlib(tmp_path):
-    with asked(compiled(tmp_path, "adapter", C / "csplat.c", C / "tools" / "adapter.c")):
+@pytest.mark.slow
+def test_passes_the_conformance_suite(tmp_path):
+    sources = [C / "csplat.c", C / "inflate.c", C / "tools" / "adapter.c"]
+    assert_passes(compiled(tmp_path, "adapter", "-DCSPLAT_NO_ZLIB", *sources))
+
+
+@in_depth
+@pytest.mark.slow
+def test_passes_the_conformance_suite_under_sanitizers(sanitized, tmp_path):
+    assert_passes(compiled(tmp_path, "adapter", *SANITIZED, *sanitized, C / "tools" / "adapter.c"))
+
+
+@pytest.mark.slow
+def test_reads_and_refuses_the_same_streams_by_zlib(decoder, tmp_path):
+    with asked(compiled(tmp_path, "adapter", decoder, C / "tools" / "adapter.c")):
         report = run_command("adapter {input} {outdir}", Choice("*deflate*,valid/rich", jobs=1))
     assert report.failures == []
     assert len(report.outcomes) > 50
 
 
-def test_survives_callers_whose_functions_fail(decoder, tmp_path):
-    interface = compiled(tmp_path, "interface", *SANITIZED, *decoder, C / "tools" / "interface.c")
+@in_depth
+@pytest.mark.slow
+def test_survives_callers_whose_functions_fail(sanitized, tmp_path):
+    interface = compiled(tmp_path, "interface", *SANITIZED, *sanitized, C / "tools" / "interface.c")
     ended = run([interface, VECTORS / "valid" / "rich.csplat"])
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+@in_depth
+@pytest.mark.slow
 def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_sources(tmp_path):
     if shutil.which("clang-14") is None or shutil.which("wasm-ld-14") is None:
         absent("there is no clang-14 or no lld-14")
@@ -104,8 +132,9 @@ def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_source
     assert (tmp_path / "wasm.mjs").read_bytes() == committed, "make wasm"
 
 
-def test_the_example_tells_what_is_in_a_file(tmp_path):
-    example = compiled(tmp_path, "example", C / "csplat.c", C / "example.c")
+@pytest.mark.slow
+def test_the_example_tells_what_is_in_a_file(decoder, tmp_path):
+    example = compiled(tmp_path, "example", decoder, C / "example.c")
     told = subprocess.run(
         [example, VECTORS / "valid" / "worked_example.csplat"], capture_output=True, text=True, check=True
     )
@@ -115,7 +144,8 @@ def test_the_example_tells_what_is_in_a_file(tmp_path):
     assert re.fullmatch(r"E_CRC at byte \d+ \(CHK-1\): .+\n", refused.stderr)
 
 
-def test_the_sample_of_the_guide_decodes(tmp_path):
+@pytest.mark.slow
+def test_the_sample_of_the_guide_decodes(decoder, tmp_path):
     sample = (ROOT / "codec" / "EMBEDDING.md").read_text(encoding="utf-8").split("```c\n")[1].split("```")[0]
     source = tmp_path / "sample.c"
     source.write_text(
@@ -126,6 +156,6 @@ def test_the_sample_of_the_guide_decodes(tmp_path):
         f'{sample}return printf("%g %g", (double)quats[0], (double)shN[0]) != 3;\n}}\n',
         encoding="utf-8",
     )
-    program = compiled(tmp_path, "sample", C / "csplat.c", source)
+    program = compiled(tmp_path, "sample", decoder, source)
     with (VECTORS / "valid" / "worked_example.csplat").open("rb") as file:
         assert run([program], stdin=file).stdout == "1 1"

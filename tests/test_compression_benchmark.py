@@ -27,6 +27,8 @@ from csplat_bench.compression.sizes import Book, books_of, float_bytes, integer_
 from csplat_bench.compression.tables import tables
 from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 BLACK = np.zeros(3, np.float32)
 BOOKS = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
 
@@ -93,7 +95,6 @@ def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(sourc
     assert np.array_equal(moved, start.means)
 
 
-@pytest.mark.benchmark
 def test_the_control_learns(source):
     wanted = renders_of(source, cameras(10), BLACK, None)
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
@@ -162,7 +163,6 @@ def run(capture, out, *words):
     return command(main, list(map(str, (*words, *extra, *knobs, "--iterations", 40, "--threads", 1, "--out", out))))
 
 
-@pytest.mark.benchmark
 def test_everything_is_measured_and_printed(capture, tmp_path, capsys):
     lists = ("--sizes", 16, "--escapes", 0.1, "--bits", 12, "--keep", "0.6,0.5")
     parts = ("main", "control", "others", "sizes", "escapes", "positions", "curve")

@@ -19,8 +19,10 @@ def test_every_prefix_is_refused_as_truncated(data):
     # CNF-3
     for size in range(len(data)):
         with pytest.raises(csplat.FormatError) as caught:
-            csplat.decode(data[:size])
-        assert "E_TRUNCATED" == caught.value.code
+            csplat.decode(data[:size], threads=1)
+        assert "E_TRUNCATED" == caught.value.code, size
+        assert caught.value.clause
+        assert 0 <= caught.value.offset <= size
 
 
 def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
@@ -28,29 +30,25 @@ def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
         cut = bytearray(SMALL[:size])
         cut[20:28] = size.to_bytes(8, "little")
         with pytest.raises(csplat.CsplatError):
-            csplat.decode(repair(bytes(cut)))
+            csplat.decode(repair(bytes(cut)), threads=1)
 
 
-@pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 7)], ids=["small", "rich"])
+@pytest.mark.slow
+@pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 19)], ids=["small", "rich"])
 def test_every_flipped_bit_is_refused(data, stride):
-    # CNF-3; of the larger file every seventh bit, which reaches each place within a byte
+    # CNF-3; of the larger file every 19th bit, which reaches each place within a byte. Behind magic and version
+    # it is a CRC that refuses (HDR-12).
+    named = 8 * _spec.HEADER_OFFSETS["profile"]
     for bit in range(0, 8 * len(data), stride):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(csplat.CsplatError):
-            csplat.decode(bytes(damaged))
+        with pytest.raises(csplat.CsplatError) as caught:
+            csplat.decode(bytes(damaged), threads=1)
+        assert caught.value.code in ({"E_MAGIC", "E_VERSION"} if bit < named else {"E_CRC"}), bit
+        assert 0 <= caught.value.offset <= len(data)
 
 
-def test_every_flipped_bit_behind_magic_and_version_is_refused_by_a_crc():
-    # HDR-12
-    for bit in range(8 * _spec.HEADER_OFFSETS["profile"], 8 * len(SMALL)):
-        damaged = bytearray(SMALL)
-        damaged[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(csplat.FormatError) as caught:
-            csplat.decode(bytes(damaged))
-        assert "E_CRC" == caught.value.code
-
-
+@pytest.mark.slow
 def test_every_flipped_bit_of_a_part_is_refused_by_who_reads_that_part_alone():
     # HDR-12
     layer = read_header(SMALL).tiles[0].layers[0]
@@ -58,17 +56,19 @@ def test_every_flipped_bit_of_a_part_is_refused_by_who_reads_that_part_alone():
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
         with pytest.raises(csplat.FormatError) as caught:
-            csplat.decode(damaged, tiles=[0], sh_degree=0)
+            csplat.decode(damaged, tiles=[0], sh_degree=0, threads=1)
         assert ("E_CRC", layer.offset, "CHK-1") == (caught.value.code, caught.value.offset, caught.value.clause)
 
 
-def test_every_flipped_bit_with_all_checksums_repaired_is_refused_or_decoded():
+@pytest.mark.slow
+def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
     records = chunk_records(SMALL)
-    for bit in range(8 * len(SMALL)):
+    # Every third bit, which reaches each place within a byte.
+    for bit in range(0, 8 * len(SMALL), 3):
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
         try:
-            model = csplat.decode(repair(bytes(damaged), records))
+            model = csplat.decode(repair(bytes(damaged), records), threads=1)
         except csplat.CsplatError:
             continue
         assert 2 == len(model)

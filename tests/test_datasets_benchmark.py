@@ -21,6 +21,8 @@ from csplat_bench.datasets import protocols as dataset_protocols
 from csplat_bench.datasets import tables as dataset_tables
 from csplat_render.cameras import intrinsics, look_at
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 W, H = 48, 32
 QUICK = ("--iterations", "20", "--max-splats", "60", "--sh-degree", "1")
 

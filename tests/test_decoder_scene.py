@@ -95,6 +95,7 @@ def test_one_codebook_for_all_bands(escaped):
         assert_same(full, decode(build(described).data, sh_degree=degree), coefficients=(degree + 1) ** 2 - 1)
 
 
+@pytest.mark.slow
 def test_tiles_longer_than_a_run_of_the_decoder():
     count, entries = 17_000, {1: rows_of(0, 5, 9, -60, 60)}
     index = [row[0] for row in rows_of(1, count, 1, 0, 5)]

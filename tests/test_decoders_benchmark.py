@@ -14,6 +14,8 @@ from csplat_bench.codec.decoders.__main__ import main, measured
 from csplat_bench.codec.decoders.started import DECODERS
 from csplat_bench.common.scenes import Scene
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 # A decoder behind the protocol of codec/js/test/adapter.mjs that gives the same answer to every file.
 STUB = """#!{python}
 import struct, sys

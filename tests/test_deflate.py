@@ -4,6 +4,7 @@ import random
 import zlib
 
 import pytest
+from tables import failures
 
 from csplat_conformance.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_conformance.recipes.deflate_streams import broken_streams, sound_streams
@@ -35,21 +36,23 @@ def by_validator(coded, size=SIZE):
     return "long" if len(out) > size else (out, inflater.used)
 
 
-@pytest.mark.parametrize("case", sound_streams(), ids=lambda case: case.name)
-def test_sound_streams_give_their_output(case):
-    size = len(case.output)
+def test_sound_streams_give_their_output():
+    def check(case):
+        size = len(case.output)
+        assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
+        assert (case.output, len(case.coded)) == by_validator(case.coded, size)
 
-    assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
-    assert (case.output, len(case.coded)) == by_validator(case.coded, size)
+    assert [] == failures(sound_streams(), check)
 
 
-@pytest.mark.parametrize("case", broken_streams(), ids=lambda case: case.name)
-def test_broken_streams_are_refused_for_their_clause(case):
-    assert "refused" == by_zlib(case.coded, len(case.output))
-    with pytest.raises(CodedError) as caught:
-        uncoded(memoryview(case.coded), DEFLATE, len(case.output))
+def test_broken_streams_are_refused_for_their_clause():
+    def check(case):
+        assert "refused" == by_zlib(case.coded, len(case.output))
+        with pytest.raises(CodedError) as caught:
+            uncoded(memoryview(case.coded), DEFLATE, len(case.output))
+        assert case.clause == caught.value.clause
 
-    assert case.clause == caught.value.clause
+    assert [] == failures(broken_streams(), check)
 
 
 def damaged(count):
@@ -69,11 +72,11 @@ def damaged(count):
 
 
 def test_the_slow_inflate_reads_what_zlib_reads_and_refuses_the_rest():
-    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(4000)]
+    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(1500)]
 
     assert [] == [pair for pair in verdicts if pair[0] != pair[1]]
     refused = sum(zlib_says == "refused" for zlib_says, _ in verdicts)
-    assert 1000 < refused < 3500
+    assert 375 < refused < 1300
 
 
 def test_a_code_of_code_lengths_without_codewords_is_refused():

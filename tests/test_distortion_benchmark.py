@@ -24,6 +24,8 @@ from csplat_tools.optimise import fitted, moves
 from csplat_tools.optimise.report import Optimised, Report
 from csplat_tools.optimise.simplify import adjusting
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 SCALAR = (Point(38.0, 1000), Point(42.0, 4000))
 CODEBOOK = (Point(39.0, 1500), Point(41.0, 6000))
 
@@ -221,16 +223,15 @@ def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, mo
     assert 7 == len(parts)
 
 
-@pytest.mark.benchmark
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
     """A part of the scene that ships, beside a peer that was judged before."""
     part = tmp_path / "part.ply"
-    write_ply(part, read_ply(scenes._SAMPLE).select(slice(None, None, 4)))
-    monkeypatch.setattr(scenes, "_SAMPLE", part)
+    write_ply(part, read_ply(scenes.SAMPLE).select(slice(None, None, 4)))
+    monkeypatch.setattr(scenes, "SAMPLE", part)
     known = tmp_path / "sample.json"
     known.write_text(json.dumps({"peers": {"SPZ": asdict(Point(36.0, 60_000))}}))
     monkeypatch.setattr(distortion, "find_splat_transform", lambda _: (["none"], "judged before"))
-    monkeypatch.setattr(distortion, "_GRID", (-3.0,))
+    monkeypatch.setattr(distortion, "GRID", (-3.0,))
     chosen = {"psnr": 36.1, "size_bytes": 30_000, "splats": 900, "sh_coding": "scalar"}
     searches = []
 

@@ -6,6 +6,7 @@ import re
 import types
 import xml.etree.ElementTree as ET
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from unittest import mock
 
@@ -15,13 +16,17 @@ import pytest
 import csplat
 from csplat.decoder import decode_scene
 from csplat.encoder import PRESETS, geometry, quantise
-from csplat_conformance.encoders import EncoderChoice, all_inputs, figures, run_encoder
+from csplat_conformance import encoders
+from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
 from csplat_conformance.encoders.cut import find_cuts
+from csplat_conformance.encoders.figures import figures_of
 from csplat_conformance.encoders.judge import judge_content
 from csplat_conformance.encoders.proving import judge_errors
 from csplat_conformance.process import Ended
 from csplat_conformance.report import Outcome, Report, Status, to_json, to_junit, to_table
 from csplat_conformance.stated import Source
+
+pytestmark = pytest.mark.slow  # together: tests of the encoder suite
 
 INPUTS = {one.name: one for one in all_inputs()}
 PLAIN = "ordinary/degree_1"
@@ -332,27 +337,29 @@ def test_a_picture_that_is_no_number_is_no_picture(altered):
     assert ("L4", Status.FAILED) == statuses(altered(lambda scene: scene, ("L4",), lambda *_: float("nan")))[-1]
 
 
-def test_sizes_and_figures_of_others_stand_beside_the_picture(altered, tmp_path, monkeypatch):
+def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypatch):
     def message(table, psnr=41.2, **fields):
-        (tmp_path / "figures.json").write_text(json.dumps(table))
-        figures._all.cache_clear()
+        monkeypatch.setattr("csplat_conformance.encoders.picturing.figures_of", lambda name: table.get(name, {}))
         return altered(lambda scene: scene, ("L4",), lambda *_: psnr, **fields).outcomes[0]
 
-    monkeypatch.setattr(figures, "_FILE", tmp_path / "figures.json")
     ours, spz = {"bytes": 4800, "psnr": 40.9}, {"bytes": 7900, "psnr": 39.1}
     whole = message({PLAIN: {"csplat": ours, "spz": spz}})
-    try:
-        assert "41.20 dB in 4,183 bytes (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)" == whole.message
-        assert {"psnr": 41.2, "wanted": 30.0, "bytes": 4183, "beside": {"csplat": ours, "spz": spz}} == whole.details
-        assert "41.20 dB in 4,183 bytes (SPZ in 7,900)" == message({PLAIN: {"spz": {"bytes": 7900}}}).message
-        assert "41.20 dB in 4,183 bytes" == message({"other": {}}).message
-        short = message({PLAIN: {"csplat": ours}}, 25.0, psnr_min=26.0)
-        assert (
-            "25.00 dB, wanted 26 at least, in 4,183 bytes (csplat 40.90 in 4,800); with the source's means 25.0,"
-            " shapes 25.0, opacities 25.0, colours 25.0"
-        ) == short.message
-    finally:
-        figures._all.cache_clear()
+    assert "41.20 dB in 4,183 bytes (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)" == whole.message
+    assert {"psnr": 41.2, "wanted": 30.0, "bytes": 4183, "beside": {"csplat": ours, "spz": spz}} == whole.details
+    assert "41.20 dB in 4,183 bytes (SPZ in 7,900)" == message({PLAIN: {"spz": {"bytes": 7900}}}).message
+    assert "41.20 dB in 4,183 bytes" == message({"other": {}}).message
+    short = message({PLAIN: {"csplat": ours}}, 25.0, psnr_min=26.0)
+    assert (
+        "25.00 dB, wanted 26 at least, in 4,183 bytes (csplat 40.90 in 4,800); with the source's means 25.0,"
+        " shapes 25.0, opacities 25.0, colours 25.0"
+    ) == short.message
+
+
+def test_figures_are_those_of_the_file_that_the_suite_ships():
+    shipped = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
+
+    assert shipped[PLAIN] == figures_of(PLAIN)
+    assert {} == figures_of("no/such")
 
 
 def test_what_cannot_be_drawn_fails_alone(altered):

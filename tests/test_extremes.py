@@ -1,9 +1,14 @@
-"""Scenes at the extremes: from PLY to file, back, and to pictures. Figures and words stand in codec/EXTREMES.md."""
+"""Scenes at the extremes: from PLY to file, back, and to pictures. Figures and words stand in codec/EXTREMES.md.
+
+Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, learning
+is tried on three; all others, and the million splats, are in the area `extremes`.
+"""
 
 import numpy as np
 import pytest
 from extremes import (
     CONDITIONS,
+    COPIES,
     COUNT,
     DRAWN,
     FAR,
@@ -14,31 +19,47 @@ from extremes import (
     guide_rows,
     judge,
     scene,
-    write_scene,
 )
 
 pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[render]'")
+pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
+
+# Importing it needs what is looked for above.
+from extremes_chain import LEARNT, assert_finite, chain_of
 
 from csplat import decode, read_ply, write_ply
 from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder.measure import measure_errors
-from csplat.errors import InputError, LimitError
-from csplat.ply import lint_ply
+from csplat.errors import LimitError
 from csplat_conformance.stated import Source, prove
 from csplat_render import render
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.virtual import virtual_cameras
 
-pytestmark = pytest.mark.extremes
+pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.xdist_group("extremes")]
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 QUALITIES = {10.0: 12.0, 120.0: 44.0}  # dB that are asked of each attribute, and that the pictures keep at least
+THROUGHOUT = ("needles", "half the rows NaN")  # with every preset and quality in the usual tests
+LONG = pytest.mark.area(name="extremes")
+MOST = [pytest.param(name, marks=() if name in THROUGHOUT else LONG) for name in DRAWN]
 
 
-def assert_finite(picture):
-    for name in ("rgb", "alpha", "depth"):
-        assert np.isfinite(getattr(picture, name)).all(), name
-    assert 0.0 <= picture.alpha.min() <= picture.alpha.max() <= 1.0
+@pytest.fixture(scope="module")
+def chains(once):
+    """Every condition after all stages."""
+    return once("extremes", lambda: {name: chain_of(name) for name in NAMES})
+
+
+def assert_each(chains, check):
+    """Call a check with the name and the chain of each condition; fail with the names of those that it fails for."""
+    failures = {}
+    for name, chain in chains.items():
+        try:
+            check(name, chain)
+        except AssertionError as error:
+            failures[name] = str(error)
+    assert {} == failures
 
 
 def assert_proved(name, result):
@@ -50,80 +71,127 @@ def assert_proved(name, result):
     return decoded
 
 
-# reading
+def assert_picture_is_finite(picture):
+    for name in ("rgb", "alpha", "depth"):
+        assert np.isfinite(getattr(picture, name)).all(), name
+    assert 0.0 <= picture.alpha.min() <= picture.alpha.max() <= 1.0
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_reader_repairs_what_is_safe_and_strict_refuses_it(name, tmp_path):
-    condition = CONDITIONS[name]
-    model, findings = scene(name)
-    path = write_scene(tmp_path, name)
-    assert condition.repairs == tuple(one.id for one in findings if one.kind == "repair")
-    assert len(condition.make()["means"]) - condition.dropped == len(model)
-    if not condition.repairs:
-        assert len(model) == len(read_ply(path, strict=True))
-        return
-    with pytest.raises(InputError, match=condition.repairs[0]):
-        read_ply(path, strict=True)
-    assert condition.repairs == tuple(one.id for one in lint_ply(path) if one.kind == "repair")
+# each condition
 
 
-# files
+def test_a_reader_repairs_what_is_safe_and_strict_refuses_it(chains):
+    def check(name, chain):
+        repairs = CONDITIONS[name].repairs
+        assert repairs == tuple(one.id for one in chain.findings if one.kind == "repair")
+        assert repairs == chain.linted
+        assert (repairs[0] in chain.refusal) if repairs else (chain.refusal == "")
+        wanted = COUNT - CONDITIONS[name].dropped
+        assert {"one splat": 1, "a million identical": COPIES}.get(name, wanted) == len(chain.source)
+
+    assert_each(chains, check)
+
+
+def test_decoded_scenes_lie_within_the_stated_errors(chains):
+    def check(_, chain):
+        assert ((), True) == (chain.proof.failures, chain.proof.rms_proved)
+        assert list(range(len(chain.source))) == sorted(chain.result.source_index.tolist())
+        assert chain.source.origin == chain.decoded.origin
+
+    assert_each(chains, check)
+
+
+def test_the_stated_maxima_are_proved_without_an_index_too(chains):
+    def check(name, chain):
+        data = chain.result.data
+        if name in DRAWN:
+            assert (
+                ()
+                == prove(Source.of(chain.source), chain.decoded, read_header(data), read_stated_errors(data)).failures
+            )
+
+    assert_each(chains, check)
+
+
+def test_decoded_scenes_survive_a_ply(chains, tmp_path):
+    def check(_, chain):
+        decoded = chain.decoded
+        write_ply(tmp_path / "back.ply", decoded)
+        again = read_ply(tmp_path / "back.ply", strict=True)
+        assert decoded.origin == again.origin
+        for array in ("means", "scales", "sh0", "shN"):
+            np.testing.assert_array_equal(getattr(decoded, array), getattr(again, array), array)
+        np.testing.assert_allclose(decoded.quats, again.quats, atol=1e-6)
+        np.testing.assert_allclose(decoded.opacities, again.opacities, atol=1e-6)
+
+    assert_each(chains, check)
+
+
+def test_pictures_of_source_and_file_are_finite(chains):
+    def check(_, chain):
+        for picture in chain.pictures:
+            assert_picture_is_finite(picture)
+
+    assert_each(chains, check)
+
+
+def test_a_little_learning_leaves_splats_finite_and_brings_the_loss_down(chains):
+    def check(name, chain):
+        if name not in LEARNT:
+            return
+        learnt = chain.learnt
+        assert len(chain.source) // 2 == len(learnt.half)
+        assert_finite(learnt.half)
+        assert COUNT == len(learnt.trained)
+        assert_finite(learnt.trained)
+        assert np.mean(learnt.losses[-10:]) < 0.98 * np.mean(learnt.losses[:10])
+        if name == "exploded":
+            assert "colours are too large to be tuned" in learnt.tuned
+        else:
+            assert_finite(learnt.tuned)
+
+    assert_each(chains, check)
+
+
+def test_identical_splats_come_back_identical(chains):
+    chain = chains["a million identical"]
+    assert len(chain.result.data) < 3_000
+    for array in ARRAYS:
+        values = getattr(chain.decoded, array)
+        assert (values == values[0]).all(), array
+    assert (0.0, 0.0) == measure_errors(chain.source, chain.decoded, np.arange(COPIES))["means"]
+
+
+def test_lint_names_exploded_splats_and_no_others(chains):
+    noted = {name: [one.count for one in chains[name].findings if one.id == "huge-values"] for name in NAMES}
+    assert {name: [8] if name == "exploded" else [] for name in NAMES} == noted
+
+
+# presets and qualities
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", NAMES)
-def test_what_is_decoded_lies_within_the_stated_errors(name, preset):
+@pytest.mark.parametrize("name", [*MOST, pytest.param("a million identical", marks=LONG)])
+def test_each_preset_lies_within_the_stated_errors(name, preset):
     if (name, preset) == ("a million identical", "small"):
         pytest.skip("a scene of SH degree 0 takes the same path as with balanced")
     result = encoded(name, preset)
     decoded = assert_proved(name, result)
-    assert sorted(result.source_index.tolist()) == list(range(len(scene(name)[0])))
+    assert list(range(len(scene(name)[0]))) == sorted(result.source_index.tolist())
     assert scene(name)[0].origin == decoded.origin
-
-
-@pytest.mark.parametrize("name", DRAWN)
-def test_the_stated_maxima_are_proved_without_an_index_too(name):
-    source, result = scene(name)[0], encoded(name, "balanced")
-    proof = prove(Source.of(source), decode(result.data), read_header(result.data), read_stated_errors(result.data))
-    assert () == proof.failures
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", MOST)
 def test_the_ends_of_quality_hold_what_they_state(name, preset, quality):
     decoded = assert_proved(name, encoded(name, preset, quality))
     if preset == "balanced" and name != "exploded":  # of which any step moves the edges of infinitely bright splats
         assert judge(name, (160, 120)).psnr(decoded) >= QUALITIES[quality]
 
 
-@pytest.mark.parametrize("name", DRAWN)
-def test_a_decoded_scene_survives_a_ply(name, tmp_path):
-    decoded = decode(encoded(name, "balanced").data)
-    write_ply(tmp_path / "back.ply", decoded)
-    again = read_ply(tmp_path / "back.ply", strict=True)
-    assert decoded.origin == again.origin
-    for array in ("means", "scales", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(decoded, array), getattr(again, array), array)
-    np.testing.assert_allclose(decoded.quats, again.quats, atol=1e-6)
-    np.testing.assert_allclose(decoded.opacities, again.opacities, atol=1e-6)
-
-
-# pictures
-
-
-@pytest.mark.parametrize("name", DRAWN)
-def test_pictures_of_source_and_file_are_finite(name):
-    source, decoded = scene(name)[0], decode(encoded(name, "balanced").data)
-    for camera in virtual_cameras(source, 3, 80, 60):
-        for model in (source, decoded):
-            for mode in ("fast", "exact"):
-                assert_finite(render(model, camera, mode=mode))
-
-
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "needles" else LONG) for name in DRAWN])
 def test_pictures_are_as_good_as_the_guide_says(name, preset):
     size, psnr = guide_figures()[name][PRESETS.index(preset)]
     result = encoded(name, preset)
@@ -159,7 +227,7 @@ def test_an_origin_is_told_from_coordinates_in_doubles(tmp_path):
 
 
 def test_pictures_lose_little_ten_kilometres_away():
-    """The same camera, moved along: float32 coordinates cost 45 dB at worst, an origin nothing."""
+    """Float32 coordinates cost 45 dB at worst, an origin nothing, as the same camera moved along shows."""
     K = intrinsics(160, 120, 60.0)
     near, far = (
         render(scene(name)[0], look_at(np.array([0.0, -1.0, 3.0]) + at, np.full(3, at), (0, -1, 0), K, 160, 120)).rgb
@@ -168,6 +236,7 @@ def test_pictures_lose_little_ten_kilometres_away():
     assert 45.0 <= -10.0 * np.log10(np.square(near - far).mean()) < 80.0
 
 
+@LONG
 def test_a_million_identical_splats_are_a_few_kilobytes():
     source = scene("a million identical")[0]
     for preset in PRESETS:
@@ -180,6 +249,7 @@ def test_a_million_identical_splats_are_a_few_kilobytes():
         assert measure_errors(source, decoded, np.arange(len(source)))["means"] == (0.0, 0.0)
 
 
+@LONG
 def test_a_million_identical_splats_are_drawn_small_and_refused_large():
     source = scene("a million identical")[0]
     K = intrinsics(48, 36, 60.0)
@@ -188,7 +258,7 @@ def test_a_million_identical_splats_are_drawn_small_and_refused_large():
     camera = look_at(eye, source.means[0], (0, -1, 0), K, 48, 36)
     pictures = [render(model, camera) for model in (source, decode(encoded("a million identical", "fast").data))]
     for picture in pictures:
-        assert_finite(picture)
+        assert_picture_is_finite(picture)
         assert picture.alpha.max() > 0.999
     assert np.square(np.clip(pictures[0].rgb, 0, 1) - np.clip(pictures[1].rgb, 0, 1)).mean() < 1e-3
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
@@ -218,11 +288,6 @@ def test_exploded_splats_harm_no_others(preset):
     assert errors["sh1"][0] <= 2.0 * steps["sh_step"]
     scales = np.sort(decoded.scales[rest], axis=1) - np.sort(source.scales[result.source_index[rest]], axis=1)
     assert np.abs(scales).max() <= 0.51 * steps["scale_step"]
-
-
-def test_lint_names_exploded_splats_and_no_others():
-    noted = {name: [one.count for one in scene(name)[1] if one.id == "huge-values"] for name in NAMES}
-    assert noted == {name: [8] if name == "exploded" else [] for name in NAMES}
 
 
 def test_the_guide_names_every_condition():

@@ -17,7 +17,11 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from csplat import read_ply
 from csplat_tools.cli.app import app
 
-pytestmark = [pytest.mark.extremes, pytest.mark.usefixtures("small_views")]
+pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
+
+LONG = pytest.mark.area(name="extremes")
+FEW = ("--views", 3, "--view-size", "40x30", "--effort", 1)
+USUAL = ("half the rows NaN", "exploded")  # conditions of the usual tests: a repair, and a note of the encoder
 
 
 def run(*words):
@@ -42,7 +46,7 @@ def names_in(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in USUAL else LONG) for name in DRAWN])
 def test_the_whole_chain(name, tmp_path):
     ply, file, back = write_scene(tmp_path, name), tmp_path / "scene.csplat", tmp_path / "back.ply"
     condition = CONDITIONS[name]
@@ -65,7 +69,7 @@ def test_the_whole_chain(name, tmp_path):
     assert ["0000.depth.npy", "0000.png", "0001.depth.npy", "0001.png"] == names_in(tmp_path / "pictures")
     assert np.isfinite(np.load(tmp_path / "pictures" / "0000.depth.npy")).all()
 
-    done = run("simplify", ply, tmp_path / "half.ply", "--keep", 0.5, "--views", 3, "--json")
+    done = run("simplify", ply, tmp_path / "half.ply", "--keep", 0.5, *FEW, "--json")
     assert 0 == done.exit_code
     assert json.loads(done.stdout)["splats"] == len(read_ply(tmp_path / "half.ply", strict=True))
 
@@ -78,6 +82,7 @@ def test_strict_refuses_in_one_line_and_writes_nothing(name, tmp_path):
     assert 1 == run("lint", ply).exit_code
 
 
+@LONG
 def test_a_million_identical_splats_become_a_file_that_is_too_much_for_a_picture(tmp_path):
     ply, file = write_scene(tmp_path, "a million identical"), tmp_path / "scene.csplat"
     assert 0 == run("encode", ply, file, "--preset", "fast").exit_code

@@ -1,4 +1,8 @@
-"""Scenes at the extremes: simplified, trained on, tuned. Figures and words stand in codec/EXTREMES.md."""
+"""Scenes at the extremes: simplified, trained on, tuned. Figures and words stand in codec/EXTREMES.md.
+
+The usual tests refuse what cannot be learnt from, and see that a little learning survives (test_extremes.py); how good
+it gets is in the area `extremes`.
+"""
 
 from dataclasses import replace
 
@@ -43,7 +47,13 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.tuning import renders_of, split_views, tune
 
-pytestmark = [pytest.mark.extremes, pytest.mark.usefixtures("small_views")]
+pytestmark = [
+    pytest.mark.extremes,
+    pytest.mark.slow,
+    pytest.mark.usefixtures("small_views"),
+    pytest.mark.xdist_group("extremes"),
+]
+LONG = pytest.mark.area(name="extremes")
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -61,6 +71,7 @@ def told(name, column):
 # simplification
 
 
+@LONG
 @pytest.mark.parametrize("name", NAMES)
 def test_half_the_splats_keep_what_the_guide_says(name):
     source, found = learnt_from(name), half(name)
@@ -70,6 +81,7 @@ def test_half_the_splats_keep_what_the_guide_says(name):
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
 
 
+@LONG
 @pytest.mark.parametrize("name", NAMES)
 def test_a_simplified_file_states_what_holds(name):
     source = learnt_from(name)
@@ -84,6 +96,7 @@ def test_a_simplified_file_states_what_holds(name):
     assert_finite(decoded)
 
 
+@LONG
 @pytest.mark.parametrize(
     ("name", "most"), [("all transparent", 0.1), ("saturated SH", 1.0), ("a million identical", 0.25)]
 )
@@ -94,6 +107,7 @@ def test_a_target_psnr_is_reached(name, most):
     assert len(found.model) <= most * len(source)
 
 
+@LONG
 def test_a_fit_that_saturated_colours_mislead_is_refused():
     """The fit counts colours beyond 1 as they are, pictures do not show them."""
     found = simplify(learnt_from("saturated SH"), keep=0.97, options=FEW)
@@ -101,6 +115,7 @@ def test_a_fit_that_saturated_colours_mislead_is_refused():
     assert found.report["refit_refused"]
 
 
+@LONG
 def test_measured_importances_serve_what_stands_before_a_giant_background():
     """By opacity and size the background owns the codebook."""
     source = learnt_from("giant background")
@@ -116,6 +131,7 @@ def test_measured_importances_serve_what_stands_before_a_giant_background():
     assert found[1] == pytest.approx(40.4, abs=2.5)  # how 300 splats cluster turns on the last digit of a weight
 
 
+@LONG
 def test_a_pile_of_identical_splats_wants_a_finer_quality():
     """What alpha errs by adds up: the figures of the guide."""
     source, judged = learnt_from("a million identical"), small_judge("a million identical")
@@ -128,6 +144,7 @@ def test_a_pile_of_identical_splats_wants_a_finer_quality():
 # training
 
 
+@LONG
 @pytest.mark.parametrize("name", NAMES)
 def test_training_begins_at_centres_and_brings_the_loss_down(name):
     result = trained(name)
@@ -137,6 +154,7 @@ def test_training_begins_at_centres_and_brings_the_loss_down(name):
     assert np.mean(losses[-10:]) < 0.92 * np.mean(losses[:10])
 
 
+@LONG
 @pytest.mark.parametrize("name", ["giant background", "float32 limits", "exploded", "a million identical"])
 def test_splitting_and_cloning_keep_splats_finite(name):
     """The gradient strategy draws the halves of a split from its shape, however large."""
@@ -146,6 +164,7 @@ def test_splitting_and_cloning_keep_splats_finite(name):
     assert len(result.model) > COUNT
 
 
+@LONG
 @pytest.mark.parametrize("name", ["10 km away", "giant background", "all transparent", "half the rows NaN"])
 def test_training_begins_in_a_box(name):
     result = train(photographs(name), QUICK)
@@ -153,6 +172,7 @@ def test_training_begins_in_a_box(name):
     assert result.log["losses"][-1] <= result.log["losses"][0]
 
 
+@LONG
 def test_training_learns_transparency():
     assert trained("all transparent").metrics["psnr_mean"] > 40.0
 
@@ -186,6 +206,7 @@ def test_points_that_are_not_finite_are_refused_and_left_out_of_files(tmp_path):
 # fine-tuning
 
 
+@LONG
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "exploded"])
 def test_a_tuned_file_is_no_worse_than_before(name):
     _, result, aside = tuned(name)
@@ -199,14 +220,10 @@ def test_a_tuned_file_is_no_worse_than_before(name):
 
 
 def test_splats_wider_than_float32_are_tuned():
+    """Their standard deviation is e^100."""
     source = learnt_from("needles").select(slice(40))
     source = replace(source, scales=np.full_like(source.scales, 100.0))
     views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, aside=2)
     frozen = Draft.of(source, COARSE).frozen()
     result = tune(frozen, views, replace(SHORT, iterations=20))
     assert_finite(decode(frozen.coded(result.held).write().data))
-
-
-def test_colours_that_square_beyond_float32_are_refused_before_anything_is_tuned():
-    with pytest.raises(InputError, match="colours are too large to be tuned"):
-        tuned("exploded", 6)

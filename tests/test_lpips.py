@@ -9,7 +9,7 @@ pytest.importorskip("numba", reason="the convolution wants the extra [render]")
 
 from csplat.errors import InputError
 from csplat_render import lpips as module
-from csplat_render.lpips import Lpips, load_lpips, save_lpips
+from csplat_render.lpips import Lpips, load_lpips, load_torch_lpips, save_lpips
 
 
 @pytest.fixture
@@ -70,17 +70,18 @@ def test_the_environment_and_the_cache_name_weights(tmp_path, monkeypatch, rando
 def test_absent_weights_are_said_to_be_absent(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
-    monkeypatch.setattr(module, "_from_torch", lambda: None)
+    monkeypatch.setattr(importlib.util, "find_spec", {}.get)  # torch is absent
     with pytest.raises(InputError, match="no LPIPS weights"):
         load_lpips()
 
 
 def test_without_torch_its_cache_is_not_looked_for(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
-    assert module._from_torch() is None
+    assert load_torch_lpips() is None
 
 
-def test_torch_files_hold_the_same_weights(tmp_path, monkeypatch, random_weights):
+@pytest.mark.area(name="torch")
+def test_torch_files_hold_the_same_weights(tmp_path, random_weights):
     torch = pytest.importorskip(
         "torch", reason="its cache is read where torch is installed: pip install 'csplat[train]'"
     )
@@ -95,9 +96,7 @@ def test_torch_files_hold_the_same_weights(tmp_path, monkeypatch, random_weights
         f"lin{i}.model.1.weight": torch.from_numpy(h).reshape(1, -1, 1, 1) for i, h in enumerate(random_weights.heads)
     }
     torch.save(heads, tmp_path / "alex.pth")
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    monkeypatch.setattr(module, "_heads_path", lambda: tmp_path / "alex.pth")
-    found = module._from_torch()
+    found = load_torch_lpips(tmp_path, tmp_path / "alex.pth")
     assert found is not None
     a = np.random.default_rng(0).random((40, 40, 3))
     assert random_weights(a, a * 0.9) == found(a, a * 0.9)

@@ -9,7 +9,7 @@ from chromium import absent
 from csplat.errors import InputError
 from csplat_conformance.manifest import load
 from csplat_conformance.mutation import __main__ as command
-from csplat_conformance.mutation import judging, python
+from csplat_conformance.mutation import judging
 from csplat_conformance.mutation.javascript import JavaScriptDecoder
 from csplat_conformance.mutation.mutants import Fate, Mutant, Result, sample, score, table
 from csplat_conformance.mutation.native import NativeDecoder
@@ -19,8 +19,13 @@ from csplat_conformance.mutation.tokens import c_mutants
 from csplat_conformance.native import missing_c
 from csplat_conformance.node import missing_javascript
 
+pytestmark = pytest.mark.slow  # together: tests of the mutants
+
 BY_NAME = {vector.name: vector for vector in load()}
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
+
+#: Tests that take long: they run when the suite or a decoder changes.
+in_depth = pytest.mark.area(name="suite")
 
 
 @pytest.fixture
@@ -114,10 +119,11 @@ def test_a_mutant_that_changes_nothing_is_the_same(few):
     assert (Fate.SAME, "") == (result.fate, result.by)
 
 
-def test_a_mutant_that_hangs_is_caught(few, monkeypatch):
+@in_depth
+@pytest.mark.slow
+def test_a_mutant_that_hangs_is_caught(few):
     few("valid/means_morton")
-    monkeypatch.setattr(python, "_PROCESSOR_SECONDS", 1)
-    decoder = PythonDecoder([])
+    decoder = PythonDecoder([], processor_seconds=1)
     one = mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted")
 
     result = decoder.attempt(replace(one, new="while True: pass"))
@@ -161,6 +167,8 @@ def test_survivors_stand_in_a_table_and_the_score_counts_what_can_be_seen():
 
 
 @needs_node
+@in_depth
+@pytest.mark.slow
 def test_javascript_is_changed_by_its_syntax(few, monkeypatch):
     monkeypatch.setenv("npm_config_offline", "true")  # the parser is used where the type check has brought it
     decoder = JavaScriptDecoder([])
@@ -198,6 +206,8 @@ def test_each_token_of_c_is_changed_alone(text, changed):
     assert changed == {one.apply(text) for one in c_mutants("a.c", text)}
 
 
+@in_depth
+@pytest.mark.slow
 def test_c_is_compiled_and_changed(few):
     if missing_c():
         absent(missing_c())

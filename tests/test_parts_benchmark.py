@@ -6,6 +6,8 @@ import pytest
 import csplat
 from csplat_bench.codec.parts import measured, middle_box
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 
 @pytest.fixture(scope="module")
 def path(sample_path, tmp_path_factory):

@@ -17,6 +17,8 @@ from csplat_bench.common.command import run
 from csplat_bench.photographs.__main__ import main
 from csplat_tools.cli.app import app
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 CONFIG = """
 title = "dots"
 size = "24x16"

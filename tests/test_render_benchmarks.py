@@ -19,6 +19,8 @@ from csplat_bench.viewer.rules import Engine
 from csplat_render import render
 from csplat_render.virtual import virtual_cameras
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 
 @pytest.fixture(scope="module")
 def sample(sample_path):

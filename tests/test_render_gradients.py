@@ -46,6 +46,7 @@ def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
     assert most(errors) <= 1e-6, errors
 
 
+@pytest.mark.area(name="torch")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gradients_are_those_of_autograd(degree, antialiased):

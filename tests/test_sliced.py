@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,23 +18,15 @@ from csplat.errors import InputError
 from csplat.scene import scene_of
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.judge import renderer
+from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
-from csplat_tools.files import scenes
 from csplat_tools.files.scenes import LoadedModel, OpenedScene, opened_scenes
-from csplat_tools.views import comparison_cameras, sliced
+from csplat_tools.views import comparison_cameras
 from csplat_tools.views.sliced import Sliced, slice_limits
 
 UP = (0.0, -1.0, 0.0)
 BEHIND = (0.3, 0.6, 0.1)
 LITTLE = 1  # byte of memory
-
-
-@pytest.fixture(autouse=True)
-def small_slices(monkeypatch):
-    """So that small scenes have many: 100 splats of SH degree 1, more or less."""
-    monkeypatch.setattr(sliced, "_LEAST_BYTES", 60_000)
-    monkeypatch.setattr("csplat.scene.BLOCK", 300)
-    monkeypatch.setattr(Sliced, "least_bytes", -(10**12))
 
 
 @pytest.fixture
@@ -66,21 +58,35 @@ def files_of_both(model, tmp_path):
     return str(source), str(made), str(index)
 
 
-def by_disk(model, every=1):
-    scene = scene_of(model)
-    return Sliced(scene, model.select(slice(None, None, every)), every, LITTLE)
+@pytest.fixture
+def no_least(monkeypatch):
+    """Let any bound of memory do: small scenes fit each that is accepted otherwise."""
+    monkeypatch.setattr(Sliced, "least_bytes", -(10**12))
 
 
-def slices_of(monkeypatch):
-    """How many splats each slice has that will be drawn."""
-    counts, draw = [], sliced._Picture._draw
+def by_disk(model, every=1, progress=None):
+    """A scene in blocks of 300 splats, drawn in slices of about 100."""
 
-    def noted(picture, splats):
-        counts.append(len(splats.means))
-        draw(picture, splats)
+    def blocks():
+        return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
 
-    monkeypatch.setattr(sliced._Picture, "_draw", noted)
-    return counts
+    scene = replace(scene_of(model), blocks=blocks)
+    sample = model.select(slice(None, None, every))
+    return Sliced(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
+
+
+@pytest.fixture
+def counts(monkeypatch):
+    """The number of splats in each slice that is drawn."""
+    found, forward = [], Rasteriser.forward
+
+    def noted(rasteriser, splats, *words, state=None, **named):
+        if state is not None:
+            found.append(len(splats.means))
+        return forward(rasteriser, splats, *words, state=state, **named)
+
+    monkeypatch.setattr(Rasteriser, "forward", noted)
+    return found
 
 
 def assert_same_picture(model, view, every=1, mode="standard"):
@@ -96,30 +102,26 @@ def assert_same_picture(model, view, every=1, mode="standard"):
 
 @pytest.mark.parametrize("mode", ["standard", "fast"])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_pictures_are_those_of_memory_to_the_bit(model, view, monkeypatch, mode, antialiased):
-    counts = slices_of(monkeypatch)
+def test_pictures_are_those_of_memory_to_the_bit(model, view, counts, mode, antialiased):
     assert_same_picture(replace(model, antialiased=antialiased), view, mode=mode)
     assert len(counts) > 5
     assert max(counts) < 300
 
 
-def test_a_sample_that_knows_little_changes_no_bit(model, view, monkeypatch):
-    counts = slices_of(monkeypatch)
+def test_a_sample_that_knows_little_changes_no_bit(model, view, counts):
     assert_same_picture(model, view, every=700)
     assert max(counts) < 300
 
 
 @pytest.mark.parametrize("crowd", [1500, 900])
-def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, monkeypatch):
+def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, counts):
     means = model.means.copy()
     means[:crowd, 2] = 0.25
-    counts = slices_of(monkeypatch)
     assert_same_picture(replace(model, means=means), view)
     assert max(counts) < 300
 
 
-def test_what_lies_behind_finished_pixels_is_not_drawn(model, view, monkeypatch):
-    counts = slices_of(monkeypatch)
+def test_what_lies_behind_finished_pixels_is_not_drawn(model, view, counts):
     wall = np.arange(len(model)) < 20
     means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
     means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
@@ -161,10 +163,9 @@ def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
             assert {LoadedModel} == {type(one) for one in both}
 
 
-def test_a_sample_has_every_so_manieth_splat(files_of_both, model, monkeypatch):
-    monkeypatch.setattr(scenes, "_SAMPLE", 220)
+def test_a_sample_has_every_so_manieth_splat(files_of_both, model):
     with opened_scenes(files_of_both[:2], LITTLE) as (source, _):
-        found, every = source.sample()
+        found, every = replace(source, sample_splats=220).sample()
     assert 7 == every
     np.testing.assert_array_equal(model.means[::7], found.means)
     assert 0 == found.sh_degree
@@ -181,6 +182,7 @@ def test_views_placed_by_a_sample_stand_about_where_the_scene_puts_them(sample_p
 # comparisons
 
 
+@pytest.mark.usefixtures("no_least")
 def test_comparing_finds_what_memory_finds(files_of_both, camera_file, tmp_path):
     source, made, index = files_of_both
     words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
@@ -200,6 +202,7 @@ def test_comparing_finds_what_memory_finds(files_of_both, camera_file, tmp_path)
     assert [one.read_bytes() for one in shown] == [one.read_bytes() for one in also]
 
 
+@pytest.mark.usefixtures("no_least")
 def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
     source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
     write_ply(source, model)
@@ -213,6 +216,7 @@ def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, t
     }
 
 
+@pytest.mark.usefixtures("no_least")
 def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camera_file):
     source, made, _ = files_of_both
     result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file, "--memory", "1kB"])
@@ -220,6 +224,7 @@ def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camer
     assert "errors of the splats are not known" in result.stdout
 
 
+@pytest.mark.usefixtures("no_least")
 def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both):
     result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--memory", "1kB", "--mode", "exact"])
     assert 1 == result.exit_code
@@ -228,6 +233,7 @@ def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both
     ]
 
 
+@pytest.mark.usefixtures("no_least")
 def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, monkeypatch):
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
@@ -244,11 +250,10 @@ def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
 def test_nothing_is_left_where_drawing_ends_early(model, view, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
-    def interrupted(*_):
-        raise KeyboardInterrupt
+    def interrupted(_, share):
+        if share > 0.61:  # the first slice was read from the disk and drawn
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(sliced._Picture, "_read", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        renderer(by_disk(model), BEHIND)(view)
+        renderer(by_disk(model, progress=interrupted), BEHIND)(view)
     assert [] == list(Path(tmp_path).iterdir())
-    assert {"scene", "sample", "every", "memory_bytes", "progress"} == {one.name for one in fields(Sliced)}

@@ -224,6 +224,7 @@ def test_colours_there_and_back(spec):
         assert tuple(rgb) == spec.rgb_from_ycocg(*spec.ycocg_from_rgb(*rgb, 0), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels", [3, 4, 5, 127, 32767])
 def test_rotations_there_and_back(spec, levels):
     rng = np.random.default_rng(levels)

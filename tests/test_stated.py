@@ -117,6 +117,7 @@ def test_the_worst_splat_is_the_one_with_the_largest_error():
         assert found.max == pytest.approx(max(map(abs, errors)), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.5, 3.0, 7.0])
 def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
     # SER-7: the rooms are wide enough for statements that were computed in single precision throughout

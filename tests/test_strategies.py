@@ -269,30 +269,32 @@ def test_a_file_is_the_same_each_time(source):
     assert encode_reduced(source, reduction).data == encode_reduced(source, reduction).data
 
 
+@pytest.mark.slow
 def test_a_distilled_degree_looks_more_like_the_source(shell):
+    from captures import cameras, views_of
+
+    from csplat_render.judge import Judge
+
     truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(attribute_psnr=60.0))
-    reduction = Reduction(sh_degree=0, distil=True, views=40)
-    distilled = encode_reduced(shell, reduction, EncodeOptions(attribute_psnr=60.0))
+    reduction = Reduction(sh_degree=0, distil=True)
+    views = views_of(cameras(24))
+    distilled = encode_reduced(shell, reduction, EncodeOptions(attribute_psnr=60.0), views=views)
     scene = stored(shell, distilled)
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
     assert scene.stated_errors.refitted
     said = scene.options["reduced"]
-    assert ("distilled", 51) == (said["sh"], said["views"])
-    assert said["check_psnr"] == pytest.approx(psnr(shell, distilled.data), abs=3.0)
-    assert psnr(shell, distilled.data) > psnr(shell, truncated.data) + 1.0
-
-
-def psnr(source, data):
-    from csplat_render.judge import Judge
-    from csplat_tools.views import camera_sequence
-
-    cameras = camera_sequence(source, 8, (96, 72), seed=5)
-    return Judge.of_source(source, cameras, (0.0, 0.0, 0.0)).psnr(decode(data))
+    assert ("distilled", 21) == (said["sh"], said["views"])
+    judge = Judge.of_source(shell, views.decides, (0.0, 0.0, 0.0))
+    before, after = (judge.psnr(decode(one.data)) for one in (truncated, distilled))
+    assert said["check_psnr"] == pytest.approx(after, abs=0.5)
+    assert after > before + 1.0
 
 
 def test_distilled_and_clustered_colours_state_no_error(shell):
-    reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=parse_kmeans("64"), views=16)
-    scene = stored(shell, encode_reduced(shell, reduction))
+    from captures import cameras, views_of
+
+    reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=parse_kmeans("64"))
+    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(cameras(9))))
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
     assert {"kmeans", "check_psnr", "views", "prune_opacity"} <= set(scene.options["reduced"])
     assert 64 >= len(np.unique(np.round(scene.model.opacities, 5)))

@@ -25,6 +25,8 @@ from csplat_bench.study.tables import MIB, PUBLISHED
 from csplat_render.metrics import psnr
 from csplat_tools.study import Reduction
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -116,7 +118,6 @@ def run(folder, *words):
     return command(study.main, [*words, *quick, "--out", str(folder / "out"), "--plots", str(folder / "plots")])
 
 
-@pytest.mark.benchmark
 def test_everything_is_trained_measured_printed_and_drawn(small, capsys):
     assert 1 == run(small)  # what wants torch is left out, and that is said
     said = capsys.readouterr()

@@ -11,6 +11,8 @@ from csplat_bench.common.command import run as command
 from csplat_bench.targets import __main__ as targets
 from csplat_bench.targets.tables import Ratio, at_equal_psnr, dominated, kind_of, tables
 
+pytestmark = pytest.mark.area(name="benchmarks")
+
 
 def row(size, psnr, *, all_splats=True, seconds=1.0):
     return {"bytes": size, "psnr": psnr, "seconds": seconds, "all_splats": all_splats}
@@ -120,7 +122,6 @@ def run(kept, *words):
     return command(targets.main, ["--scenes", "sample", "--kept", str(kept), *words])
 
 
-@pytest.mark.benchmark
 def test_makes_what_is_missing_and_keeps_each_row(tmp_path, capsys):
     """The scene that ships, by presets alone; then nothing is left to do."""
     run(tmp_path, "--psnr", "", "--build", "before")

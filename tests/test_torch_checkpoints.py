@@ -1,8 +1,15 @@
-"""Checkpoints of gsplat and splatfacto as scenes; the same bytes without torch are an error that names the extra."""
+"""Checkpoints of gsplat and splatfacto as scenes; without torch they are an error that names the extra.
+
+`checkpoints/` holds one of each, five splats of SH degree 1, as torch 2.13 saved them. What is made of their tensors
+is tested without torch, for which `load_plainly` stands in; what torch makes of other files is in the area `torch`.
+"""
 
 import io
+import pickle
 import sys
 import zipfile
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +21,59 @@ from csplat.errors import InputError
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
+STORED = {name: Path(__file__).parent / "checkpoints" / name for name in ("gsplat.pt", "splatfacto.ckpt")}
+
+
+class PlainTensor(np.ndarray):
+    """An array with the one method of a tensor that the reader calls."""
+
+    def numel(self):
+        return self.size
+
+
+def tensor(values):
+    return np.asarray(values).view(PlainTensor)
+
+
+def load_plainly(path, **_):
+    """Read the tensors of a checkpoint as `torch.load` does, float32 and contiguous ones alone."""
+
+    class Reader(pickle.Unpickler):
+        def find_class(self, module, name):
+            if name == "_rebuild_tensor_v2":
+                return lambda values, first, shape, *_: tensor(values[first:][: np.prod(shape, dtype=int)]).reshape(
+                    shape
+                )
+            if name == "_rebuild_parameter":
+                return lambda values, *_: values
+            return name if module.startswith("torch") else super().find_class(module, name)
+
+        def persistent_load(self, said):
+            return np.frombuffer(archive.read(f"{folder}/data/{said[2]}"), "<f4")
+
+    with zipfile.ZipFile(path) as archive:
+        folder = archive.namelist()[0].partition("/")[0]
+        return Reader(io.BytesIO(archive.read(f"{folder}/data.pkl"))).load()
+
+
 @pytest.fixture
 def torch():
     return pytest.importorskip("torch", reason="checkpoints want torch (the train extra)")
+
+
+@pytest.fixture
+def no_torch(monkeypatch):
+    """A function that has torch replaced by what loads checkpoints plainly, or as it is given."""
+
+    def replace_by(load=load_plainly):
+        monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(__version__="2.5.0", load=load))
+
+    return replace_by
+
+
+def made_splats(make_model, degree):
+    """What gsplat has of a scene."""
+    return {name: tensor(values) for name, values in to_gsplat(make_model(5, degree)).items()}
 
 
 def saved(torch, said):
@@ -33,6 +90,93 @@ def of_splatfacto(splats, **changed):
     return {"step": 29999, "pipeline": {**named, **changed, "_model.camera_optimizer.pose_adjustment": splats["means"]}}
 
 
+def of_checkpoint(path):
+    """The five splats that were stored: normals of NumPy's generator of seed 0."""
+    rng = np.random.default_rng(0)
+    means, _, scales, opacities = (
+        rng.standard_normal((5, 3)),
+        rng.standard_normal((5, 4)),
+        rng.standard_normal((5, 3)),
+        rng.random(5),
+    )
+    model = csplat.read(path)
+    np.testing.assert_allclose(means, model.means, atol=1e-6)
+    np.testing.assert_allclose(scales - 4.0, model.scales, atol=1e-6)
+    np.testing.assert_allclose(opacities, model.opacities, atol=1e-6)
+    np.testing.assert_allclose(rng.standard_normal((5, 3)), model.sh0, atol=1e-6)
+    np.testing.assert_allclose(rng.standard_normal((5, 3, 3)), model.shN, atol=1e-6)
+    np.testing.assert_allclose(1.0, np.linalg.norm(model.quats, axis=1), atol=1e-6)
+
+
+# without torch
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_a_stored_checkpoint_is_the_scene_that_was_stored(no_torch, name):
+    no_torch()
+    of_checkpoint(STORED[name])
+
+
+def test_colours_that_splatfacto_trained_without_sh_are_logits(no_torch, make_model):
+    splats = made_splats(make_model, 0)
+    found = []
+    for said in ({"splats": splats}, of_splatfacto(splats)):
+        no_torch(lambda *_, said=said, **__: said)
+        found.append(csplat.read(STORED["gsplat.pt"]))
+    colours = 0.5 + 0.28209479177387814 * found[1].sh0
+    assert np.allclose(1.0 / (1.0 + np.exp(-found[0].sh0)), colours, atol=1e-6)
+    assert (found[0].means == found[1].means).all()
+
+
+def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model):
+    splats = made_splats(make_model, 1)
+    many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
+    for said, says in (
+        ([1], "it holds a list"),
+        ({"model": 3}, "it holds model: neither"),
+        ({"splats": {**splats, "means": many}}, "means is no tensor that the file can hold"),
+        ({"splats": {**splats, "means": "many"}}, "means is no tensor"),
+        ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
+        ({"splats": {"means": splats["means"]}}, "no quats"),
+        (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
+    ):
+        no_torch(lambda *_, said=said, **__: said)
+        with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{says}"):
+            csplat.read(STORED["gsplat.pt"])
+
+
+def test_what_torch_cannot_load_is_refused_in_one_line(no_torch):
+    for error, says in (
+        (pickle.UnpicklingError("Weights only load failed"), "holds objects of a program"),
+        (RuntimeError("PytorchStreamReader failed"), "is no whole checkpoint of torch"),
+    ):
+
+        def load(*_, error=error, **__):
+            raise error
+
+        no_torch(load)
+        with pytest.raises(InputError, match=rf"^gsplat\.pt {says}[^\n]*$"):
+            csplat.read(STORED["gsplat.pt"])
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_without_torch_the_extra_is_named(monkeypatch, name):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match=rf"{name} is a checkpoint of torch: .*csplat\[train\]"):
+        csplat.read(STORED[name])
+
+
+# with torch
+
+
+@pytest.mark.area(name="torch")
+@pytest.mark.usefixtures("torch")
+@pytest.mark.parametrize("name", STORED)
+def test_torch_reads_a_stored_checkpoint_as_the_plain_reader_does(name):
+    of_checkpoint(STORED[name])
+
+
+@pytest.mark.area(name="torch")
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_scene_comes_out_of_either(torch, make_model, degree):
     model = make_model(20, degree)
@@ -48,6 +192,7 @@ def test_a_scene_comes_out_of_either(torch, make_model, degree):
         assert np.allclose(1.0 / (1.0 + np.exp(-model.sh0)), colours, atol=1e-6)
 
 
+@pytest.mark.area(name="torch")
 def test_learning_rates_may_be_numbers_of_either_numpy(torch, make_model):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
@@ -58,6 +203,7 @@ def test_learning_rates_may_be_numbers_of_either_numpy(torch, make_model):
     assert len(csplat.read(whole)) == len(csplat.read(old.getvalue())) == 5
 
 
+@pytest.mark.area(name="torch")
 def test_what_is_no_scene_is_refused(torch, make_model, tmp_path):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     many = torch.zeros(1).expand(10**9, 3)
@@ -80,6 +226,7 @@ def test_what_is_no_scene_is_refused(torch, make_model, tmp_path):
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.area(name="torch")
 def test_damage_is_refused_or_read(torch, make_model, tmp_path):
     whole, path = saved(torch, {"splats": to_gsplat(make_model(3, 0), device="cpu")}), tmp_path / "a.ckpt"
 
@@ -95,11 +242,3 @@ def test_damage_is_refused_or_read(torch, make_model, tmp_path):
     assert all("a.ckpt" in read(whole[:size]) for size in range(0, len(whole), 311))
     for at in range(0, len(whole), 29):
         read(whole[:at] + bytes([whole[at] ^ (1 << at % 8)]) + whole[at + 1 :])
-
-
-def test_without_torch_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with zipfile.ZipFile(tmp_path / "a.bin", "w") as archive:
-        archive.writestr("archive/data.pkl", b"")
-    with pytest.raises(InputError, match=r"a\.bin is a checkpoint of torch: .*csplat\[train\]"):
-        csplat.read(tmp_path / "a.bin")

@@ -14,6 +14,8 @@ from csplat_trainer.parameters import GROUPS, Parameters, from_model
 from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.pictures import Picture
 
+pytestmark = pytest.mark.area(name="torch")
+
 
 @pytest.fixture
 def camera() -> Camera:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
 
-WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 30, "--set", "log_every=10")
+WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 5, "--set", "log_every=2")
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +33,18 @@ def headings(page):
     return re.findall("<h2>(.*?)</h2>", page)
 
 
-def test_a_page_about_a_training_and_its_file(folder, tmp_path):
-    path, report = tmp_path / "page.html", tmp_path / "report.json"
-    call("train", folder, "-o", tmp_path / "a.csplat", *WORDS, "--page", path, "--report", report)
-    page, said = path.read_text(), json.loads(report.read_text())
+@pytest.fixture(scope="module")
+def made(folder):
+    """The folder of a file with its scene, page and report."""
+    call("train", folder, "-o", folder / "a.ply", *WORDS, "--page", folder / "scene.html")
+    words = ("--keep", 1, "--page", folder / "file.html", "--report", folder / "file.json")
+    call("train", folder, "-o", folder / "a.csplat", *WORDS, *words)
+    return folder
+
+
+@pytest.mark.slow
+def test_a_page_about_a_training_and_its_file(made):
+    page, said = (made / "file.html").read_text(), json.loads((made / "file.json").read_text())
     assert [
         "How near it comes", "What it looks like", "The training", "The tuning", "Where the bytes are",
         "How it was made",
@@ -48,32 +56,31 @@ def test_a_page_about_a_training_and_its_file(folder, tmp_path):
     assert not re.search("(src|href)=.http", page)
 
 
-def test_a_page_about_a_training_alone(folder, tmp_path):
-    path = tmp_path / "page.html"
-    call("train", folder, "-o", tmp_path / "a.ply", *WORDS, "--page", path)
-    page = path.read_text()
+@pytest.mark.slow
+def test_a_page_about_a_training_alone(made):
+    page = (made / "scene.html").read_text()
     assert ["How near it comes", "What it looks like", "The training", "How it was made"] == headings(page)
     assert ["photograph", "trained scene"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
 
 
-def test_the_scene_s_scores_in_a_report_of_a_file_are_those_of_compare(folder, tmp_path):
-    report, compared = tmp_path / "report.json", tmp_path / "compared.json"
-    call("train", folder, "-o", tmp_path / "a.ply", *WORDS)
-    call("train", folder, "-o", tmp_path / "a.csplat", *WORDS, "--keep", 1, "--report", report)
-    call("compare", tmp_path / "a.ply", tmp_path / "a.csplat", "--data", folder, "--report", compared)
+@pytest.mark.slow
+def test_the_scene_s_scores_in_a_report_of_a_file_are_those_of_compare(made, tmp_path):
+    compared = tmp_path / "compared.json"
+    call("compare", made / "a.ply", made / "a.csplat", "--data", made, "--report", compared)
     judged = json.loads(compared.read_text())["photographs"]
     for name, one in (("source", "a"), ("file", "b")):
-        scores = json.loads(report.read_text())["file"]["scores"][name]
+        scores = json.loads((made / "file.json").read_text())["file"]["scores"][name]
         for score in ("psnr", "psnr_mean", "ssim"):
             assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_page_about_a_tuned_file(tmp_path, make_model):
     from csplat import write_ply
 
-    write_ply(tmp_path / "a.ply", make_model(60, 1))
+    write_ply(tmp_path / "a.ply", make_model(20, 1))
     path = tmp_path / "page.html"
-    words = ("--self", "--views", 16, "--view-size", "40x30", "--iterations", 20, "--page", path)
+    words = ("--self", "--views", 16, "--view-size", "40x30", "--iterations", 2, "--page", path)
     call("finetune", tmp_path / "a.ply", tmp_path / "a.csplat", *words)
     page = path.read_text()
     assert "by 8 renders of the source" in page.lower()

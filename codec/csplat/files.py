@@ -72,7 +72,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         with path.open("rb") as pipe, local_file(pipe) as copied:
             yield copied
             return
-    with TemporaryDirectory(prefix="csplat-") as folder:
+    with TemporaryDirectory(prefix="csplat-", ignore_cleanup_errors=True) as folder:  # Windows: it may be mapped yet
         said = getattr(file, "name", None)
         spool = Path(folder) / (name or (Path(said).name if isinstance(said, str) else "") or "data")
         with _named(spool), spool.open("wb") as stream:
@@ -174,7 +174,7 @@ def _take_name(temporary: Path, target: Path) -> None:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:  # no hard links here: the name is taken by an empty file, which the complete one replaces
+    except (OSError, AttributeError):  # no hard links here: an empty file takes the name, the complete one replaces it
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         temporary.replace(target)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap as mmaps
 import os
+import sys
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Protocol
@@ -47,7 +48,7 @@ class LetGo:
 
     Args:
         view: the file.
-        step_bytes: how much is read from one time that it is let go of to the next.
+        step_bytes: bytes that are read between two releases of the mapping.
     """
 
     def __init__(self, view: memoryview, step_bytes: int = 1 << 25) -> None:
@@ -60,6 +61,6 @@ class LetGo:
     def after(self, size_bytes: int) -> None:
         """Note that so much has been read, and let go of everything now and then."""
         self._read_bytes += size_bytes
-        if self._file is not None and self._read_bytes >= self._step_bytes:
+        if sys.platform != "win32" and self._file is not None and self._read_bytes >= self._step_bytes:
             self._read_bytes = 0
             self._file.madvise(mmaps.MADV_DONTNEED)

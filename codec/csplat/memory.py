@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,7 +22,7 @@ def available_bytes() -> int:
     found = [_of_machine()]
     for limit, current in _LIMITS:
         with suppress(OSError, ValueError):
-            found.append(int(Path(limit).read_text()) - int(Path(current).read_text()))
+            found.append(int(Path(limit).read_text("ascii")) - int(Path(current).read_text("ascii")))
     return max(0, min(found))
 
 
@@ -32,9 +33,10 @@ def default_bytes() -> int:
 
 def _of_machine() -> int:
     with suppress(OSError, ValueError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
+        for line in Path("/proc/meminfo").read_text("ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
-    with suppress(ValueError, OSError, AttributeError):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    with suppress(ValueError, OSError):
+        if sys.platform != "win32" and hasattr(os, "sysconf"):
+            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     return _UNKNOWN

@@ -5,11 +5,12 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
+
+from csplat.system import CAN_FORK
 
 __all__ = ["CAN_COPY", "each_apart"]
 
@@ -18,7 +19,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 #: Whether a process can go on as a copy of this one that has all of its memory.
-CAN_COPY = sys.platform == "linux"
+CAN_COPY = CAN_FORK
+
+_SPAWNED_MAX = 61  # processes of one pool that Windows can wait for
 
 _begun: list[Any] = []  # of a worker process: the function, and what all calls share
 
@@ -43,7 +46,8 @@ def each_apart(
         for item in items:
             yield item, work(shared, item)
         return
-    start = "fork" if copied else "forkserver" if sys.platform == "linux" else "spawn"
+    start = ("fork" if copied else "forkserver") if CAN_COPY else "spawn"
+    workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin, (work, shared))
     try:
         futures = {pool.submit(_call, item): item for item in items}

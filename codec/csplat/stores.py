@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ import numpy as np
 from csplat.decoder.container import view_of
 from csplat.errors import CsplatError, FormatError, LimitError, StoreError
 from csplat.inputs import File
+from csplat.system import Pages, read_at
 
 __all__ = ["Disk", "Memory", "RequestSizes", "Store", "Window"]
 
@@ -129,7 +129,7 @@ class Disk(Store):
         super().__init__(str(path), self._facts.st_size)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        return [os.pread(self._file.fileno(), stop - start, start) for start, stop in ranges]
+        return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
 
     def _is_other(self) -> bool:
         now = os.fstat(self._file.fileno())
@@ -156,13 +156,12 @@ class Window:
         self.store = store
         self._head = head
         self._here = [(0, len(head))]
-        flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
         try:
-            self._map = mmap.mmap(-1, store.size, flags=flags) if store.size else None
+            self._pages = Pages(store.size) if store.size else None
         except (OSError, OverflowError):
             raise LimitError("address space of this machine", store.size) from None
         # Of an array, so that nobody takes it for a mapped file, which can be read again once it is let go of.
-        self.view = np.frombuffer(self._map or bytearray(), np.uint8).data
+        self.view = np.frombuffer(self._pages.buffer if self._pages else bytearray(), np.uint8).data
         self.view[: len(head)] = head
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
@@ -184,8 +183,8 @@ class Window:
 
     def forget(self) -> None:
         """Let go of all that was fetched; nothing may look at it any more."""
-        if self._map is not None:
-            self._map.madvise(mmap.MADV_DONTNEED)
+        if self._pages is not None:
+            self._pages.discard()
         self.view[: len(self._head)] = self._head
         self._here = [(0, len(self._head))]
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -103,12 +104,16 @@ def _facts(header: Any) -> dict[str, Any]:
     }
 
 
-def main() -> int:
-    """Answer by the protocol: files and status 0, or a line of JSON and status 1."""
+def main(words: Sequence[str] | None = None) -> int:
+    """Answer by the protocol: files and status 0, or a line of JSON and status 1.
+
+    Args:
+        words: of the command line; those of this process if left out.
+    """
     parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("outdir", type=Path)
-    args = parser.parse_args()
+    args = parser.parse_args(words)
     try:
         header, arrays = _decoded(args.input.read_bytes(), None, None)
     except CsplatError as error:

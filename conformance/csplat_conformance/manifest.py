@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,13 @@ class Vector:
 
 
 def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
-    """Read the manifest."""
-    return [Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"]]
+    """Read the manifest; a file is read once in a process."""
+    return list(_loaded(path))
+
+
+@cache
+def _loaded(path: Path) -> tuple[Vector, ...]:
+    return tuple(Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"])
 
 
 def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:

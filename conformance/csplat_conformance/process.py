@@ -12,10 +12,7 @@ the caller's command line names: see `run_program`.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shlex
-import signal
 import subprocess
 import tempfile
 import time
@@ -25,11 +22,14 @@ from pathlib import Path
 from typing import IO
 
 from csplat.errors import InputError
+from csplat.system import kill_group, split_words
 from csplat_conformance.report import Status
 
 __all__ = ["Ended", "run_program", "split_command"]
 
 _OUTPUT_MAX = 1 << 20  # bytes of each stream that are kept: a program may print for ever
+_KILLED = 9  # SIGKILL, which Windows has no name for
+_WINDOWS_EXCEPTION = 0xC0000000  # least exit status of a Windows program that crashed; of others it is at most 255
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...
         InputError: quotes without an end, no program, a name in braces that is missing or unknown.
     """
     try:
-        words = shlex.split(command)
+        words = split_words(command)
         missing = [name for name in names if not any(f"{{{name}}}" in word for word in words)]
         for word in words:
             word.format(**dict.fromkeys((*names, *optional), ""))
@@ -92,7 +92,7 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float,
     """
     words = split_command(command, tuple(places))
     if cwd is not None:
-        words = [_absolute(words[0]) if os.sep in words[0] else words[0], *map(_found_from_anywhere, words[1:])]
+        words = [_absolute(words[0]) if _has_folder(words[0]) else words[0], *map(_found_from_anywhere, words[1:])]
     words = [word.format(**places) for word in words]
     start = time.perf_counter()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
@@ -107,15 +107,17 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float,
             returncode = process.wait(timeout_seconds)
         except subprocess.TimeoutExpired:
             status = Status.HUNG
-            returncode = -signal.SIGKILL
+            returncode = -_KILLED
         finally:
-            _kill_group(process)
+            kill_group(process)
         seconds = time.perf_counter() - start
         message = ""
         if status is Status.HUNG:
             message = f"still running after {timeout_seconds:g} s"
         elif returncode < 0:
             status, message = Status.CRASHED, f"ended by signal {-returncode}"
+        elif returncode >= _WINDOWS_EXCEPTION:
+            status, message = Status.CRASHED, f"ended by exception {returncode:#x}"
         elif returncode > 1:
             status, message = Status.WRONG_STATUS, f"exit status {returncode}"
         return Ended(status, returncode, _tail(out), _tail(err), seconds, message)
@@ -124,7 +126,7 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float,
 def _found_from_anywhere(word: str) -> str:
     """Make a word absolute that names something in the working directory."""
     option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
-    like_a_path = os.sep in path or bool(Path(path).suffix)
+    like_a_path = _has_folder(path) or bool(Path(path).suffix)
     # Path.exists() raises for words that are too long to be one.
     found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
     return option + equals + _absolute(path) if found else word
@@ -135,11 +137,8 @@ def _absolute(path: str) -> str:
     return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
 
 
-def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """End whatever the program started and left behind; that there is nothing is the usual case."""
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+def _has_folder(path: str) -> bool:
+    return any(separator in path for separator in (os.sep, os.altsep) if separator)
 
 
 def _tail(stream: IO[bytes]) -> bytes:

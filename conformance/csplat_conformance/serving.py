@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import mmap
 import os
+import queue
 import select
 import subprocess
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import IO, Self
 
 from csplat_conformance.answers import Answer
 from csplat_conformance.report import Status
@@ -64,7 +67,7 @@ class Served:
             pages = int(Path(f"/proc/{self._process.pid}/statm").read_text(encoding="ascii").split()[1])
         except OSError:
             return 0
-        return pages * os.sysconf("SC_PAGE_SIZE")
+        return pages * mmap.PAGESIZE
 
     def _answered(self, request: bytes) -> bytes | Answer:
         """Return the line with which the process answers, or what went wrong."""
@@ -75,7 +78,7 @@ class Served:
             process.stdin.write(request)
             process.stdin.flush()
             line = self._line(process, began)
-        except BrokenPipeError:
+        except OSError:  # a broken pipe, which Windows calls an invalid argument
             line = b""
         if line is None:
             self._end(process)
@@ -99,6 +102,8 @@ class Served:
     def _line(self, process: subprocess.Popen[bytes], began: float) -> bytes | None:
         """Return a line, what there is of it when the process ended, or None when it takes too long."""
         assert process.stdout
+        if not hasattr(select, "poll"):
+            return _line_of_thread(process.stdout, began + self._timeout - time.monotonic())
         line = b""
         while not line.endswith(b"\n"):
             left = began + self._timeout - time.monotonic()
@@ -117,6 +122,16 @@ class Served:
             try:
                 if stream:
                     stream.close()
-            except BrokenPipeError:
+            except OSError:  # as above
                 continue
         self._process = None
+
+
+def _line_of_thread(stream: IO[bytes], seconds: float) -> bytes | None:
+    """Return a line as `Served._line` does. Windows cannot wait for pipes; the thread ends with the process."""
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=lambda: lines.put(stream.readline()), daemon=True).start()
+    try:
+        return lines.get(timeout=max(0.0, seconds))
+    except queue.Empty:
+        return None

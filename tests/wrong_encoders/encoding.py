@@ -1,6 +1,7 @@
 """What a wrong encoder does: ours, with its one mistake."""
 
 import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,8 @@ def encode(mistake, ply, out, index=None):
 
 def _encoded(mistake, ply):
     """Return the file, and which splat of the input each of its splats is."""
+    if mistake.is_late:
+        return honest(ply.read_bytes(), tuple(mistake.options.items()))
     with mistake.stage():
         model = _read(mistake, ply)
         if mistake.scene is not None:
@@ -46,6 +49,22 @@ def _encoded(mistake, ply):
             rows = mistake.keep(model).astype(np.int64)
             model, origin = model.select(rows), Origin(len(model), rows)
         result = encode_with_report(model, csplat.EncodeOptions(**mistake.options), origin=origin)
+    return result.data, result.source_index
+
+
+@cache
+def honest(content, options=()):
+    """Return what our encoder makes of a PLY: the file, and which splat of the input each of its splats is.
+
+    Args:
+        content: the PLY.
+        options: of the encoder, (name, value) pairs.
+    """
+    with tempfile.TemporaryDirectory(prefix="csplat-honest-") as folder:
+        path = Path(folder) / "in.ply"
+        path.write_bytes(content)
+        model = ply_files.read_ply(path, keep_extra=bool(dict(options).get("keep_extra")))
+    result = encode_with_report(model, csplat.EncodeOptions(**dict(options)))
     return result.data, result.source_index
 
 

@@ -87,8 +87,12 @@ def status_of(name, ply, out, index=None):
     return 0
 
 
+#: Views of a picture: how many, and pixels.
+VIEWS = (8, 160, 120)
+
+
 def psnr(source, decoded):
-    """PSNR of renders; those of a source are made once."""
+    """Return the PSNR of small renders; the judge of a source is made once."""
     key = b"".join(
         values.tobytes()
         for values in (source.means, source.quats, source.scales, source.opacities, source.sh0, source.shN)
@@ -96,9 +100,9 @@ def psnr(source, decoded):
     judge = _judges().get(key)
     if judge is None:
         from csplat_render.judge import Judge
-        from csplat_tools.views import comparison_cameras
+        from csplat_render.virtual import virtual_cameras
 
-        judge = _judges()[key] = Judge.of_source(source, comparison_cameras(source))
+        judge = _judges()[key] = Judge.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
     return judge.psnr(decoded)
 
 

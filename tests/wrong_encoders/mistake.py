@@ -73,6 +73,12 @@ class Mistake:
     end: Callable[[Path, Path, bytes], None] | None = None
     starts: bool = False
 
+    @property
+    def is_late(self) -> bool:
+        """Whether it is made after our encoder has done all of its work."""
+        early = (self.ply, self.scene, self.keep)
+        return all(change is None for change in early) and self.stage is contextlib.nullcontext
+
 
 def changed(**fields: Callable[[Scene], Any]) -> Callable[[Scene], Scene]:
     """Return a change of a scene: each field is made of the scene as it was."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from csplat.archives import read_archive
 from csplat.errors import InputError
 
-__all__ = ["MIN_SIZE", "SCALE", "SHIFT", "Lpips", "load_lpips", "save_lpips"]
+__all__ = ["MIN_SIZE", "SCALE", "SHIFT", "Lpips", "load_lpips", "load_torch_lpips", "save_lpips"]
 
 F32 = NDArray[np.float32]
 
@@ -118,7 +118,7 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csplat" / "lpips_alex.npz"
     if cache.is_file():
         return _read(cache)
-    weights = _from_torch()
+    weights = load_torch_lpips()
     if weights is None:
         raise InputError(
             f"no LPIPS weights: neither {cache} nor a file named by {ENVIRONMENT}, nor (with PyTorch) torchvision's "
@@ -152,16 +152,23 @@ def _read(path: Path) -> Lpips:
     return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
 
-def _from_torch() -> Lpips | None:
-    """Weights from torch's cache; `None` where a part of them, or torch, is absent.
+def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) -> Lpips | None:
+    """Read the weights from PyTorch's own files; `None` if one of them, or torch, is absent.
 
     Torch is imported by name so that nothing of this package depends on it.
+
+    Args:
+        cache: folder of torch's cache; `None`: the one that torch names.
+        heads_path: file of the linear heads; `None`: that of an installed `lpips` or `torchmetrics` package.
+
+    Raises:
+        InputError: a file lacks some of the weights.
     """
     if importlib.util.find_spec("torch") is None:
         return None
-    heads_path = _heads_path()
+    heads_path = heads_path or _heads_path()
     torch: Any = importlib.import_module("torch")
-    backbones = sorted((Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
+    backbones = sorted((Path(cache or torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
     if heads_path is None or not backbones:
         return None
     backbone = torch.load(backbones[-1], map_location="cpu", weights_only=True)

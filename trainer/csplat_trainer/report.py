@@ -48,9 +48,11 @@ class TrainingStep:
 
 def peak_memory() -> int | None:
     """Most memory that this process has held, bytes; `None` where the system does not say."""
+    if sys.platform == "win32":
+        return None
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:  # a build without it
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(most) if sys.platform == "darwin" else int(most) * 1024

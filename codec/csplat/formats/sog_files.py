@@ -63,7 +63,7 @@ class Parts:
 
     def _inside(self, name: str) -> PurePosixPath:
         place = PurePosixPath(name)
-        if place.is_absolute() or ".." in place.parts or "\\" in name or "\0" in name or len(name) > _LONGEST_NAME:
+        if place.is_absolute() or ".." in place.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
             self.refuse(f"the part {name[:80]!r} would lie outside of it")
         return place
 

@@ -163,20 +163,30 @@ class OthersTarget(DecoderTarget):
 
     Args:
         scratch: folder for the coverage that Node writes.
+        languages: those of the decoders.
+        memory_bytes: see below.
 
     Attributes:
         decoders: those that can run here, by language.
+        memory_bytes: resident memory that none of them exceeds.
     """
 
     name = "others"
 
-    def __init__(self, scratch: Path | None = None) -> None:
+    def __init__(
+        self,
+        scratch: Path | None = None,
+        *,
+        languages: Sequence[str] = ("JavaScript", "C"),
+        memory_bytes: int = _MEMORY,
+    ) -> None:
         self._scratch = scratch
+        self.memory_bytes = memory_bytes
         self.decoders: dict[str, Served] = {}
-        missing = missing_others()
-        if "JavaScript" not in missing:
+        here = set(languages) - set(missing_others())
+        if "JavaScript" in here:
             self.decoders["JavaScript"] = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
-        if "C" not in missing:
+        if "C" in here:
             self.decoders["C"] = CDecoder(limits=C_LIMITS)
 
     def attempt(self, data: bytes) -> tuple[str, str]:
@@ -198,7 +208,7 @@ class OthersTarget(DecoderTarget):
     def memory(self) -> str:
         """Look at the resident memory of the others."""
         held = {name: one.resident_bytes() for name, one in self.decoders.items()}
-        return next((f"{name} holds {size:,} bytes" for name, size in held.items() if size > _MEMORY), "")
+        return next((f"{name} holds {size:,} bytes" for name, size in held.items() if size > self.memory_bytes), "")
 
     def close(self) -> None:
         """Let them end; Node writes its coverage."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -25,7 +26,7 @@ from csplat_conformance.mutation.javascript import JavaScriptDecoder
 from csplat_conformance.mutation.judging import fuzzed, vectors
 from csplat_conformance.mutation.mutants import Decoder, Fate, Mutant, Result, sample, score, table
 from csplat_conformance.mutation.native import NativeDecoder
-from csplat_conformance.mutation.python import PythonDecoder
+from csplat_conformance.mutation.python import NO_FORK, PythonDecoder
 
 __all__ = ["main"]
 
@@ -48,6 +49,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the choice of mutants")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time (default 1)")
     args = parser.parse_args()
+    if not hasattr(os, "fork"):
+        sys.stderr.write(f"error: {NO_FORK}\n")
+        return 1
     global _decoder  # noqa: PLW0603 - workers get it by the fork, which no argument can do
     try:
         _decoder = _DECODERS[args.decoder](fuzzed(_FILES, args.seed))

@@ -57,12 +57,12 @@ class Result:
 
     Attributes:
         mutant: which.
-        fate: what became of it.
+        fate: what became of it; other runners have fates of their own.
         by: the vector, or the fuzzed file and how the answers differ.
     """
 
     mutant: Mutant
-    fate: Fate
+    fate: StrEnum
     by: str = ""
 
 
@@ -107,15 +107,22 @@ def score(results: Sequence[Result]) -> float:
     return 100.0 * counts[0] / max(1, sum(counts))
 
 
-def table(results: Sequence[Result], texts: Mapping[str, str]) -> str:
+def table(
+    results: Sequence[Result],
+    texts: Mapping[str, str],
+    fates: Sequence[StrEnum] = (Fate.MISSED, Fate.SAME),
+    seen: str = "seen in",
+) -> str:
     """Return the survivors in Markdown, those that the vectors miss first.
 
     Args:
         results: all of a run.
-        texts: the decoder's modules by the names of their files.
+        texts: the modules by the names of their files.
+        fates: those that are listed, in this order.
+        seen: head of the column that holds `by`.
     """
-    lines = ["| fate | where | was | is | seen in |", "|---|---|---|---|---|"]
-    for fate in (Fate.MISSED, Fate.SAME):
+    lines = [f"| fate | where | was | is | {seen} |", "|---|---|---|---|---|"]
+    for fate in fates:
         for result in results:
             if result.fate is fate:
                 one = result.mutant

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import select
 import signal
 import sys
@@ -18,6 +17,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from csplat import decoder
+from csplat.errors import InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import Answer
 from csplat_conformance.fuzzing.targets import LIMITS
@@ -26,7 +26,9 @@ from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.mutation.operators import python_mutants
 from csplat_conformance.report import Status
 
-__all__ = ["PythonDecoder"]
+__all__ = ["NO_FORK", "PythonDecoder"]
+
+NO_FORK = "this system cannot copy processes, in which mutants run: use Linux or macOS"
 
 _PROCESSOR_SECONDS = 30  # the right decoder takes five
 _SECONDS = 300.0  # of a clock, for what waits; other processes may be busy
@@ -41,10 +43,12 @@ class PythonDecoder:
 
     Args:
         files: fuzzed ones.
+        processor_seconds: that a mutant may take for all vectors and files.
     """
 
-    def __init__(self, files: Sequence[bytes]) -> None:
+    def __init__(self, files: Sequence[bytes], processor_seconds: int = _PROCESSOR_SECONDS) -> None:
         self._files = files
+        self._processor_seconds = processor_seconds
         self._mutants: list[Mutant] = []
         self._folder = Path(decoder.__file__).parent
         self.texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(self._folder.glob("*.py"))}
@@ -68,6 +72,8 @@ class PythonDecoder:
 
     def attempt(self, mutant: Mutant) -> Result:
         """Run the vectors, then the fuzzed files; what hangs is noticed."""
+        if sys.platform == "win32":
+            raise InputError(NO_FORK)
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
@@ -90,7 +96,7 @@ class PythonDecoder:
 
     def _in_child(self, mutant: Mutant, writing: int) -> None:
         """Write two lines: the vector that fails, the file that differs; empty ones for none."""
-        _limit()
+        _limit(self._processor_seconds)
         warnings.simplefilter("ignore")
         try:
             self._load(mutant)
@@ -153,9 +159,13 @@ class _Finder(MetaPathFinder, Loader):
         exec(self.codes[module.__name__], module.__dict__)  # noqa: S102 - code of our own
 
 
-def _limit() -> None:
+def _limit(processor_seconds: int) -> None:
     """Let loops without end be ended, and allocations without bound fail."""
-    resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_SECONDS, _PROCESSOR_SECONDS))
+    import resource  # Windows has none
+
+    if sys.platform == "win32":
+        return
+    resource.setrlimit(resource.RLIMIT_CPU, (processor_seconds, processor_seconds))
     statm = Path("/proc/self/statm")
     if statm.exists():
         held = int(statm.read_text(encoding="ascii").split()[0]) * resource.getpagesize()

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import errno
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from io import BufferedRandom
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.files import check_room
+from csplat.system import read_into
 from csplat_conformance.stated.source import Source
 
 __all__ = ["Rows", "Spool", "opened_spool"]
@@ -73,7 +72,7 @@ class Spool:
         rows: how splats lie in it.
     """
 
-    stream: BufferedRandom
+    stream: IO[bytes]
     rows: Rows
     _parts: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # by key: byte of the file, and records
     _waiting: dict[int, list[Records]] = field(default_factory=dict)
@@ -144,10 +143,10 @@ class Spool:
             yield self.rows.source(block[:filled]), block["number"][:filled].copy()
 
 
-def _read_at(stream: BufferedRandom, at: int, buffer: memoryview) -> None:
+def _read_at(stream: IO[bytes], at: int, buffer: memoryview) -> None:
     """Fill a buffer, without moving the place where the next one reads."""
     while buffer:
-        count = os.preadv(stream.fileno(), [buffer], at)
+        count = read_into(stream.fileno(), buffer, at)
         if not count:
             raise OSError(errno.EIO, "the file of sorted splats has become shorter")
         buffer, at = buffer[count:], at + count

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from csplat.errors import InputError
 from csplat.formats import formats
 from csplat.remote import is_url
+from csplat.system import split_words
 from csplat_tools.files.scenes import FOLDER_NAMES
 
 __all__ = ["Task", "find_tasks"]
@@ -115,10 +115,10 @@ def _listed(manifest: Path) -> Iterator[_Found]:
         source, output, options = (fields.get(name) or "" for name in _COLUMNS)
         if not isinstance(source, str) or not source or not isinstance(output, str):
             raise InputError(f"{where}: wanted a path, and perhaps an output and options")
-        if not is_url(output) and (PurePosixPath(output).is_absolute() or ".." in PurePosixPath(output).parts):
+        if not is_url(output) and leads_out(output):
             raise InputError(f"{where}: the output {output} leads out of the folder of outputs")
         try:
-            words = shlex.split(options) if isinstance(options, str) else [str(word) for word in options]
+            words = split_words(options) if isinstance(options, str) else [str(word) for word in options]
         except (ValueError, TypeError):
             raise InputError(f"{where}: the options are {options!r}, wanted words as of a command line") from None
         placed = source if is_url(source) else str(manifest.parent / source)
@@ -149,7 +149,17 @@ def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
 def _within(source: str) -> str:
     """A path of a manifest as one within the folder of outputs; its last part where it leads elsewhere."""
     path = PurePosixPath(source.partition("?")[0])
-    return path.name if is_url(source) or path.is_absolute() or ".." in path.parts else str(path)
+    return path.name if is_url(source) or leads_out(str(path)) else str(path)
+
+
+def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
+    """Return whether a relative path leads out of its folder, as the paths of this system are read.
+
+    Args:
+        name: parts separated by `/`, or as the system does.
+        flavour: the kind of path.
+    """
+    return any(path.anchor or ".." in path.parts for path in (PurePosixPath(name), flavour(name)))
 
 
 def _named(found: Sequence[_Found], root: str, ending: str) -> list[Task]:

@@ -6,7 +6,6 @@ ends by itself one line for each scene is left.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -16,11 +15,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from csplat.errors import InputError
+from csplat.system import locked_folder
 from csplat_tools.files.streams import write_bytes
 
 __all__ = ["JOURNAL", "Journal", "Record", "open_journal", "read_journal"]
 
 JOURNAL = "batch.jsonl"
+_LOCK = ".batch.lock"  # on Windows
 _BEGUN = "begun"
 
 
@@ -85,7 +86,7 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
         self.records, self.pending = read_journal(folder)
-        self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        self._file = self._path.open("ab", buffering=0)
         with self._path.open("rb") as stream:
             if stream.seek(0, os.SEEK_END) and (stream.seek(-1, os.SEEK_END), stream.read())[1] != b"\n":
                 self._write_line(b"")  # half a line stays by itself
@@ -100,19 +101,20 @@ class Journal:
         self._write_line(json.dumps(record.as_json()).encode())
 
     def end(self) -> None:
-        """Leave one line for each scene."""
+        """Leave one line for each scene; nothing can be added any more."""
+        self.close()  # Windows replaces no file that is open
         lines = [json.dumps(one.as_json()) + "\n" for one in self.records.values()]
         write_bytes(str(self._path), "".join(lines).encode())
 
     def close(self) -> None:
         """Close the file; what stands in it stays."""
-        os.close(self._file)
+        self._file.close()
 
     def _write_line(self, line: bytes) -> None:
         left = memoryview(line + b"\n")
         while left:  # a full disk takes a part, and then none
-            left = left[os.write(self._file, left) :]
-        os.fsync(self._file)  # an output that is there after a power cut has to be known
+            left = left[self._file.write(left) :]
+        os.fsync(self._file.fileno())  # an output that is there after a power cut has to be known
 
 
 @contextmanager
@@ -123,21 +125,14 @@ def open_journal(folder: Path) -> Iterator[Journal]:
         InputError: another batch is at work there.
         OSError: it cannot be written.
     """
-    held = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"another batch writes to {folder}: wait for it, or name another folder") from None
-        except OSError:
-            pass  # a file system without locks
+    with locked_folder(folder, _LOCK) as is_ours:
+        if not is_ours:
+            raise InputError(f"another batch writes to {folder}: wait for it, or name another folder")
         journal = Journal(folder)
         try:
             yield journal
         finally:
             journal.close()
-    finally:
-        os.close(held)
 
 
 def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:

@@ -13,6 +13,7 @@ from typing import Any
 from csplat.errors import InputError
 from csplat.memory import available_bytes
 from csplat.remote import is_url
+from csplat.system import core_count
 from csplat_tools.batches.budget import Budget
 from csplat_tools.batches.finding import Task, find_tasks
 from csplat_tools.batches.page import PAGE, write_page
@@ -132,8 +133,8 @@ def batch(
     target = Path(folder)
     with closing(Worker()) as first:
         tasks, options = _prepared(first, scenes, target, command, ending, match)
-        count = min(workers or _cores(), len(tasks))
-        threads = max(1, _cores() // count) if "threads" in options and dask is None else None
+        count = min(workers or core_count(), len(tasks))
+        threads = max(1, core_count() // count) if "threads" in options and dask is None else None
         resumes = "resume" in options
         target.mkdir(parents=True, exist_ok=True)
         with open_journal(target) as journal:
@@ -175,7 +176,7 @@ def plan(
     with closing(Worker()) as first:
         tasks, _ = _prepared(first, scenes, target, command, ending, match)
         jobs = _jobs(tasks, command, target, *read_journal(target))
-        others = [Worker() for _ in range(min(workers or _cores(), len(jobs)) - 1)]
+        others = [Worker() for _ in range(min(workers or core_count(), len(jobs)) - 1)]
         with closing(spread(jobs, [first, *others], plan_job)) as planned:
             found = {one.job.task.output: one for one in planned}
     return [found[one.output] for one in tasks]
@@ -267,8 +268,3 @@ def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[Job]) -> Iterato
             whole -= sizes[record.output]
         failed += record.state == "failed"
         yield Step(number, len(jobs), failed, done / whole if whole > 0.0 else 1.0, record), worked
-
-
-def _cores() -> int:
-    """Of this machine, those that this program may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

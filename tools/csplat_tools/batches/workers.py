@@ -13,6 +13,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from csplat.errors import CsplatError
+from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
 __all__ = ["Worker", "WorkerLostError", "remove_left"]
 
@@ -81,6 +82,7 @@ class Worker:
                 self._process = subprocess.Popen(  # noqa: S603  # this interpreter
                     [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said,
                     encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for who started it
+                    creationflags=NEW_GROUP_FLAGS,
                 )  # fmt: skip
             return self._process
 
@@ -102,7 +104,7 @@ def _end(process: Process | None) -> None:
     """End a process, and close what leads to it."""
     if process is None:
         return
-    process.send_signal(signal.SIGINT)
+    interrupt_process(process)
     try:
         process.wait(_PATIENCE)
     except subprocess.TimeoutExpired:

@@ -24,6 +24,7 @@ from typing import Any
 
 import typer
 
+from csplat.system import interrupt_main_thread
 from csplat_tools.batches.looking import look
 from csplat_tools.batches.thumbnails import prepare_thumbnails, write_thumbnail
 from csplat_tools.cli.app import app, command_function
@@ -51,14 +52,14 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print is no answer
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    busy, main_thread = threading.Event(), threading.get_ident()
+    busy = threading.Event()
 
     def listen() -> None:
         for line in sys.stdin:
             requests.put(line)
         requests.put(None)
         if busy.is_set():  # what the command waits for is interrupted, too
-            signal.pthread_kill(main_thread, signal.SIGINT)
+            interrupt_main_thread()
 
     threading.Thread(target=listen, daemon=True).start()
     with suppress(KeyboardInterrupt, BrokenPipeError):
@@ -177,13 +178,13 @@ def _json(text: str) -> Any:
 def _forget_peak() -> None:
     """Let the system measure this process's largest memory anew; where it cannot, that of all scenes so far counts."""
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", "ascii")
 
 
 def _peak() -> int | None:
     """The most memory that this process held, bytes."""
     with suppress(OSError, ValueError):
-        for line in Path("/proc/self/status").read_text().splitlines():
+        for line in Path("/proc/self/status").read_text("utf-8", "replace").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
     return None

@@ -30,8 +30,6 @@ __all__ = [
 #: Files that stand for all that lies beside them: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
-
-_SAMPLE = 1 << 19  # splats
 _SMALL = 1 << 20  # bytes of a file of any format that fits every memory
 #: What comparing takes in memory beside the arrays: the program; of a splat what is drawn and searched.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
@@ -89,12 +87,14 @@ class OpenedScene:
         size_bytes: of the file.
         path: of the file.
         memory_bytes: what may be taken by those who look at it, about.
+        sample_splats: number of splats in the sample, at most.
     """
 
     scene: Scene
     size_bytes: int
     path: Path
     memory_bytes: int
+    sample_splats: int = 1 << 19
     _sample: list[SplatModel] = field(default_factory=list, init=False)
 
     def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:
@@ -103,7 +103,7 @@ class OpenedScene:
         Raises:
             CsplatError: the scene is not whole.
         """
-        every = max(1, -(-self.count // _SAMPLE))
+        every = max(1, -(-self.count // self.sample_splats))
         if not self._sample:
             parts = []
             for rows, block in self.scene.numbered():

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, contextmanager
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -294,7 +294,7 @@ def whole_output(path: str) -> Iterator[BinaryIO]:
             yield stream
         return
     with TemporaryFile() as spool, _output_stream(path) as stream:
-        yield spool
+        yield cast(BinaryIO, spool)  # on Windows a wrapper of one
         spool.seek(0)
         shutil.copyfileobj(spool, stream)
 

@@ -34,7 +34,7 @@ from csplat_tools.optimise.trials import Trial, Trials, Whole
 from csplat_tools.views import VIRTUAL, ViewSet, elsewhere, with_deciders
 from csplat_tools.views.timing import picture_seconds
 
-__all__ = ["check", "expected_seconds", "optimise"]
+__all__ = ["check", "expected_pictures", "expected_seconds", "optimise"]
 
 #: What a target costs, in pictures of 640x480, without removal (380 to 690 of plane3, donut, lego60k and fox120k) and
 #: with it: whatever the effort, and by how much work that is (plane3 at 40 dB at 1, 3 and 7: as 0.6 to 1 to 4).
@@ -121,10 +121,17 @@ def expected_seconds(
 
     By how long the views that judge take now: what is done costs so many pictures of them, whatever the machine.
     """
-    pictures = _PICTURES
-    if not _all_stay(target, encoding, keep_all=keep_all):
-        pictures = _PICTURES_OF_FEWER[0] + _PICTURES_OF_FEWER[1] * (simplifying or SimplifyOptions()).work
+    pictures = expected_pictures(encoding, target, keep_all=keep_all, simplifying=simplifying)
     return pictures * picture_seconds(source, views.judges, threads=encoding.threads)
+
+
+def expected_pictures(
+    encoding: EncodeOptions, target: Target, *, keep_all: bool, simplifying: SimplifyOptions | None = None
+) -> float:
+    """Return as how many pictures of the judging views a target costs, about."""
+    if _all_stay(target, encoding, keep_all=keep_all):
+        return _PICTURES
+    return _PICTURES_OF_FEWER[0] + _PICTURES_OF_FEWER[1] * (simplifying or SimplifyOptions()).work
 
 
 def _all_stay(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -142,6 +142,7 @@ class Trial:
         judge: the source's renders in the views that judge.
         decided_psnr: by the views that decide, dB: what files are compared by.
         photo_psnr: by the photographs that decide, dB; NaN where none do.
+        decode: reads its bytes.
     """
 
     part: Part
@@ -153,11 +154,12 @@ class Trial:
     judge: Judge = field(repr=False)
     decided_psnr: float
     photo_psnr: float
+    decode: Callable[[bytes], SplatModel] = field(default=decode, repr=False)
 
     @cached_property
     def errors(self) -> F64:
         """[V] mean squared error by judging view, against the source."""
-        return self.judge.errors(decode(self.result.data))
+        return self.judge.errors(self.decode(self.result.data))
 
     @property
     def psnr(self) -> float:
@@ -228,6 +230,7 @@ class Trials:
         photographs: those that decide, where a loss against photographs is the target.
         made: every file, in order.
         progress: is told which file is made.
+        decode: reads the bytes of a file; another encoder than csplat's, such as a formula, brings its own.
     """
 
     encoding: EncodeOptions
@@ -236,6 +239,7 @@ class Trials:
     photographs: Judge | None = None
     made: list[Trial] = field(default_factory=list)
     progress: Progress | None = None
+    decode: Callable[[bytes], SplatModel] = decode
     _judged: WeakKeyDictionary[Part, float] = field(default_factory=WeakKeyDictionary, init=False)
 
     @property
@@ -276,10 +280,12 @@ class Trials:
         tell(stage, 0.0)
         coded = part.coded(options, graded=coding.graded, quick=quick)
         result = coded.write(part.said(None))
-        model = decode(result.data)
+        model = self.decode(result.data)
         decided_psnr = self.decider.psnr(model)
         photo_psnr = math.nan if self.photographs is None else self.photographs.psnr(model)
-        trial = Trial(part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr)
+        trial = Trial(
+            part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr, self.decode
+        )
         said = part.said(trial)
         self.made.append(trial if said is None else trial.told(coded.write(said)))
         tell(stage, 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat.system import core_count
 
 __all__ = ["describe_machine", "package_version", "processor_name"]
 
@@ -22,7 +22,7 @@ def describe_machine(threads: int | None) -> dict[str, Any]:
     Args:
         threads: that were asked for; `None` for all.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = core_count()
     return {
         "processor": processor_name(),
         "cores": cores,

@@ -6,7 +6,7 @@ import hashlib
 import statistics
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,20 +39,26 @@ TIMED_VIEWS = 8
 
 @dataclass
 class StageClock:
-    """Seconds between the calls of a progress callback, by the name of the stage; calls come from any thread."""
+    """Seconds between the calls of a progress callback, by the name of the stage; calls come from any thread.
 
+    Attributes:
+        clock: returns the seconds that have passed.
+        seconds: by stage.
+    """
+
+    clock: Callable[[], float] = time.perf_counter
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self._last = time.perf_counter()
+        self._last = self.clock()
 
     def listening(self, report: Progress) -> Progress:
         """Pass calls on, and note when they come. What passes before a stage is at 0 is not its own."""
 
         def told(stage: str, done: float) -> None:
             with self._lock:
-                now = time.perf_counter()
+                now = self.clock()
                 if done > 0.0:
                     self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
                 self._last = now

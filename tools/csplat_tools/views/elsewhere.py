@@ -10,10 +10,10 @@ from csplat_render import Camera
 from csplat_render.cameras import relative_to
 from csplat_render.cloud import sample_cloud
 from csplat_render.virtual import is_clear, scene_frame, virtual_cameras
+from csplat_tools.views import placing
 
 __all__ = ["elsewhere"]
 
-_VIEWS = (12, 320, 240)  # of each kind; width and height of their pictures
 _SEED = 2000  # those that decide have 1000 and more
 _NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # from the middle of the scene, times the usual
 _POINTS = 20_000
@@ -31,7 +31,7 @@ def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
         12 cameras of each kind: `beside`, `nearer`, `farther`.
     """
     frame = scene_frame(source)
-    beside = virtual_cameras(source, *_VIEWS, seed=_SEED)
+    beside = virtual_cameras(source, *placing.VIRTUAL_SIZES.elsewhere, seed=_SEED)
     found = {"beside": beside, "farther": [_at(camera, frame.centre, _FARTHER) for camera in beside]}
     if not len(source):
         return {**found, "nearer": beside}

@@ -22,6 +22,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras, relative_to
 from csplat_render.virtual import virtual_cameras
 from csplat_tools.files.extras import need_photographs
+from csplat_tools.views import placing
 from csplat_tools.views.placing import CHECKS, camera_sequence, evenly, usual_views
 from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, pose
 
@@ -30,12 +31,11 @@ if TYPE_CHECKING:
 
 __all__ = ["DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
 
-_JUDGING = (8, 640, 480)  # the views of `psnr`
 _ENOUGH = 40  # cameras of a file that they may teach and judge
 _JUDGE_EVERY, _MOST_JUDGES = 4, 24
 _DECIDE_EVERY = 8
 _MOST_DECIDING = 16  # of the photographs that a data set names for that
-_DECIDING, _DECIDING_SEED = (12, 320, 240), 1000
+_DECIDING_SEED = 1000
 _TEST_EVERY = 8
 
 
@@ -60,7 +60,7 @@ class DataOptions:
 
 def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
     """The cameras of `psnr`: virtual ones, chosen from the source alone, or from every so-manieth of its splats."""
-    return virtual_cameras(source, *_JUDGING, seed=0, every=every)
+    return virtual_cameras(source, *placing.VIRTUAL_SIZES.judging, seed=0, every=every)
 
 
 def find_view_set(
@@ -222,8 +222,9 @@ def _virtual(
     """Views that teach, and views that decide: like those of `psnr`, by which they are judged, but others."""
     if count < 1:
         return [], []
-    kept = _DECIDING[0] if aside is None else aside
-    decides = virtual_cameras(source, kept, *_DECIDING[1:], seed=_DECIDING_SEED + seed) if kept else []
+    usual, width, height = placing.VIRTUAL_SIZES.deciding
+    kept = usual if aside is None else aside
+    decides = virtual_cameras(source, kept, width, height, seed=_DECIDING_SEED + seed) if kept else []
     return camera_sequence(source, count + CHECKS, size, seed=seed), decides
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +19,17 @@ from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
 from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, is_clear, scene_frame
 
-__all__ = ["CHECKS", "VIEW_COUNT", "VIEW_SIZE", "camera_sequence", "evenly", "reduced", "usual_views"]
+__all__ = [
+    "CHECKS",
+    "VIEW_COUNT",
+    "VIEW_SIZE",
+    "VIRTUAL_SIZES",
+    "VirtualSizes",
+    "camera_sequence",
+    "evenly",
+    "reduced",
+    "usual_views",
+]
 
 F64 = NDArray[np.float64]
 T = TypeVar("T")
@@ -31,6 +41,25 @@ VIEW_SIZE = (240, 180)
 
 #: Virtual views beside those that are asked for: whether what these taught holds elsewhere, they say.
 CHECKS = 16
+
+
+@dataclass(frozen=True)
+class VirtualSizes:
+    """Virtual views that fit nothing: how many there are, and the width and height of their pictures in pixels.
+
+    Attributes:
+        judging: those of `psnr`.
+        deciding: those that decide.
+        elsewhere: those of `elsewhere`, of each kind.
+    """
+
+    judging: tuple[int, int, int] = (8, 640, 480)
+    deciding: tuple[int, int, int] = (12, 320, 240)
+    elsewhere: tuple[int, int, int] = (12, 320, 240)
+
+
+#: The usual ones, by which all published figures were measured.
+VIRTUAL_SIZES = VirtualSizes()
 
 _PIXELS = 50  # of all views together, for every splat
 _LARGEST = 2.0  # times as wide and high: all pictures are in memory, and larger ones would be too few

@@ -34,7 +34,6 @@ STAGE = "drawing one picture by way of the disk"
 _LOOKED_AT = 1 << 19  # splats of a slice that is cut again
 _BASE_BYTES = 320_000_000  # program, samples, splats that wait for being written
 _BLOCKS = 16  # that are being decoded, or were, and lie in what the system has not been given back
-_LEAST_BYTES = 1 << 24  # of a slice
 _FOLDS = 2.2  # of a splat's arrays: as records, and as arrays
 _SPLAT_BYTES = 300  # beside them: what the rasteriser knows of a splat
 _PAIR_BYTES = 5  # of a splat and a tile that it touches
@@ -54,6 +53,7 @@ class Sliced:
         sample, every: as `OpenedScene.sample` gives them.
         memory_bytes: bound, about.
         progress: is told how far a picture has come.
+        slice_bytes: least bytes of memory for a slice.
     """
 
     scene: Scene
@@ -61,6 +61,7 @@ class Sliced:
     every: int
     memory_bytes: int
     progress: Progress | None = None
+    slice_bytes: int = 1 << 24
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -85,12 +86,12 @@ class Sliced:
     @property
     def least_bytes(self) -> int:
         """Bytes of memory without which nothing can be drawn."""
-        return self._beside + _LEAST_BYTES
+        return self._beside + self.slice_bytes
 
     @property
     def room_bytes(self) -> int:
         """Bytes of memory for a slice."""
-        return max(_LEAST_BYTES, self.memory_bytes - self._beside)
+        return max(self.slice_bytes, self.memory_bytes - self._beside)
 
     @property
     def _beside(self) -> int:

@@ -131,7 +131,7 @@ def _held(root: int) -> int:
         process = pending.pop()
         pending += parents.get(process, [])
         with suppress(OSError, ValueError):
-            text = Path(f"/proc/{process}/smaps_rollup").read_text()
+            text = Path(f"/proc/{process}/smaps_rollup").read_text("ascii", "replace")
             total += sum(int(line.split()[1]) * 1024 for line in text.splitlines() if line.startswith("Pss:"))
     return total
 

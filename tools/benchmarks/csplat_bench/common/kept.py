@@ -32,7 +32,7 @@ class Kept:
 
     def __init__(self, path: Path, settings: Mapping[str, object] | None = None, *, again: bool = False) -> None:
         self.path = path
-        self.values: dict[str, Any] = json.loads(path.read_text()) if path.exists() and not again else {}
+        self.values: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.exists() and not again else {}
         if settings is None:
             return
         wanted = json.loads(json.dumps(settings))  # as it will be read again
@@ -65,7 +65,7 @@ class Kept:
 def read_kept(folder: Path) -> dict[str, Any]:
     """All that is known in a folder, by scene; what trainings keep beside it left out."""
     files = [path for path in sorted(folder.glob("*.json")) if not path.name.endswith(".training.json")]
-    return {path.stem: json.loads(path.read_text()) for path in files}
+    return {path.stem: json.loads(path.read_text("utf-8")) for path in files}
 
 
 def file_digest(path: Path) -> str:

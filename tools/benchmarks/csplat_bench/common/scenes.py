@@ -22,7 +22,19 @@ from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
 from csplat_tools.views import BLACK, comparison_cameras
 
-__all__ = ["DATA", "MADE", "NPM", "OUT", "ROOT", "Scene", "cameras_of", "find_scenes", "given_cameras", "judge_of"]
+__all__ = [
+    "DATA",
+    "MADE",
+    "NPM",
+    "OUT",
+    "ROOT",
+    "SAMPLE",
+    "Scene",
+    "cameras_of",
+    "find_scenes",
+    "given_cameras",
+    "judge_of",
+]
 
 ROOT = Path(__file__).resolve().parents[4]
 DATA = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
@@ -32,7 +44,8 @@ OUT = ROOT / "out"
 MADE = OUT / "scenes"
 NPM = OUT / "peers"
 
-_SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
+#: The scene that ships with the project.
+SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 _SOG_TO_PLY = DATA / "tools" / "sog2ply.py"
 
 #: By name, what is copied side by side, and splats.
@@ -110,7 +123,7 @@ def _path(name: str, cache: Path) -> Path | None:
             convert = [sys.executable, str(_SOG_TO_PLY), str(source), str(made)]
             subprocess.run(convert, check=True, stdout=subprocess.DEVNULL)
         return made if made.exists() else None
-    source = _SAMPLE if name == "sample" else DATA / "ply" / f"{_made_of(name)}.ply"
+    source = SAMPLE if name == "sample" else DATA / "ply" / f"{_made_of(name)}.ply"
     if not source.exists():
         return made if made.exists() else None
     if name in _BLOWN_UP and not made.exists():

@@ -67,7 +67,7 @@ _SH_CODINGS: dict[str, ShCoding] = {"scalar": "scalar", "codebook": "codebook"}
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
 _GRID_TRIES = 4  # files at most for one point of a curve
-_GRID = (-9.0, -6.0, -3.0, 3.0, 6.0)  # dB beside the PSNR of SPZ at which the curve is drawn, too
+GRID = (-9.0, -6.0, -3.0, 3.0, 6.0)  # dB from the PSNR of SPZ at which the curve is drawn, too
 _GRID_FAR = (-16.0, -12.5)  # likewise, without SH, where SPZ is far above what pictures need
 
 
@@ -182,7 +182,7 @@ def _plain(bench: _Bench) -> None:
     spz = goals.get("SPZ")
     if spz is None:
         return
-    for offset in _GRID if has_sh else (*_GRID_FAR, *_GRID):
+    for offset in GRID if has_sh else (*_GRID_FAR, *GRID):
         for preset, coding in drawn:
             for _ in range(_GRID_TRIES):
                 series = bench.known.plain().get(f"{preset}, {coding}", ())

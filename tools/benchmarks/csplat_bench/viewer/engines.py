@@ -126,7 +126,7 @@ def _firefox() -> Iterator[Drive]:
     port = _free_port()
     with tempfile.TemporaryDirectory() as profile:
         Path(profile, "user.js").write_text(
-            f'user_pref("marionette.port", {port});\nuser_pref("webgl.force-enabled", true);\n'
+            f'user_pref("marionette.port", {port});\nuser_pref("webgl.force-enabled", true);\n', encoding="utf-8"
         )
         words = ["firefox-esr", "--marionette", "--no-remote", "--profile", profile]
         with _started(words), _connected(port) as wire, wire.makefile("rb") as answers:

@@ -1,0 +1,187 @@
+"""Calls that only some operating systems have, each with a replacement for the others.
+
+`sys.platform` is for type checkers: what a system has is asked of its modules.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+__all__ = [
+    "CAN_FORK",
+    "NEW_GROUP_FLAGS",
+    "Pages",
+    "core_count",
+    "interrupt_main_thread",
+    "interrupt_process",
+    "kill_group",
+    "locked_folder",
+    "read_at",
+    "read_into",
+    "split_words",
+]
+
+#: Whether a process can be copied with all of its memory. macOS can, but its system libraries do not survive it.
+CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
+
+#: `creationflags` of a process that an interrupt at the terminal does not reach; on POSIX `start_new_session` does it.
+NEW_GROUP_FLAGS: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+
+_reading = threading.Lock()  # seek and read are two calls
+
+
+def core_count() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def read_at(descriptor: int, size: int, offset: int) -> bytes:
+    """Read from an offset of a file; threads may do so at the same time. Fewer bytes come at the end of the file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    if sys.platform != "win32" and hasattr(os, "pread"):
+        return os.pread(descriptor, size, offset)
+    with _reading:  # Windows
+        os.lseek(descriptor, offset, os.SEEK_SET)
+        return os.read(descriptor, size)
+
+
+def read_into(descriptor: int, buffer: memoryview, offset: int) -> int:
+    """Read from an offset of a file into a buffer; return the number of bytes read, 0 at the end of the file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    if sys.platform != "win32" and hasattr(os, "preadv"):
+        return os.preadv(descriptor, [buffer], offset)
+    data = read_at(descriptor, len(buffer), offset)
+    buffer[: len(data)] = data
+    return len(data)
+
+
+class Pages:
+    """Zeroed memory that takes room only where it is written, on systems that can do so. Owns the memory.
+
+    Attributes:
+        buffer: the memory.
+
+    Args:
+        size_bytes: length, at least 1.
+
+    Raises:
+        OSError, OverflowError: the address space is too small.
+    """
+
+    def __init__(self, size_bytes: int) -> None:
+        if sys.platform != "win32" and hasattr(mmap, "MAP_ANONYMOUS"):
+            flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
+            self.buffer = mmap.mmap(-1, size_bytes, flags=flags)
+        else:  # Windows: the page file has to have room for all of it
+            self.buffer = mmap.mmap(-1, size_bytes)
+
+    def discard(self) -> None:
+        """Give the memory back to the system if it takes it; the content is undefined afterwards."""
+        if hasattr(self.buffer, "madvise") and hasattr(mmap, "MADV_DONTNEED"):
+            self.buffer.madvise(mmap.MADV_DONTNEED)
+
+
+@contextmanager
+def locked_folder(folder: Path, name: str) -> Iterator[bool]:
+    """Lock a folder against other programs that do the same; yield whether this program has the lock.
+
+    File systems without locks count as locked. The system releases the lock when the program ends, however it ends.
+
+    Args:
+        folder: an existing folder.
+        name: name of a lock file, which systems that cannot lock a folder (Windows) create in it.
+
+    Raises:
+        OSError: the folder cannot be read, or the lock file cannot be made.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        with _lock_file(folder / name) as is_held:
+            yield is_held
+        return
+    held, is_held = os.open(folder, os.O_RDONLY), True
+    try:
+        if sys.platform != "win32":
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                is_held = False
+            except OSError:
+                pass  # a file system without locks
+        yield is_held
+    finally:
+        os.close(held)
+
+
+@contextmanager
+def _lock_file(path: Path) -> Iterator[bool]:
+    """Lock by a file that exists as long as the lock; Windows deletes it when the program that opened it ends."""
+    try:
+        held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | getattr(os, "O_TEMPORARY", 0))
+    except FileExistsError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        os.close(held)
+        path.unlink(missing_ok=True)
+
+
+def split_words(command: str, *, is_posix: bool = os.sep == "/") -> list[str]:
+    """Split a command line into words as a shell does. On Windows a backslash separates folders and escapes nothing.
+
+    Raises:
+        ValueError: a quote has no end.
+    """
+    lexer = shlex.shlex(command, posix=True, punctuation_chars=False)
+    lexer.whitespace_split, lexer.commenters = True, ""
+    if not is_posix:
+        lexer.escape = ""
+    return list(lexer)
+
+
+def kill_group(process: subprocess.Popen[Any]) -> None:
+    """Kill a process and, on POSIX, whatever it started: it must lead a session (`start_new_session`)."""
+    if sys.platform != "win32" and hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()
+
+
+def interrupt_process(process: subprocess.Popen[Any]) -> None:
+    """Ask a process to end: by SIGINT, or by closing its standard input where no signals reach processes (Windows)."""
+    if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
+        process.send_signal(signal.SIGINT)
+    elif process.stdin is not None:
+        with suppress(OSError):  # bytes that could not be delivered
+            process.stdin.close()
+
+
+def interrupt_main_thread() -> None:
+    """Raise KeyboardInterrupt in the main thread, from another thread; on POSIX in the middle of a system call, too."""
+    if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)

@@ -1,0 +1,200 @@
+"""The search for a target on an analytic scene: the one place where the model meets the search as it is today."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+from analytic_model import AnalyticFile, AnalyticScene, Contents, Views, psnr_of
+
+from csplat import EncodeOptions
+from csplat_tools.optimise.coding import Codings
+from csplat_tools.optimise.goals import goal_of
+from csplat_tools.optimise.moves import Moves
+from csplat_tools.optimise.removal import Removal
+from csplat_tools.optimise.report import Report
+from csplat_tools.optimise.reporting import reported
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.simplify.order import Order
+from csplat_tools.optimise.solving import Solver
+from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.trials import Trials
+
+
+@dataclass(frozen=True)
+class Found:
+    """A search that came to its end.
+
+    Attributes:
+        file: that was chosen.
+        tried: every file that was made, in order.
+        judged: those that the judging views were shown.
+        report: as users get it.
+    """
+
+    file: AnalyticFile
+    tried: list[AnalyticFile]
+    judged: list[AnalyticFile]
+    report: Report
+
+
+def search(
+    scene: AnalyticScene,
+    *,
+    options: EncodeOptions | None = None,
+    keep_all: bool = False,
+    judging: Views | None = None,
+    photo_psnr: float | None = None,
+    grades: bool = False,
+    effort: int = 3,
+    tried: list[AnalyticFile] | None = None,
+    **target: object,
+) -> Found:
+    """Look for a file of an analytic scene.
+
+    Args:
+        scene: the scene.
+        options: knobs of the encoder that the caller fixed.
+        keep_all: no splat may be removed.
+        judging: what the judging views see; usually what the deciding ones do.
+        photo_psnr: of the source against photographs, dB, which decide a loss.
+        grades: splats may be sorted by importance.
+        effort: of the refit.
+        tried: is filled with the files that are made, for who wants them of a search that is refused.
+        target: as for `Target`.
+    """
+    encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
+    judge, decider = _Judge(scene, judging or Views()), _Judge(scene, Views())
+    photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
+    trials = Trials(encoding, judge, decider, photographs, decode=lambda data: data)
+    removal = None if keep_all else analytic_removal(scene, grades=grades, effort=effort)
+    whole = _Splats(scene, model, refits=False, gradable=grades)
+    goal = goal_of(asked, model, photographs)
+    moves = Moves(Solver(trials, goal), Codings(model, encoding, grades), whole, removal)
+    try:
+        best = moves.best()
+    finally:
+        if tried is not None:
+            tried += [one.result.data for one in trials.made]
+    report = reported(
+        asked, best, trials, splats_before=scene.splats, views_of="virtual", remarks=(),
+        encodes=len(trials.made), seconds=0.0,
+    )  # fmt: skip
+    made = [one.result.data for one in trials.made]
+    return Found(best.result.data, made, judge.shown, report)
+
+
+def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Removal:
+    """Return who says how many splats may go."""
+    how = SimplifyOptions(effort=effort)
+    return _Removal(scene.model(), None, how, grades=grades, progress=None, psnr=None, scene=scene)
+
+
+@dataclass(eq=False)
+class _Judge:
+    """Views, which see what the law says. Remembers the files that it was shown."""
+
+    scene: AnalyticScene
+    views: Views
+    cameras: tuple[int, ...] = tuple(range(8))
+    shown: list[AnalyticFile] = field(default_factory=list)
+
+    def errors(self, model):
+        if isinstance(model, AnalyticFile):
+            self.shown.append(model)
+            error = self.scene.error_of(model.contents, self.views)
+        elif isinstance(model, _Shown):
+            error = self.scene.source_error(model.splats, self.scene.sh_degree, self.views, refitted=model.refitted)
+        else:
+            error = self.scene.source_error(len(model), model.sh_degree, self.views)
+        return np.full(len(self.cameras), error)
+
+    def pooled(self, errors):
+        return float(np.mean(errors))
+
+    def psnr(self, model):
+        return float(psnr_of(self.pooled(self.errors(model))))
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Splats before they are quantised."""
+
+    splats: int
+    refitted: bool
+
+
+@dataclass(eq=False)
+class _Splats:
+    """Splats that a file is to hold: today's `Part`."""
+
+    scene: AnalyticScene
+    model: object
+    refits: bool
+    gradable: bool
+
+    @property
+    def shown(self):
+        return _Shown(len(self.model), self.refits)
+
+    @property
+    def rows(self):
+        return np.arange(len(self.model))
+
+    @property
+    def psnr(self):
+        if not self.refits:
+            return np.inf
+        error = self.scene.source_error(len(self.model), self.scene.sh_degree, Views(), refitted=True)
+        return float(psnr_of(error))
+
+    fitted_psnr = psnr
+
+    def coded(self, options, *, graded, quick):
+        graded = graded and self.gradable and options.grades != 1 and self.scene.grading < 1.0
+        contents = Contents(options, len(self.model), self.refits, graded=graded, draft=quick and self.refits)
+        return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
+
+    def said(self, trial):  # noqa: ARG002  # the file says nothing of it
+        return None
+
+
+def _encoded(file):
+    """Return a file as the encoder does."""
+    options = file.scene.options_of(file.contents)
+    report = SimpleNamespace(options=options, errors=file.errors, splat_count=file.contents.splats)
+    return SimpleNamespace(data=file, report=report)
+
+
+@dataclass(frozen=True)
+class _Session:
+    """What all numbers of splats share: the whole order of removal."""
+
+    order: Order
+    splats: int
+    options: SimplifyOptions
+    value_count: int = 1
+    sides: tuple[()] = ()
+
+    def pruned(self, gone):
+        return np.arange(gone, self.splats)
+
+
+@dataclass(eq=False)
+class _Removal(Removal):
+    """The order of removal and the refit that the law gives, in place of those that are measured."""
+
+    scene: AnalyticScene = None
+
+    @cached_property
+    def session(self):
+        count = len(self.source)
+        errors = self.scene.removed(np.arange(count, 0, -1), refitted=False)
+        order = Order(np.arange(count - 1), np.diff(errors), ())
+        return _Session(order, count, self.options)
+
+    def fitted(self, left, allowed, seen):  # noqa: ARG002  # as the measured one is called
+        model = self.source.select(np.arange(len(self.source) - left, len(self.source)))
+        return _Splats(self.scene, model, refits=True, gradable=self.grades)

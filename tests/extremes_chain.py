@@ -1,0 +1,121 @@
+"""A scene at the extremes from its PLY through all stages. Needs the extra [render]."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from captures import views_of
+from extremes import COUNT, write_small_scene
+from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
+
+from csplat import decode, read_ply
+from csplat.decoder import read_header, read_stated_errors
+from csplat.encoder import Draft, EncodeResult, encode_with_report
+from csplat.errors import InputError
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.ply import lint_ply
+from csplat_conformance.stated import Proof, Source, prove
+from csplat_render import Camera, render
+from csplat_render.arrays import RenderResult
+from csplat_render.virtual import virtual_cameras
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_trainer.loop import train
+from csplat_trainer.tuning import renders_of, split_views, tune
+
+#: Conditions whose chain goes on to learning in the usual tests: a repaired scene, and the two with the largest values.
+LEARNT = ("half the rows NaN", "float32 limits", "exploded")
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A scene after few steps of learning.
+
+    Attributes:
+        half: half its splats.
+        trained: splats that learnt from photographs of it.
+        losses: of each step.
+        tuned: what its tuned file decodes to, or why it cannot be tuned.
+    """
+
+    half: SplatModel
+    trained: SplatModel
+    losses: tuple[float, ...]
+    tuned: SplatModel | str
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A condition after each stage.
+
+    Attributes:
+        source: the scene as it is read.
+        findings: of its reader.
+        linted: ids of the repairs that `lint_ply` names.
+        refusal: why strict reading refuses it; "" if it does not.
+        result: its file, preset `balanced`.
+        decoded: the scene of the file.
+        proof: of the file's stated errors.
+        pictures: of source and decoded scene, in the modes `fast` and `exact`.
+        learnt: of `LEARNT` alone.
+    """
+
+    source: SplatModel
+    findings: tuple[Finding, ...]
+    linted: tuple[str, ...]
+    refusal: str
+    result: EncodeResult
+    decoded: SplatModel
+    proof: Proof
+    pictures: tuple[RenderResult, ...]
+    learnt: Learnt | None
+
+
+def chain_of(name: str) -> Chain:
+    """Take a condition through all stages; of a million splats 2,000."""
+    findings: list[Finding] = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_small_scene(Path(folder), name)
+        source, refusal = read_ply(path, report=findings), ""
+        linted = tuple(one.id for one in lint_ply(path) if one.kind == "repair")
+        try:
+            read_ply(path, strict=True)
+        except InputError as error:
+            refusal = str(error)
+    result = encode_with_report(source)
+    decoded = decode(result.data)
+    proof = prove(
+        Source.of(source), decoded, read_header(result.data), read_stated_errors(result.data), result.source_index
+    )
+    (camera,) = virtual_cameras(source, 1, 48, 36)
+    pictures = [render(model, camera, mode=mode) for model in (source, decoded) for mode in ("fast", "exact")]
+    learnt = _learn(source) if name in LEARNT else None
+    return Chain(source, tuple(findings), linted, refusal, result, decoded, proof, tuple(pictures), learnt)
+
+
+def _learn(source: SplatModel) -> Learnt:
+    seen_from = virtual_cameras(source, 9, 32, 24)
+    half = simplify(source, keep=0.5, views=views_of(seen_from), options=SimplifyOptions(rounds=1, effort=1)).model
+    options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
+    trained = train(photographs_of(source, seen_from, source.means[:COUNT]), options)
+    try:
+        tuned = _tune(source, seen_from)
+    except InputError as error:
+        tuned = str(error)
+    return Learnt(half, trained.model, tuple(trained.log["losses"]), tuned)
+
+
+def _tune(source: SplatModel, seen_from: list[Camera]) -> SplatModel:
+    views = split_views(renders_of(source, seen_from, BLACK, None), BLACK, aside=2)
+    frozen = Draft.of(source, COARSE).frozen()
+    result = tune(frozen, views, replace(SHORT, iterations=20))
+    return decode(frozen.coded(result.held).write().data)
+
+
+def assert_finite(model: SplatModel) -> None:
+    """Fail if an array of a scene holds NaN or infinity."""
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.isfinite(getattr(model, name)).all(), name

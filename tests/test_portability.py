@@ -1,0 +1,300 @@
+"""Systems other than Linux: each call that they lack has a replacement, or a clear refusal.
+
+Tests hide such calls on Linux. What only the other systems themselves can show is left to their runners.
+"""
+
+import mmap
+import multiprocessing
+import operator
+import os
+import re
+import select
+import signal
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+import pytest
+
+import csplat
+from csplat import memory, processes, system
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.formats.sog_files import Parts
+from csplat.inputs import LetGo
+from csplat_conformance.answers import Answer
+from csplat_conformance.mutation import __main__ as mutation
+from csplat_conformance.process import run_program
+from csplat_conformance.report import Status
+from csplat_conformance.serving import Served
+from csplat_tools.batches.finding import leads_out
+from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
+from csplat_tools.batches.workers import Worker, WorkerLostError
+from csplat_trainer.report import peak_memory
+
+ROOT = Path(__file__).resolve().parent.parent
+PRODUCT = ("codec/csplat", "conformance/csplat_conformance", "tools/csplat_tools", "trainer")
+
+#: Modules and attributes that Windows or macOS lack, and that product code might use.
+POSIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
+POSIX_NAMES = {
+    "mmap": r"MAP_\w+|PROT_\w+|MADV_\w+",
+    "multiprocessing": r"forkserver",
+    "os": (
+        r"chown|fchmod|fchown|fork\w*|getloadavg|getpg\w+|getuid|geteuid|initgroups|killpg|lchown|mkfifo|nice|openpty"
+        r"|posix_\w+|pread\w*|pwrite\w*|readv|sched_\w+|sendfile|setpg\w+|setsid|statvfs|sysconf|umask|uname|wait[34]"
+        r"|writev|O_(?!APPEND|CREAT|EXCL|RDONLY|RDWR|TRUNC|WRONLY)\w+"
+    ),
+    "select": r"poll|epoll|kqueue|select",
+    "signal": r"SIG(?!INT\b|TERM\b|_IGN\b|_DFL\b)[A-Z]+|alarm|setitimer|pthread_\w+|sigwait\w*",
+}
+IMPORT = re.compile(r"^ *(?:import|from) (?P<module>\w+)", re.MULTILINE)
+
+#: Files of the product that use them, each with the reason.
+USERS = {
+    "codec/csplat/inputs.py": "advice on pages that were read, if the system takes any",
+    "codec/csplat/memory.py": "the size of the memory, if the system tells",
+    "codec/csplat/system.py": "the replacements",
+    "conformance/csplat_conformance/mutation/python.py": "forks; `main` refuses systems that cannot",
+    "conformance/csplat_conformance/serving.py": "waits for pipes, in a thread where it cannot",
+    "trainer/csplat_trainer/report.py": "peak memory, or none",
+}
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Hide what Windows lacks from product code."""
+    for module, names in {
+        mmap: ("MAP_PRIVATE", "MAP_ANONYMOUS", "MAP_NORESERVE", "MADV_DONTNEED"),
+        os: ("fork", "killpg", "link", "pread", "preadv", "sched_getaffinity", "sysconf"),
+        signal: ("pthread_kill",),
+    }.items():
+        for name in names:
+            monkeypatch.delattr(module, name, raising=False)
+    for name in ("fcntl", "resource"):
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+def product_files():
+    return [path for folder in PRODUCT for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def posix_uses(path):
+    """Return what a file uses of the tables above, as `os.pread`."""
+    text = path.read_text("utf-8")
+    found = {match["module"] for match in re.finditer(IMPORT, text) if match["module"] in POSIX_MODULES}
+    for module, names in POSIX_NAMES.items():
+        found |= {f"{module}.{name}" for name in re.findall(rf"\b{module}s?\.({names})\b", text)}
+    return sorted(found)
+
+
+def test_calls_that_only_some_systems_have_are_in_few_files():
+    found = {path.relative_to(ROOT).as_posix(): posix_uses(path) for path in product_files()}
+    users = {name for name, uses in found.items() if uses}
+    assert {} == {name: found[name] for name in users - set(USERS)}, "csplat.system is the place for these"
+    assert set(USERS) <= users
+
+
+# files
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_file_is_read_in_parts(make_model, tmp_path):
+    path, model = tmp_path / "scene.csplat", make_model(3000, 1)
+    path.write_bytes(csplat.encode(model, csplat.EncodeOptions(preset="fast", tile_splats=1000)))
+    whole = csplat.decode(path)
+    with csplat.open(path) as file:
+        tiles = list(file.tiles())  # each batch is discarded before the next one
+        again = file.read()
+    assert len(tiles) == 3
+    assert np.array_equal(whole.means, np.concatenate([tile.means for tile in tiles]))
+    assert np.array_equal(whole.means, again.means)
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_threads_read_a_file_at_the_same_time(tmp_path, monkeypatch):
+    seek = os.lseek
+
+    def slow_seek(*where):
+        seek(*where)
+        time.sleep(1e-4)  # another thread has its turn
+
+    monkeypatch.setattr(os, "lseek", slow_seek)
+    data = np.random.default_rng(0).bytes(40 * 500)
+    (tmp_path / "data").write_bytes(data)
+    buffers = [bytearray(500) for _ in range(40)]
+    with (tmp_path / "data").open("rb") as stream, ThreadPoolExecutor(4) as pool:
+        places, views = range(0, len(data), 500), map(memoryview, buffers)
+        read = list(pool.map(lambda at: system.read_at(stream.fileno(), 500, at), places))
+        counts = list(pool.map(lambda view, at: system.read_into(stream.fileno(), view, at), views, places))
+        assert system.read_into(stream.fileno(), memoryview(bytearray(9)), len(data)) == 0
+    assert data == b"".join(read)
+    assert data == b"".join(buffers)
+    assert {500} == set(counts)
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_mapped_file_without_advice_is_read(tmp_path):
+    (tmp_path / "data").write_bytes(bytes(1 << 10))
+    with (tmp_path / "data").open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        view = memoryview(mapped)
+        LetGo(view).after(1 << 30)
+        assert view[-1] == 0
+        view.release()
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_of_two_writers_of_one_name_one_fails_without_hard_links(tmp_path):
+    path = tmp_path / "out"
+
+    def write_late():
+        with atomic_writer(path, replace=False) as stream:
+            stream.write(b"late")
+            path.write_bytes(b"first")
+
+    with pytest.raises(FileExistsError):
+        write_late()
+    with atomic_writer(tmp_path / "other", replace=False) as stream:
+        stream.write(b"alone")
+    assert {"out": b"first", "other": b"alone"} == {one.name: one.read_bytes() for one in tmp_path.iterdir()}
+
+
+def test_paths_of_windows_do_not_lead_out_of_a_folder(tmp_path):
+    (tmp_path / "C:x").write_bytes(b"")  # the file x of the current folder of drive C
+    with pytest.raises(InputError, match="outside"):
+        Parts(tmp_path, "scene").read("C:x")
+    names = {"sub/a.csplat": False, "../a": True, "..\\a": True, "C:a": True, "C:\\a": True, "\\a": True, "/a": True}
+    assert names == {name: leads_out(name, PureWindowsPath) for name in names}
+
+
+# memory
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_memory_has_a_size_where_the_system_does_not_tell(monkeypatch):
+    def absent(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "read_text", absent)
+    assert memory.available_bytes() > 1 << 30
+    assert peak_memory() is None
+    assert system.core_count() == os.cpu_count()
+
+
+# processes
+
+
+@pytest.mark.slow
+def test_work_is_given_to_processes_that_are_no_copies(monkeypatch):
+    starts, context = [], multiprocessing.get_context
+    monkeypatch.setattr(processes, "CAN_COPY", False)
+    monkeypatch.setattr(multiprocessing, "get_context", lambda start: (starts.append(start), context(start))[1])
+    done = dict(processes.each_apart(operator.mul, 3, [1, 2, 3], workers=2, copied=True))
+    assert {1: 3, 2: 6, 3: 9} == done
+    assert ["spawn"] == starts
+
+
+def test_command_lines_of_windows_keep_their_backslashes():
+    line = r""" C:\tools\decode.exe "C:\my files\{input}" '--out=D:\x y' # {outdir}"""
+    words = [r"C:\tools\decode.exe", r"C:\my files\{input}", r"--out=D:\x y", "#", "{outdir}"]
+    assert words == system.split_words(line, is_posix=False)
+    assert ["a b", "c d", "#"] == system.split_words(r"a\ b 'c d' #", is_posix=True)
+    with pytest.raises(ValueError, match="quotation"):
+        system.split_words("'", is_posix=False)
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_program_ends_or_is_killed_without_process_groups():
+    ended = run_program(f"{sys.executable} -S -c 'print(5)'", {}, 20)
+    assert (None, b"5\n") == (ended.status, ended.stdout)
+    begun = time.monotonic()
+    assert run_program(f"{sys.executable} -S -c 'import time; time.sleep(60)'", {}, 0.3).status is Status.HUNG
+    assert time.monotonic() - begun < 20
+
+
+class _Echo(Served):
+    def ask(self, data: bytes) -> bytes | Answer:
+        return self._answered(data)
+
+
+def test_a_decoder_is_asked_where_pipes_cannot_be_waited_for(monkeypatch):
+    monkeypatch.delattr(select, "poll")
+    monkeypatch.delattr(select, "select")
+    answers = (
+        "import sys\nfor line in sys.stdin:\n    print(line, end='', flush=True)\n    line == 'end\\n' and exit(3)"
+    )
+    with _Echo([sys.executable, "-S", "-c", answers], timeout=20) as served:
+        assert b"one\n" == served.ask(b"one\n")
+        assert b"end\n" == served.ask(b"end\n")
+        assert Status.CRASHED is served.ask(b"gone\n").status
+    with _Echo([sys.executable, "-S", "-c", "import time; time.sleep(60)"], timeout=0.3) as served:
+        assert Status.HUNG is served.ask(b"silent\n").status
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_mutants_are_refused_without_copies_of_processes(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mutation", "--count", "1"])
+    assert mutation.main() == 1
+    assert "use Linux or macOS" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_the_main_thread_is_interrupted_without_signals_to_threads():
+    def wait():
+        threading.Thread(target=system.interrupt_main_thread).start()
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# batches
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_one_program_at_a_time_writes_a_journal_without_fcntl(tmp_path):
+    with open_journal(tmp_path), pytest.raises(InputError, match="another batch writes to"), open_journal(tmp_path):
+        pass
+    with open_journal(tmp_path) as journal:
+        journal.add(Record("a.ply", "a.csplat", ("encode",), "0", "done"))
+    assert ["a.csplat"] == list(read_journal(tmp_path)[0])
+    assert [JOURNAL] == [path.name for path in tmp_path.iterdir()]
+
+
+def test_a_journal_is_closed_before_it_is_replaced(tmp_path, monkeypatch):
+    replaced, replace = [], Path.replace
+
+    def watched(self, target):
+        with pytest.raises(ValueError, match="closed"):  # Windows replaces no open file
+            journal.begin([])
+        replaced.append(Path(target).name)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", watched)
+    with open_journal(tmp_path) as journal:
+        journal.add(Record("a.ply", "a.csplat", ("encode",), "0", "done"))
+        journal.end()
+    assert [JOURNAL] == replaced
+    assert ["a.csplat"] == list(read_journal(tmp_path)[0])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("elsewhere")
+def test_a_worker_ends_without_signals():
+    worker = Worker()
+    try:
+        assert worker.ask("check", words=["encode", "--preset", "fast"])["ending"] == ".csplat"
+        begun = time.monotonic()
+    finally:
+        worker.close()
+    assert time.monotonic() - begun < 8  # it is killed after ten seconds
+    with pytest.raises(WorkerLostError):
+        worker.ask("check", words=["encode"])

@@ -1,0 +1,57 @@
+"""Unpack a wheel for tests: `python tests/wheel.py out/dist/csplat-0.1.0-py3-none-any.whl out/wheel`.
+
+The folder then comes first on PYTHONPATH, so that tests see what users install, in the one environment that there is.
+A file's modification time follows from its content, so that bytecode stays valid as long as the source is the same.
+numba does not notice changes in callees of a kernel that are in other files, so each state of all kernels has a cache
+folder of its own; its name is printed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import zipfile
+from pathlib import Path
+
+PACKAGES = ("csplat", "csplat_render", "csplat_trainer", "csplat_tools", "csplat_conformance")
+_EPOCH = 1_000_000_000  # seconds, 2001: modification times lie in the 136 years after it
+
+
+def unpack(wheel: Path, folder: Path) -> None:
+    """Make a folder hold the files of a wheel, and no others but bytecode.
+
+    Raises:
+        AssertionError: a package is absent.
+    """
+    with zipfile.ZipFile(wheel) as archive:
+        entries = {info.filename: info for info in archive.infolist() if not info.is_dir()}
+        for path in [one for one in folder.rglob("*") if one.is_file() and one.suffix != ".pyc"]:
+            if path.relative_to(folder).as_posix() not in entries:
+                path.unlink()
+        for name, info in entries.items():
+            path = folder / name
+            if not path.exists() or path.stat().st_mtime != _EPOCH + info.CRC or path.stat().st_size != info.file_size:
+                archive.extract(info, folder)
+                os.utime(path, (_EPOCH + info.CRC, _EPOCH + info.CRC))
+    for package in PACKAGES:
+        assert (folder / package / "__init__.py").exists(), f"{wheel} holds no package {package}"
+
+
+def kernel_cache(folder: Path) -> Path:
+    """Return the folder for compiled kernels of these sources; those of other sources are removed."""
+    total = hashlib.sha256()
+    for package in ("csplat_render", "csplat_trainer"):
+        for path in sorted((folder / package).rglob("*.py")):
+            total.update(path.read_bytes())
+    caches, name = folder.parent / "kernels", total.hexdigest()[:16]
+    for other in caches.glob("*"):
+        if other.name != name:
+            shutil.rmtree(other)
+    return caches / name
+
+
+if __name__ == "__main__":
+    unpack(Path(sys.argv[1]), Path(sys.argv[2]))
+    print(kernel_cache(Path(sys.argv[2]).absolute()))

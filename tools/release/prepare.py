@@ -1,0 +1,64 @@
+"""Prepare the packages of a release: check the tag, and write the address of the repository into their metadata.
+
+The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v0.1.0 URL=https://…`
+calls this before it builds. npm accepts a provenance only if `repository` in package.json is where it was built.
+
+    python tools/release/prepare.py --tag v0.1.0 --url https://github.com/OWNER/NAME
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def main(words: list[str] | None = None, root: Path = ROOT) -> int:
+    """Change pyproject.toml and codec/js/package.json in place; the status is 1 for a tag of another version."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tag", required=True, help="`v` and the version")
+    parser.add_argument("--url", required=True, help="of the repository, https")
+    args = parser.parse_args(words)
+    if not re.fullmatch(r"https://[\w.-]+(/[\w.-]+)+", args.url):
+        parser.error(f"--url is {args.url!r}, expected https://HOST/OWNER/NAME")
+    project, package = root / "pyproject.toml", root / "codec" / "js" / "package.json"
+    text = project.read_text("utf-8")
+    version = tomllib.loads(text)["project"]["version"]
+    if args.tag != f"v{version}":
+        sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, the version in pyproject.toml\n")
+        return 1
+    project.write_text(with_urls(text, args.url), "utf-8", newline="\n")
+    metadata = json.loads(package.read_text("utf-8")) | {
+        "homepage": args.url,
+        "repository": {"type": "git", "url": f"git+{args.url}.git", "directory": "codec/js"},
+    }
+    package.write_text(json.dumps(metadata, indent=2, ensure_ascii=False) + "\n", "utf-8", newline="\n")
+    return 0
+
+
+def with_urls(text: str, url: str) -> str:
+    """Return a pyproject.toml with the links that a package index shows; links that are there are replaced.
+
+    Args:
+        text: the file.
+        url: address of the repository.
+    """
+    links = {
+        "Homepage": url,
+        "Issues": f"{url}/issues",
+        "Changelog": f"{url}/blob/main/CHANGELOG.md",
+    }
+    table = "[project.urls]\n" + "".join(f'{name} = "{link}"\n' for name, link in links.items()) + "\n"
+    text = re.sub(r"(?ms)^\[project\.urls\]\n.*?(?=^\[)", "", text)
+    changed, count = re.subn(r"(?m)^(?=\[project\.optional-dependencies\]$)", lambda _: table, text)
+    assert count == 1, "pyproject.toml has no [project.optional-dependencies] to stand before"
+    return changed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
