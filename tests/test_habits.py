@@ -8,17 +8,6 @@ import pytest
 
 TESTS = Path(__file__).resolve().parent
 
-#: Files that still replace something private, and what: the list only ever gets shorter.
-ALLOWED = {
-    "conftest.py": {"csplat_tools.views.finding._DECIDING", "csplat_tools.views.finding._JUDGING"},
-    "test_distortion_benchmark.py": {"scenes._SAMPLE", "distortion._GRID"},
-    "test_encoder_judging.py": {"figures._FILE"},
-    "test_fuzz.py": {"targets._MEMORY"},
-    "test_lpips.py": {"module._from_torch", "module._heads_path"},
-    "test_mutation.py": {"python._PROCESSOR_SECONDS"},
-    "test_sliced.py": {"sliced._LEAST_BYTES", "sliced._Picture._draw", "scenes._SAMPLE", "sliced._Picture._read"},
-}
-
 #: What a file contains that replaces, skips or expects a failure: no other file is parsed.
 WORDS = re.compile(r"setattr|delattr|patch|skip|xfail|\w\]?\._[a-z]\w* *[-+*/|]?= ", re.IGNORECASE)
 
@@ -114,12 +103,7 @@ def test_what_is_private_is_found_in_all_ways_of_replacing_it(text, names):
 
 @pytest.mark.slow
 def test_no_test_replaces_what_is_private_to_a_module(trees):
-    found = [
-        f"{file}:{line}: {name}"
-        for file, nodes in trees.items()
-        for line, name in replaced(nodes)
-        if name not in ALLOWED.get(file, ())
-    ]
+    found = [f"{file}:{line}: {name}" for file, nodes in trees.items() for line, name in replaced(nodes)]
     assert not found, "\n".join(["make it a parameter, a field or a fixture:", *found])
 
 
