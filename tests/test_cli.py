@@ -531,7 +531,7 @@ def test_a_full_disk_leaves_nothing_and_is_told_with_the_file(tmp_path, csplat_f
 def test_a_full_standard_output_is_one_line(csplat_file, monkeypatch, capsys):
     line = "error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
     for words in (("info", csplat_file), ("--version",)):
-        full = Path("/dev/full").open("w")  # noqa: SIM115  # what closes it fails as well
+        full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115  # what closes it fails as well
         monkeypatch.setattr(sys, "stdout", full)
         status = status_of(*words)
         monkeypatch.undo()

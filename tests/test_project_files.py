@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import csplat
+
 ROOT = Path(__file__).resolve().parent.parent
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 PUBLISHING = ("npm publish ", "gh release create ")  # what a release does after everything was built and tested
@@ -96,15 +98,15 @@ def prepare(root, *words):
 @pytest.fixture
 def copied(tmp_path):
     """The files that a release changes."""
-    (tmp_path / "codec" / "js").mkdir(parents=True)
-    for name in ("pyproject.toml", "codec/js/package.json"):
+    for name in ("pyproject.toml", "codec/js/package.json", "codec/csplat/__init__.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     return tmp_path
 
 
 def test_a_release_names_the_repository_that_it_is_made_in(copied):
     before = tomllib.loads((copied / "pyproject.toml").read_text("utf-8"))
-    tag = f"v{before['project']['version']}"
+    tag = f"v{csplat.__version__}"
     for url in ("https://github.com/first/csplat", "https://github.com/second/csplat"):  # twice: links are replaced
         assert prepare(copied, "--tag", tag, "--url", url) == 0
         after = tomllib.loads((copied / "pyproject.toml").read_text("utf-8"))

@@ -38,7 +38,7 @@ def tensor(values):
 def load_plainly(path, **_):
     """Read the tensors of a checkpoint as `torch.load` does, float32 and contiguous ones alone."""
 
-    class Reader(pickle.Unpickler):
+    class Reader(pickle.Unpickler):  # noqa: S301  # a file of the project
         def find_class(self, module, name):
             if name == "_rebuild_tensor_v2":
                 return lambda values, first, shape, *_: tensor(values[first:][: np.prod(shape, dtype=int)]).reshape(

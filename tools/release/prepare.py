@@ -12,7 +12,6 @@ import argparse
 import json
 import re
 import sys
-import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -28,9 +27,9 @@ def main(words: list[str] | None = None, root: Path = ROOT) -> int:
         parser.error(f"--url is {args.url!r}, expected https://HOST/OWNER/NAME")
     project, package = root / "pyproject.toml", root / "codec" / "js" / "package.json"
     text = project.read_text("utf-8")
-    version = tomllib.loads(text)["project"]["version"]
+    version = re.findall(r'(?m)^__version__ = "(.+)"$', (root / "codec/csplat/__init__.py").read_text("utf-8"))[0]
     if args.tag != f"v{version}":
-        sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, the version in pyproject.toml\n")
+        sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, the version in codec/csplat/__init__.py\n")
         return 1
     project.write_text(with_urls(text, args.url), "utf-8", newline="\n")
     metadata = json.loads(package.read_text("utf-8")) | {
