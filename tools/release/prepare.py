@@ -29,7 +29,7 @@ def main(words: list[str] | None = None, root: Path = ROOT) -> int:
     text = project.read_text("utf-8")
     version = re.findall(r'(?m)^__version__ = "(.+)"$', (root / "codec/csplat/__init__.py").read_text("utf-8"))[0]
     if args.tag != f"v{version}":
-        sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, the version in codec/csplat/__init__.py\n")
+        sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, as codec/csplat/__init__.py states\n")
         return 1
     project.write_text(with_urls(text, args.url), "utf-8", newline="\n")
     metadata = json.loads(package.read_text("utf-8")) | {
