@@ -178,6 +178,7 @@ def test_absent_bands_are_decoded_as_zeros_and_the_others_as_without(make_model,
     assert {"sparse"} == set(codings)
 
 
+@pytest.mark.slow
 def test_absent_bands_cost_next_to_nothing(make_model):
     big, sizes, scalar = make_model(20_000, 3), {}, EncodeOptions(sh_coding="scalar")
     for share in (0.0, 0.95, 1.0):

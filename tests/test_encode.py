@@ -278,8 +278,9 @@ def wild_models(draw):
     )
 
 
+@pytest.mark.slow
 @given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
-@settings(max_examples=150, suppress_health_check=list(HealthCheck))
+@settings(max_examples=80, suppress_health_check=list(HealthCheck))
 def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
     # CNF-6
     with suppress(InputError):
@@ -295,6 +296,7 @@ def test_bytes_do_not_depend_on_threads(make_model, coding):
     assert one == two == four
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_blas_threads():
     code = (
         "import hashlib, numpy as np, csplat.model; r = np.random.default_rng(0);"
@@ -446,8 +448,8 @@ def test_sh_that_no_codebook_can_escape_is_coded_by_itself(make_model, preset):
         encode_with_report(replace(model, shN=rest), EncodeOptions(preset=preset, sh_coding="codebook"))
 
 
-@pytest.mark.parametrize("preset", PRESET_NAMES)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "seed"), [(name, seed) for seed, name in enumerate((*PRESET_NAMES, *PRESET_NAMES))])
 def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
     """Enough splats for cut tiles and codebooks, with importances from nothing to huge."""
     rng = np.random.default_rng(seed)

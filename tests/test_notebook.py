@@ -48,6 +48,7 @@ def test_without_splats_or_without_the_tools_a_notebook_shows_text(make_model, m
     assert make_model(5)._repr_html_() is None
 
 
+@pytest.mark.slow
 def test_the_frame_draws_and_is_kept_from_the_notebook(tab, site, make_model):
     shown = make_model(200, 0)._repr_html_()
     head = '<!doctype html><link rel="icon" href="data:,"><title>kept</title>'

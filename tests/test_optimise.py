@@ -148,12 +148,14 @@ def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, se
     assert len(np.unique(found.result.source_index)) == len(decoded.model)
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_in_a_file_that_a_search_found(many, search_at_psnr):
     measured = measure_errors(many, decode(search_at_psnr.data), search_at_psnr.result.source_index)
     stated = search_at_psnr.result.report.errors
     assert [] == [name for name in stated if measured[name][0] > stated[name][0]]
 
 
+@pytest.mark.slow
 def test_no_file_that_a_search_tried_reaches_its_psnr_with_fewer_bytes(search_at_psnr):
     report = search_at_psnr.report
     good = [one["size_bytes"] for one in report.tried if one["psnr"] is not None and one["psnr"] >= 30.0]
@@ -178,12 +180,14 @@ def test_a_loss_against_photographs_lets_splats_go(many, photographs, search_at_
     assert search_at_loss.report.splats < 900
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["search_at_size", "search_at_loss"])
 def test_whoever_judges_looks_at_nothing_but_the_chosen_file_of_a_size_or_a_loss(request, name):
     report = request.getfixturevalue(name).report
     assert [report.chosen] == [one for one in report.tried if one["psnr"] is not None]
 
 
+@pytest.mark.slow
 def test_the_report_says_what_why_and_how_sure(search_at_psnr):
     report = search_at_psnr.report
     assert {"psnr": 30.0} == report.goal
@@ -275,10 +279,12 @@ def test_a_share_of_the_splats_proves_what_it_states(kept, alike):
     assert decoded.stated_errors.refitted
 
 
+@pytest.mark.slow
 def test_shapes_are_clustered_by_what_the_views_say_of_them(kept):
     assert 0 < kept.result.report.options["shape_codebook_size"] <= 60
 
 
+@pytest.mark.slow
 def test_what_is_left_is_fitted_to_what_the_source_looks_like(kept, alike):
     bare = Judge.of_source(alike, judged_by(cameras(40)).judges, BLACK).psnr(alike.select(kept.result.source_index))
     assert kept.report.psnr > bare + 3.0
@@ -422,6 +428,7 @@ def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(
     assert 26 == report.sensitivity_views
 
 
+@pytest.mark.slow
 def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, measured):
     """An importance with curvatures is taken as it is, also inside of surroundings; one without keeps its weights."""
     given = replace(measured, curvatures=None)

@@ -48,6 +48,7 @@ def relative(found, expected):
 # the pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
     model = replace(scene(), antialiased=antialiased)
@@ -69,21 +70,23 @@ def test_the_pass_agrees_on_real_scenes(data_dir, name):
     assert_the_pass_agrees(read_ply(path), replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48))
 
 
+@pytest.mark.slow
 def test_the_pass_agrees_on_the_sample(sample_path):
     source = read_ply(sample_path)
     assert_the_pass_agrees(source, virtual_cameras(source, 1, 64, 48)[0])
 
 
 def assert_the_pass_agrees(source, camera):
-    model = source.select(slice(0, None, max(1, len(source) // 1500)))
+    model = source.select(slice(0, None, max(1, len(source) // 500)))
     found = measure_removal(model, [camera], transmittance_min=0.0)
-    rows = np.argsort(-found.error)[:400:80]
+    rows = np.argsort(-found.error)[:120:24]
     expected = removal_exact(model, [camera], rows, transmittance_min=0.0)
     off = relative(found.error[rows], expected).max()
     print(f"{off:.1e} off taking splats away one by one")
     assert off < 1e-4
 
 
+@pytest.mark.slow
 def test_finished_pixels_are_all_that_it_leaves_out():
     model = scene(count=120)
     model = replace(model, opacities=np.full(120, 0.97, np.float32), scales=model.scales + np.float32(1.0))
@@ -146,15 +149,16 @@ def test_threads_change_nothing(threads):
         np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_splats_at_a_slant_lose_no_row(antialiased):
-    model = scene(count=150, seed=4)
-    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (150, 1))  # needles: most rows of their boxes are empty
+    model = scene(count=60, seed=4)
+    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (60, 1))  # needles: most rows of their boxes are empty
     model = replace(model, scales=scales, antialiased=antialiased)
-    expected = removal_exact(model, views(1), np.arange(150), transmittance_min=0.0)
+    expected = removal_exact(model, views(1), np.arange(60), transmittance_min=0.0)
     found = measure_removal(model, views(1), dtype=np.float64, transmittance_min=0.0)
     assert relative(found.error, expected)[expected > 0.0].max() < 1e-9
-    assert np.count_nonzero(expected) > 100
+    assert np.count_nonzero(expected) > 40
 
 
 @pytest.mark.parametrize("name", [name for name, _ in adversarial()])

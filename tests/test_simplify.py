@@ -135,6 +135,7 @@ def test_rounds_ask_one_side_after_the_other(source):
     np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_exact_errors_choose_better_than_opacity(source):
     check = camera_sequence(source, 6, (64, 48), seed=9)
     judge = Judge.of_source(source, check, (0, 0, 0))
@@ -149,6 +150,7 @@ def test_exact_errors_choose_better_than_opacity(source):
 # the whole
 
 
+@pytest.mark.slow
 def test_keeping_a_share_keeps_that_many_and_says_which(source):
     result = simplify(source, keep=0.5, options=SMALL)
     assert len(result.model) == 225
@@ -160,6 +162,7 @@ def test_keeping_a_share_keeps_that_many_and_says_which(source):
     json.dumps(report, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_refit_gains_on_views_that_it_did_not_see(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
@@ -199,6 +202,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("goal", [35.0, 28.0])
 def test_a_target_psnr_is_reached(source, goal):
     views = views_of(camera_sequence(source, 16, (48, 36), seed=3))
@@ -208,6 +212,7 @@ def test_a_target_psnr_is_reached(source, goal):
     assert len(result.model) < len(source)
 
 
+@pytest.mark.slow
 def test_more_loss_lets_more_splats_go(source):
     cameras = camera_sequence(source, 16, (48, 36), seed=5)
     rng = np.random.default_rng(1)
@@ -217,7 +222,7 @@ def test_more_loss_lets_more_splats_go(source):
     judge = photograph_judge(views.pictures(views.decides), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False))
+        result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False, refit=False))
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -234,11 +239,12 @@ def test_nothing_changes_where_everything_stays(source):
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keep", "options", "left"),
     [
         (0.998, {}, 449),  # less than a splat for each round
-        (0.9, {"rounds": 300}, 405),
+        (0.9, {"rounds": 60}, 405),
         (1e-4, {"keep_unseen": False, "rounds": 1}, 1),
     ],
 )
@@ -247,6 +253,7 @@ def test_as_many_stay_as_were_asked_for_and_one_at_least(source, keep, options, 
     assert left == len(simplify(source, keep=keep, options=chosen).model)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_threads(source):
     one, two = (simplify(source, keep=0.5, options=replace(SMALL, threads=threads)) for threads in (1, 2))
     np.testing.assert_array_equal(one.source_index, two.source_index)
@@ -267,6 +274,7 @@ def test_bands_that_are_worth_less_than_their_bits_go():
     assert [3, 15, 15] == free.sum(axis=1).tolist()
 
 
+@pytest.mark.slow
 def test_bands_without_worth_are_zero_and_others_are_not(source):
     result = simplify(source, keep=0.4, options=SMALL)
     stays = result.stays
@@ -308,6 +316,7 @@ def invoke(*words):
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path):
     scene, out, report = tmp_path / "scene.ply", tmp_path / "out.ply", tmp_path / "report.json"
     write_ply(scene, source)
@@ -323,19 +332,20 @@ def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path
     assert "--force replaces it" in again.stderr
 
 
+@pytest.mark.slow
 def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(source, tmp_path, monkeypatch):
-    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda _, cameras, **__: cameras[0].W / 4800)
+    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda _, cameras, **__: cameras[0].W / 1200)
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
     words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--set", "refit=no", "--cameras", cameras)
-    result = invoke(*words, "--view-size", "48x36", "--json")
+    result = invoke(*words, "--views", "40", "--view-size", "48x36", "--json")
     assert result.exit_code == 0, result.output
     assert "this takes about 1 to 2 minutes here" in result.stderr
     report = json.loads(result.stdout)
     assert report["decided_psnr"] >= 30.0
     assert {"cameras": "cameras.json", "views": 10} == report["judged_by"]
-    assert report["views"]["used"] >= 150  # so few cameras judge alone; virtual ones teach, but those that are the same
+    assert report["views"]["used"] >= 30  # so few cameras judge alone; virtual ones teach, but those that are the same
 
 
 def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path):

@@ -115,6 +115,7 @@ def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
     assert (300, 0) == (found.report.splats, found.report.renders)
 
 
+@pytest.mark.slow
 def test_outliers_keep_to_a_bound_of_the_means(scene):
     away = (scene.means[:20] * 3000.0).astype(np.float32)
     far = replace(scene, means=np.concatenate([away, scene.means[20:]]))
@@ -178,6 +179,7 @@ def test_the_command_reports_a_share_as_json_and_its_file_is_proved(tmp_path, pl
     assert "150 pruned" in run("info", out).stdout
 
 
+@pytest.mark.slow
 def test_the_command_keeps_to_largest_errors(tmp_path, ply):
     out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
     arguments = ["encode", ply, out, "--max-error", "means=2mm,sh0=0.01", "--unit-metres", "0.5", "--json"]

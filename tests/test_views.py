@@ -192,10 +192,11 @@ def command_words(name, folder, out):
         "finetune": (
             "finetune", ply, "-o", out / "s.csplat", "--iterations", "2", "--set", "sh-coding=none", "--keep", "0.7"
         ),
-        "tradeoff": ("tradeoff", ply, "--what", "targets=30,simplify=0.5"),
+        "tradeoff": ("tradeoff", ply, "--what", "targets=30", "--preset", "fast"),
     }[name]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["compare", "simplify", "max-loss", "sensitivity", "finetune", "tradeoff"])
 def test_no_command_decides_by_what_judges(sets, made, tmp_path, name):
     invoke(*command_words(name, sets["rgb"], tmp_path), "--data", sets["rgb"], "--test-every", "5")
@@ -209,6 +210,7 @@ def test_no_command_decides_by_what_judges(sets, made, tmp_path, name):
     assert all(numbers(views.judges) in ([0, 5, 10, 15], []) for views in of_data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_whoever_judges_says_the_same_of_the_same_scene(sets, tmp_path, kind):
     ply, own = sets[kind] / "scene.ply", ("--data", sets[kind], "--test-every", "5", "--size", "24x20")
