@@ -147,3 +147,13 @@ def tuned_file(once, trained_scene, tmp_path_factory):
     from trained import make_tuned, run_here
 
     return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
+
+
+@pytest.fixture(scope="session")
+def file_runs(once, tmp_path_factory):
+    """Runs of `csplat train` to files, see trained.py; further ones write into a folder of their own name."""
+    pytest.importorskip("numba", reason="training wants the extra [render]")
+    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    from trained import FileRuns
+
+    return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))
