@@ -183,3 +183,13 @@ def _searched(once, name: str, **goal: float):
         return captures.found_within(scene, views, **goal)
 
     return once(f"search at a {name}", find)
+
+
+@pytest.fixture(scope="session")
+def file_runs(once, tmp_path_factory):
+    """Runs of `csplat train` to files, see trained.py; further ones write into a folder of their own name."""
+    pytest.importorskip("numba", reason="training wants the extra [render]")
+    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    from trained import FileRuns
+
+    return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

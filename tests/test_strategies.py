@@ -246,7 +246,7 @@ def test_the_encoders_degree_is_the_reductions(source):
     assert (0, "truncated") == (scene.model.sh_degree, scene.options["reduced"]["sh"])
 
 
-@pytest.mark.parametrize("text", ["24", "0.05,means=200"])
+@pytest.mark.parametrize("text", ["24", "0.1,means=200"])
 def test_a_clustered_file_states_its_errors_against_the_source(source, text):
     kmeans = parse_kmeans(text, stages=2)
     reduction = Reduction(prune_opacity=0.2, sh_degree=1, kmeans=kmeans)
