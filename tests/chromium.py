@@ -1,11 +1,18 @@
-"""Chromium for tests: one browser per session, a tab per test, and a static server that counts what is asked of it.
+"""Chromium for tests: one browser per session, and a static server that counts the requests.
 
-    def test_something(tab, site):
+Loading the viewer's page costs two CPU seconds, showing another scene in it a tenth of one. So tests share a page
+that is loaded already, and take a tab of their own only when they need another address or other markup:
+
+    def test_a_scene_is_named(viewer):
+        viewer.show(data)
+        assert "scene.csplat" == viewer.text("#title")
+
+    def test_something_else(tab, site):
         site.add("/scene.csplat", data)
         tab.page.goto(site.url("/tools/viewer/index.html?scene=/scene.csplat"))
-        ...
         assert 206 in [one.status for one in site.requests]
 
+Every file of such tests has `pytestmark = IN_CHROMIUM`: they are slow, and run on one worker, which starts one browser.
 Where Chromium or playwright is absent the tests are skipped with the reason; with CI=true that is a failure.
 """
 
@@ -17,17 +24,22 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
+from viewer_pages import EnginePage, ViewerPage
 
 from csplat_tools.present.webroot import web_files
 
 ROOT = Path(__file__).resolve().parent.parent
-SERVED = ("tools/viewer", "codec/js")
+SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")
+
+#: Marks of a test that needs the browser.
+IN_CHROMIUM = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 
 #: WebGL2 on the CPU, with float render targets and float blending; deterministic pictures at one pixel per pixel.
 ARGUMENTS = [
@@ -52,7 +64,7 @@ TYPES = {
 
 @dataclass
 class Tab:
-    """A page of its own context, and what it complained about.
+    """A page, and what it complained about.
 
     Attributes:
         page: playwright's page.
@@ -201,19 +213,34 @@ def browser() -> Iterator[Any]:
         launched.close()
 
 
-@pytest.fixture
-def tab(browser: Any) -> Iterator[Tab]:
-    """A fresh page of 800 by 600 pixels; complaints that a test leaves in `problems` fail it."""
-    context = browser.new_context(viewport={"width": 800, "height": 600}, device_scale_factor=1)
+@pytest.fixture(scope="session")
+def context(browser: Any) -> Iterator[Any]:
+    """The profile that all tabs share: one of its own would cost a tab twice as much."""
+    made = browser.new_context(device_scale_factor=1)
+    yield made
+    made.close()
+
+
+@contextmanager
+def open_tab(context: Any, width: int, height: int) -> Iterator[Tab]:
+    """Open a page; complaints that are left in `problems` at the end are a failure."""
+    made = Tab(context.new_page())
     try:
-        made = Tab(context.new_page())
+        made.page.set_viewport_size({"width": width, "height": height})
         made.page.set_default_timeout(60_000)
         made.page.on("console", lambda message: message.type == "error" and made.problems.append(message.text))
         made.page.on("pageerror", lambda error: made.problems.append(str(error)))
         yield made
     finally:
-        context.close()
+        made.page.close()
     assert made.problems == []
+
+
+@pytest.fixture
+def tab(context: Any) -> Iterator[Tab]:
+    """A fresh page of 160 by 120 pixels."""
+    with open_tab(context, 160, 120) as made:
+        yield made
 
 
 @pytest.fixture
@@ -222,3 +249,55 @@ def site() -> Iterator[Site]:
     made = Site()
     yield made
     made.close()
+
+
+@pytest.fixture(scope="session")
+def viewer_page(context: Any) -> Iterator[ViewerPage]:
+    """The viewer's page, loaded once; tests take `viewer`."""
+    site = Site()
+    try:
+        with open_tab(context, *ViewerPage.SIZE) as tab:
+            page = ViewerPage(tab, site)
+            page.load()
+            yield page
+    finally:
+        site.close()
+
+
+@pytest.fixture
+def viewer(request: pytest.FixtureRequest, viewer_page: ViewerPage) -> Iterator[ViewerPage]:
+    """The viewer's page, loaded already; what the last test left open is closed. A failed test leaves a fresh page."""
+    failures = request.session.testsfailed
+    viewer_page.rest()
+    yield viewer_page
+    problems, viewer_page.tab.problems[:] = list(viewer_page.tab.problems), []
+    if problems or request.session.testsfailed > failures:
+        viewer_page.load()
+    assert problems == []
+
+
+@pytest.fixture(scope="session")
+def engine_page(context: Any) -> Iterator[EnginePage]:
+    """A page with the engine alone, loaded once; tests take `engine`."""
+    site = Site()
+    try:
+        with open_tab(context, 160, 120) as tab:
+            page = EnginePage(tab, site)
+            page.load()
+            page.start()
+            yield page
+    finally:
+        site.close()
+
+
+@pytest.fixture
+def engine(request: pytest.FixtureRequest, engine_page: EnginePage) -> Iterator[EnginePage]:
+    """The engine, made already; a failed test leaves a fresh page."""
+    failures = request.session.testsfailed
+    engine_page.page.evaluate("void (errors.length = 0)")
+    yield engine_page
+    problems, engine_page.tab.problems[:] = list(engine_page.tab.problems), []
+    if problems or request.session.testsfailed > failures:
+        engine_page.load()
+        engine_page.start()
+    assert problems == []
