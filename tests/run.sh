@@ -56,8 +56,11 @@ static_checks() {
 
 javascript() {
     have node "the JavaScript tests" || return 0
-    if have npm "the types of the JavaScript"; then
-        step "types (tsc)" javascript_types
+    if have npm "types and layout of the JavaScript"; then
+        [ node_modules/.package-lock.json -nt package-lock.json ] ||
+            step "npm packages" npm ci --silent --no-audit --no-fund --ignore-scripts
+        step "types (tsc)" npm run --silent types
+        step "layout (prettier)" npm run --silent format:check
     fi
     step "JavaScript" javascript_tests
     if have chromium "the decoder in a browser"; then
@@ -125,10 +128,6 @@ have() {
         exit 1
     fi
     return 1
-}
-
-javascript_types() {
-    npm run --silent --prefix codec/js types
 }
 
 # The counts when all is well, every failure in full otherwise.

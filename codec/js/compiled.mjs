@@ -72,7 +72,10 @@ export class CompiledDecoder {
     if (module === null) return null;
     const decoder = spare?.deref() ?? new CompiledDecoder(module);
     spare = null;
-    const parts = new Map([[0, head], [spec.HEADER_SIZE, index]]);
+    const parts = new Map([
+      [0, head],
+      [spec.HEADER_SIZE, index],
+    ]);
     return decoder.reading(parts, new Set(), () => decoder.exports.open(fileSize)) ? decoder : null;
   }
 

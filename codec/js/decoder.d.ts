@@ -160,14 +160,7 @@ export interface Checks {
 }
 
 export type ExtraArray =
-  | Uint8Array
-  | Int8Array
-  | Uint16Array
-  | Int16Array
-  | Uint32Array
-  | Int32Array
-  | Float32Array
-  | Float64Array;
+  Uint8Array | Int8Array | Uint16Array | Int16Array | Uint32Array | Int32Array | Float32Array | Float64Array;
 
 /** The arrays of the spec, section 3, in C order. */
 export interface Splats {

@@ -165,7 +165,8 @@ function checkCounts(head, index, limits) {
     );
   }
   const least =
-    (head.head_size - spec.INDEX_HEAD_SIZE) +
+    head.head_size -
+    spec.INDEX_HEAD_SIZE +
     head.attribute_count * head.attribute_size +
     head.codebook_count * head.codebook_size +
     head.extra_count * head.extra_size +

@@ -75,7 +75,10 @@ export class Reader {
     const inflate = options.inflate ?? (await platformInflate());
     const reader = new this(source, header, limits, inflate, compiled);
     reader.inflates = options.inflate !== undefined;
-    reader.opening = new Map([[0, head], [spec.HEADER_SIZE, index]]);
+    reader.opening = new Map([
+      [0, head],
+      [spec.HEADER_SIZE, index],
+    ]);
     return reader;
   }
 
@@ -408,7 +411,13 @@ export class Reader {
   async fetchTable(key, id) {
     const record = /** @type {DirectoryRecord} */ (this.codebookChunks.get(key));
     const payload = this.opened(await this.codebookChunk(key), record);
-    return readTable(payload, record, /** @type {CodebookRecord} */ (this.codebooks.get(id)), this.header.attributes, this.inflate);
+    return readTable(
+      payload,
+      record,
+      /** @type {CodebookRecord} */ (this.codebooks.get(id)),
+      this.header.attributes,
+      this.inflate,
+    );
   }
 
   /**

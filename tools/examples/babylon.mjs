@@ -17,10 +17,18 @@ addEventListener('resize', () => engine.resize());
 try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const onProgress = ({ loaded }) => (words.textContent = `${loaded} bytes`);
-  const { meshes: [splats] } = await ImportMeshAsync(url, scene, { onProgress });
+  const {
+    meshes: [splats],
+  } = await ImportMeshAsync(url, scene, { onProgress });
   const { center, radius } = splats.metadata.csplat.bounds;
   camera.setTarget(Vector3.FromArray(center));
-  Object.assign(camera, { alpha: -Math.PI / 2, beta: 1.25, radius: 3.2 * radius, minZ: 0.01, wheelDeltaPercentage: 0.01 });
+  Object.assign(camera, {
+    alpha: -Math.PI / 2,
+    beta: 1.25,
+    radius: 3.2 * radius,
+    minZ: 0.01,
+    wheelDeltaPercentage: 0.01,
+  });
   engine.runRenderLoop(() => scene.render());
   words.textContent = '';
 } catch (error) {

@@ -18,7 +18,10 @@ const scene = new THREE.Scene();
 try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const splats = await loadCsplat(url, { onProgress: (loaded) => (words.textContent = `${loaded} bytes`) });
-  const { header, bounds: { center, radius } } = splats.userData.csplat;
+  const {
+    header,
+    bounds: { center, radius },
+  } = splats.userData.csplat;
   const plain = { preBlurAmount: 0.3, blurAmount: 0 }; // Spark draws scenes as antialiased ones unless it is told otherwise
   scene.add(new SparkRenderer({ renderer, ...(header.antialiased ? {} : plain) }), splats);
   camera.position.copy(controls.target.fromArray(center)).add(new THREE.Vector3(0, radius, 3 * radius));

@@ -9,5 +9,9 @@ export default defineConfig({
   // The decoder lies beside these pages, not in node_modules, and takes its engines from here.
   resolve: { dedupe: Object.keys(manifest.dependencies) },
   server: { fs: { allow: ['.', '../../codec/js'] } },
-  build: { rollupOptions: { input: pages.map((name) => `${name}.html`) }, chunkSizeWarningLimit: 4000, target: 'esnext' },
+  build: {
+    rollupOptions: { input: pages.map((name) => `${name}.html`) },
+    chunkSizeWarningLimit: 4000,
+    target: 'esnext',
+  },
 });

@@ -77,7 +77,9 @@ export function findFrame({ samples, weights }, up) {
  * @returns {Float32Array}
  */
 export function evened(weights) {
-  const positive = Float32Array.from(weights).filter((weight) => weight > 0).sort();
+  const positive = Float32Array.from(weights)
+    .filter((weight) => weight > 0)
+    .sort();
   if (!positive.length) return new Float32Array(weights.length).fill(1);
   const most = positive[positive.length >> 1];
   return Float32Array.from(weights, (weight) => Math.min(weight, most));

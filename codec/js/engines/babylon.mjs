@@ -59,7 +59,10 @@ export class CSPLATFileLoader {
       onProgress?.({ lengthComputable: total > 0, loaded, total });
     };
     const engine = /** @type {'RUB' | 'RUF'} */ (scene.useRightHandedSystem ? 'RUB' : 'RUF');
-    const source = typeof from === 'string' || from instanceof Blob ? from : new Blob([/** @type {ArrayBufferView<ArrayBuffer>} */ (from)]);
+    const source =
+      typeof from === 'string' || from instanceof Blob
+        ? from
+        : new Blob([/** @type {ArrayBufferView<ArrayBuffer>} */ (from)]);
     const target = { name: 'csplat for Babylon.js', engine, mirrors: true };
     openScene(source, { ...options, onProgress: progress }, target, [controller.signal])
       .then(onSuccess, (error) => onError?.(undefined, error))

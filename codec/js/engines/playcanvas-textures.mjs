@@ -73,7 +73,8 @@ export function bandImagesOf(header, layers, maxSize) {
   for (const [i, band] of bands.entries()) images[`csBand${i + 1}`] = band.image;
   images.csRows = imageOf(header.splatCount, bitsFor(Math.max(...bands.map(({ size }) => size))));
   const { texels } = images.csRows;
-  for (const [band, { index }] of bands.entries()) for (let i = 0; i < index.length; i++) texels[4 * i + band] = index[i];
+  for (const [band, { index }] of bands.entries())
+    for (let i = 0; i < index.length; i++) texels[4 * i + band] = index[i];
   const lattice = (/** @type {number} */ i) => bands[i]?.lattice ?? { low: 0, step: 0 };
   const parameters = {
     csLows: [lattice(0).low, lattice(1).low, lattice(2).low, header.flat ? 1 : 0],
@@ -106,7 +107,8 @@ function tileTable(tiles, maxSize) {
   const width = Math.max(1, Math.min(tiles.length, maxSize));
   const height = Math.max(1, Math.ceil(tiles.length / width));
   const texels = new Float32Array(4 * width * height);
-  for (const [i, { means }] of tiles.entries()) texels.set([...means.offsets.map((offset) => offset * means.step), means.step], 4 * i);
+  for (const [i, { means }] of tiles.entries())
+    texels.set([...means.offsets.map((offset) => offset * means.step), means.step], 4 * i);
   return { width, height, texels };
 }
 
@@ -137,7 +139,8 @@ function bandOf(header, bands, layer, maxSize) {
       const offset = packed.offsets[c];
       const factor = packed.step / lattice.step;
       for (let i = 0; i < n; i++) {
-        image.texels[4 * terms * (used + i) + place] = Math.round((offset + packed.columns[c * n + i]) * factor) - lattice.low;
+        image.texels[4 * terms * (used + i) + place] =
+          Math.round((offset + packed.columns[c * n + i]) * factor) - lattice.low;
       }
     }
     used += n;

@@ -17,10 +17,6 @@ export interface CsplatResource extends GSplatResourceBase {
 export class CsplatParser {
   constructor(app: AppBase, options?: LoadOptions);
   canParse(context: { ext: string }): boolean;
-  load(
-    url: string | { load: string },
-    callback: (error: any, resource?: CsplatResource) => void,
-    asset?: Asset,
-  ): void;
+  load(url: string | { load: string }, callback: (error: any, resource?: CsplatResource) => void, asset?: Asset): void;
   open(url: string, data: unknown): unknown;
 }

@@ -273,7 +273,9 @@ export class CsplatParser {
       onceSaid(NAME, 'trained with opacity compensation: set app.scene.gsplat.antiAlias = true');
     }
     const prepareCenters = world?.gsplatCentersEnabled !== false;
-    const resource = new CsplatResource(device, scene, imagesOf(header, tiles, device.maxTextureSize), { prepareCenters });
+    const resource = new CsplatResource(device, scene, imagesOf(header, tiles, device.maxTextureSize), {
+      prepareCenters,
+    });
     const degree = scene.progressive ? 0 : scene.degree;
     resource.addImages(Array.from({ length: degree }, (_, i) => tiles.map(({ sh }) => sh[i])));
     resource.csplat = scene.facts(() => resource.addBands(), undefined);

@@ -40,8 +40,15 @@ export async function openScene(from, options, target, signals = []) {
     const { metadata } = await reader.describe({ signal });
     const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
     const { extras } = reader.header;
-    if (extras.length) onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
-    return new SplatScene(reader, metadata, { degree, progressive: progressive === true && degree > 0, workers }, target, life);
+    if (extras.length)
+      onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
+    return new SplatScene(
+      reader,
+      metadata,
+      { degree, progressive: progressive === true && degree > 0, workers },
+      target,
+      life,
+    );
   } catch (error) {
     life.end();
     throw error;
@@ -126,7 +133,9 @@ export class SplatScene {
         this.sample.push(...centresOf(tile));
         if (!this.mirrored) yield { ...tile, first };
         else {
-          const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1));
+          const sh = tile.sh.map(
+            (/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1),
+          );
           yield { ...mirroredGeometry(tile), sh, first };
         }
       }
@@ -186,7 +195,10 @@ export class SplatScene {
     const turn = this.mirrored ? this.upright.map(([x, y, z]) => [-x, y, z]) : this.upright;
     const centre = [0, 1, 2].map((axis) => quantile(this.sample.map((mean) => mean[axis]), 0.5)); // prettier-ignore
     const away = this.sample.map((mean) => Math.hypot(...mean.map((value, axis) => value - centre[axis])));
-    return { center: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)), radius: quantile(away, MOST) };
+    return {
+      center: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)),
+      radius: quantile(away, MOST),
+    };
   }
 
   /**
@@ -199,7 +211,10 @@ export class SplatScene {
     const { signal } = this.life;
     signal.throwIfAborted();
     if (reader === null) throw new Error('all of it was read already');
-    reader.prefetch(header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))), { signal });
+    reader.prefetch(
+      header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))),
+      { signal },
+    );
     return reader;
   }
 }

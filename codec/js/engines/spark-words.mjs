@@ -123,7 +123,12 @@ export class PackedWords {
     const { rgbMin, rgbMax, lnScaleMin, lnScaleMax } = this.splatEncoding;
     const bytes = new Uint8ClampedArray(packedArray.buffer); // these round
     const alpha = alphaOf(header);
-    putColumns(tile.sh0, places(bytes, 16, 0), first, (sh0) => (255 * (displayColour(sh0) - rgbMin)) / (rgbMax - rgbMin));
+    putColumns(
+      tile.sh0,
+      places(bytes, 16, 0),
+      first,
+      (sh0) => (255 * (displayColour(sh0) - rgbMin)) / (rgbMax - rgbMin),
+    );
     putColumns(tile.opacities, places(bytes, 16, 3, 1), first, (q) => 255 * alpha(q));
     putColumns(tile.means, places(new Uint16Array(packedArray.buffer), 8, 2), first, half);
     const perScale = 254 / (lnScaleMax - lnScaleMin);

@@ -117,7 +117,8 @@ async function geometryOf(scene) {
     putColumns(tile.opacities, [alphaAt], first, (q) => 255 * alpha(q));
     for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
   }
-  if (!antialiased) onceSaid(NAME, 'three.js draws all splats as antialiased ones; small ones of scenes that are not come out fainter');
+  if (!antialiased)
+    onceSaid(NAME, 'three.js draws all splats as antialiased ones; small ones of scenes that are not come out fainter');
   const geometry = new BufferGeometry();
   geometry.setAttribute('position', new BufferAttribute(centres, 3));
   geometry.setAttribute('covariance', new BufferAttribute(covariances, 6));
@@ -160,7 +161,9 @@ class Bands {
    */
   constructor(count, degree) {
     this.words = SH_WORDS.slice(1, degree + 1).map((width) => new Uint32Array(width * count).fill(SH_ZERO));
-    this.places = this.words.map(({ buffer }, i) => places(new Uint8ClampedArray(buffer), 4 * SH_WORDS[i + 1], 0, 3 * (2 * i + 3)));
+    this.places = this.words.map(({ buffer }, i) =>
+      places(new Uint8ClampedArray(buffer), 4 * SH_WORDS[i + 1], 0, 3 * (2 * i + 3)),
+    );
   }
 
   /**

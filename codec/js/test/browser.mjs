@@ -54,7 +54,10 @@ const words = engine.startsWith('firefox')
   : engine === 'MiniBrowser'
     ? [url]
     : [...CHROMIUM, `--user-data-dir=${profile}`, url];
-const browser = spawn(program, words, { stdio: 'ignore', env: { ...process.env, WEBKIT_DISABLE_SANDBOX_THIS_IS_DANGEROUS: '1' } });
+const browser = spawn(program, words, {
+  stdio: 'ignore',
+  env: { ...process.env, WEBKIT_DISABLE_SANDBOX_THIS_IS_DANGEROUS: '1' },
+});
 browser.on('error', (problem) => fail(problem.message));
 setTimeout(() => fail(`no result after ${LIMIT_MS / 1000} s`), LIMIT_MS).unref();
 

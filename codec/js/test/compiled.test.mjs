@@ -14,7 +14,11 @@ const valid = manifest.filter(({ error }) => !error.code);
 /** All that it can decode of a file whose header and index are right, or null. */
 async function decodeAll(file, header) {
   const end = HEADER_SIZE + header.indexSize;
-  const decoder = await CompiledDecoder.open(file.length, file.subarray(0, HEADER_SIZE), file.subarray(HEADER_SIZE, end));
+  const decoder = await CompiledDecoder.open(
+    file.length,
+    file.subarray(0, HEADER_SIZE),
+    file.subarray(HEADER_SIZE, end),
+  );
   if (decoder === null) return null;
   const places = [...header.directory, ...header.tiles.flatMap(({ layers }) => layers)];
   const parts = new Map(places.map(({ offset, size }) => [offset, file.subarray(offset, offset + size)]));
@@ -33,7 +37,8 @@ test('reads every valid vector', async () => {
   for (const { name, expect } of valid) {
     const file = vector(name);
     const { arrays } = (await decodeAll(file, readHeader(file))) ?? assert.fail(name);
-    for (const [part, [, , sha]] of Object.entries(expect.floats)) assert.equal(hash(arrays[part]), sha, `${name} ${part}`);
+    for (const [part, [, , sha]] of Object.entries(expect.floats))
+      assert.equal(hash(arrays[part]), sha, `${name} ${part}`);
   }
 });
 
@@ -61,7 +66,8 @@ test('runs for floats and packed arrays, and steps aside for an inflate of the c
 
 test('a page that forbids WebAssembly has no such decoder', async () => {
   const file = vector('valid/rich');
-  for (const forbidden of ['compile', 'Instance']) { // WebKit forbids the second
+  for (const forbidden of ['compile', 'Instance']) {
+    // WebKit forbids the second
     const allowed = WebAssembly[forbidden];
     WebAssembly[forbidden] = function () {
       throw new WebAssembly.CompileError('unsafe-eval');
@@ -79,7 +85,12 @@ test('a decoder that breaks down is not used again', async () => {
   const file = vector('valid/rich');
   const reader = await CsplatReader.open(file.buffer);
   const { compiled } = reader;
-  compiled.exports = { ...compiled.exports, read_tile: () => { throw new WebAssembly.RuntimeError('unreachable'); } };
+  compiled.exports = {
+    ...compiled.exports,
+    read_tile: () => {
+      throw new WebAssembly.RuntimeError('unreachable');
+    },
+  };
   const tile = await reader.readTile(0);
   assert.ok(compiled.isBroken);
   compiled.close();

@@ -19,7 +19,14 @@ function covariances({ count, quats, scales }) {
       [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
       [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
     ].map((row) => row.map((value, axis) => value * Math.exp(scales[3 * i + axis])));
-    for (const [p, q] of [[0, 0], [0, 1], [0, 2], [1, 1], [1, 2], [2, 2]]) {
+    for (const [p, q] of [
+      [0, 0],
+      [0, 1],
+      [0, 2],
+      [1, 1],
+      [1, 2],
+      [2, 2],
+    ]) {
       out.push(rows[p].reduce((sum, value, axis) => sum + value * rows[q][axis], 0));
     }
   }
@@ -38,13 +45,31 @@ for (const { name } of valid) {
       const put = (width, fill) => {
         const array = new Float32Array(8 * (count + 1));
         fill(places(array, 8, 1, width));
-        return Float32Array.from({ length: width * count }, (_, at) => array[8 * (1 + Math.floor(at / width)) + 1 + (at % width)]);
+        return Float32Array.from(
+          { length: width * count },
+          (_, at) => array[8 * (1 + Math.floor(at / width)) + 1 + (at % width)],
+        );
       };
-      assert.deepEqual(put(3, (to) => putColumns(tile.means, to, 1, same)), floats.means);
-      assert.deepEqual(put(3, (to) => putColumns(tile.scales, to, 1, same)), floats.scales);
-      assert.deepEqual(put(1, (to) => putColumns(tile.opacities, to, 1, alphaOf(header))), floats.opacities);
-      assert.deepEqual(put(4, (to) => putQuats(tile.quats, header, to, 1, same)), floats.quats);
-      assert.deepEqual(put(3, (to) => putBand(tile.sh0, to, 1, same)), floats.sh0);
+      assert.deepEqual(
+        put(3, (to) => putColumns(tile.means, to, 1, same)),
+        floats.means,
+      );
+      assert.deepEqual(
+        put(3, (to) => putColumns(tile.scales, to, 1, same)),
+        floats.scales,
+      );
+      assert.deepEqual(
+        put(1, (to) => putColumns(tile.opacities, to, 1, alphaOf(header))),
+        floats.opacities,
+      );
+      assert.deepEqual(
+        put(4, (to) => putQuats(tile.quats, header, to, 1, same)),
+        floats.quats,
+      );
+      assert.deepEqual(
+        put(3, (to) => putBand(tile.sh0, to, 1, same)),
+        floats.sh0,
+      );
       const width = floats.shN.length / count;
       const shN = new Float32Array(width * (count + 1));
       for (const [i, band] of tile.sh.entries()) {
@@ -80,7 +105,8 @@ for (const name of ['valid/rich', 'valid/codebook_sh_1_3', 'valid/combined_tiles
       const terms = floats.shN.length / count / 3;
       const shN = new Float32Array(3 * terms * count);
       for (const [i, band] of packed.sh.entries()) {
-        if (band) putBand(mirroredBand(band, i + 1), places(shN, 3 * terms, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)), 0, same);
+        if (band)
+          putBand(mirroredBand(band, i + 1), places(shN, 3 * terms, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)), 0, same);
       }
       const signs = odd.slice(0, terms).flatMap((one) => [one, one, one]);
       assert.deepEqual(signed(shN, [0]), signed(floats.shN, signs));
@@ -105,11 +131,33 @@ test('of flat scenes the smallest scale is zero', async () => {
 
 test('a scene stands upright in the axes of an engine', () => {
   const map = (axes, engine, up) => uprightIn({ axes }, { up }, engine);
-  assert.deepEqual(map('RUB', 'RUB'), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]);
-  assert.deepEqual(map('', 'RUB'), [[1, 0, 0], [0, -1, 0], [0, 0, -1]]);
-  assert.deepEqual(map('RDF', 'RUF'), [[1, 0, 0], [0, -1, 0], [0, 0, 1]]);
-  assert.deepEqual(map('RFU', 'RUF', 'no direction'), [[1, 0, 0], [0, 0, 1], [0, 1, 0]]);
-  for (const up of [[0, -1, 0], [0, 1, 0], [0.6, -0.8, 0], [0, 0, 5], [2, 3, -1]]) {
+  assert.deepEqual(map('RUB', 'RUB'), [
+    [1, 0, 0],
+    [0, 1, 0],
+    [0, 0, 1],
+  ]);
+  assert.deepEqual(map('', 'RUB'), [
+    [1, 0, 0],
+    [0, -1, 0],
+    [0, 0, -1],
+  ]);
+  assert.deepEqual(map('RDF', 'RUF'), [
+    [1, 0, 0],
+    [0, -1, 0],
+    [0, 0, 1],
+  ]);
+  assert.deepEqual(map('RFU', 'RUF', 'no direction'), [
+    [1, 0, 0],
+    [0, 0, 1],
+    [0, 1, 0],
+  ]);
+  for (const up of [
+    [0, -1, 0],
+    [0, 1, 0],
+    [0.6, -0.8, 0],
+    [0, 0, 5],
+    [2, 3, -1],
+  ]) {
     const rows = map('RDF', 'RUF', up);
     const [x, y, z] = rows.map((row) => row.reduce((sum, one, i) => sum + (one * up[i]) / Math.hypot(...up), 0));
     assert.ok(Math.hypot(x, y - 1, z) < 1e-12, `${up} is up`);
@@ -127,7 +175,10 @@ for (const options of [{}, { progressive: true }, { workers: 0 }]) {
       const [first, last] = new Headers(headers).get('range').slice(6).split('-').map(Number);
       const body = bytes.slice(first, last + 1);
       asked.push([first, first + body.length]);
-      const known = { 'Content-Range': `bytes ${first}-${first + body.length - 1}/${bytes.length}`, 'Content-Length': body.length };
+      const known = {
+        'Content-Range': `bytes ${first}-${first + body.length - 1}/${bytes.length}`,
+        'Content-Length': body.length,
+      };
       return new Response(body, { status: 206, headers: known });
     };
     const target = { name: 'test', engine: 'RUB', mirrors: true };
@@ -135,7 +186,8 @@ for (const options of [{}, { progressive: true }, { workers: 0 }]) {
     let count = 0;
     for await (const tile of scene.tiles()) count += tile.count;
     const complete = scene.facts(async () => {
-      for (let layer = 1; layer <= scene.degree; layer++) for await (const band of scene.bands(layer)) assert.ok(band.count > 0);
+      for (let layer = 1; layer <= scene.degree; layer++)
+        for await (const band of scene.bands(layer)) assert.ok(band.count > 0);
     });
     await complete.complete;
     await new Promise((resolve) => setTimeout(resolve)); // what follows on it

@@ -74,7 +74,10 @@ for (const file of files) {
       const { left, operatorToken: operator, right } = node;
       for (const other of BINARY[operator.getText(source)] ?? []) {
         const changed = `${left.getText(source)} ${other} ${right.getText(source)}`;
-        replaced(node, other.length > 1 && other.endsWith('=') && !'<>=!'.includes(other[0]) ? changed : `(${changed})`);
+        replaced(
+          node,
+          other.length > 1 && other.endsWith('=') && !'<>=!'.includes(other[0]) ? changed : `(${changed})`,
+        );
       }
     } else if (ts.isPrefixUnaryExpression(node) && node.operator === Kind.ExclamationToken) {
       replaced(node, `(${node.operand.getText(source)})`);

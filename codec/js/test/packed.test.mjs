@@ -55,7 +55,7 @@ function rotations({ columns, offsets }, { levels }) {
 }
 
 const inflate = await zlibInflate();
-const ways = { 'WebAssembly': {}, 'JavaScript': { inflate } };
+const ways = { WebAssembly: {}, JavaScript: { inflate } };
 
 const cases = valid.flatMap(({ name }) => Object.entries(ways).map(([way, options]) => ({ name, way, options })));
 for (const { name, way, options } of cases) {

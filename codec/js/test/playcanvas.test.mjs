@@ -7,7 +7,9 @@ import { bandImagesOf, imagesOf } from '../engines/playcanvas-textures.mjs';
 import { manifest, vector } from './helpers.mjs';
 
 const fit = Math.fround;
-const valid = manifest.filter(({ name }) => /^(valid|render).*(rich|combined_tiles|codebook|sparse|opacities|quats|tiles)/.test(name));
+const valid = manifest.filter(({ name }) =>
+  /^(valid|render).*(rich|combined_tiles|codebook|sparse|opacities|quats|tiles)/.test(name),
+);
 
 /** All images of a scene. */
 function madeOf(header, tiles, size) {
@@ -40,7 +42,10 @@ function readerOf({ images, parameters }) {
       const image = images[`csBand${band}`];
       const line = image.width / (2 * band + 1);
       const row = at(images.csRows, i)[band - 1];
-      return (texel(image, (row % line) * (2 * band + 1) + m, Math.floor(row / line))[c] + csLows[band - 1]) * csSteps[band - 1];
+      return (
+        (texel(image, (row % line) * (2 * band + 1) + m, Math.floor(row / line))[c] + csLows[band - 1]) *
+        csSteps[band - 1]
+      );
     },
   };
 }
@@ -55,13 +60,15 @@ for (const { name } of valid) {
     const splat = readerOf(made);
     for (const { index, first, corner, extent, step } of header.tiles) {
       const floats = await reader.readTile(index);
-      const near = (found, wanted, off, what) => assert.ok(Math.abs(found - wanted) <= off, `${what}: ${found}, ${wanted}`);
+      const near = (found, wanted, off, what) =>
+        assert.ok(Math.abs(found - wanted) <= off, `${what}: ${found}, ${wanted}`);
       for (let i = 0; i < floats.count; i++) {
         for (let c = 0; c < 3; c++) {
           const mean = floats.means[3 * i + c];
           assert.equal(made.centers[3 * (first + i) + c], mean);
           near(splat.mean(first + i, c), mean, (Math.abs(corner[c]) + extent[c]) * step * 2 ** -22, 'mean');
-          const value = (found, wanted, what) => near(found, wanted, Math.abs(wanted) * 2 ** -22 + 2 ** -31 * 100, what);
+          const value = (found, wanted, what) =>
+            near(found, wanted, Math.abs(wanted) * 2 ** -22 + 2 ** -31 * 100, what);
           value(splat.scale(first + i, c), floats.scales[3 * i + c], 'scale');
           value(splat.quat(first + i, c), floats.quats[4 * i + 1 + c], 'quat');
           value(splat.colour(first + i, c), floats.sh0[3 * i + c], 'colour');

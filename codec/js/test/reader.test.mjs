@@ -20,10 +20,7 @@ test('one request for header and index of a small file, none for what came with 
   const tile = await reader.readTile(0);
   assert.deepEqual(requests, ['bytes=0-65535']);
   assert.equal(hash(tile.shN), hash((await decode(seeded)).shN));
-  assert.deepEqual(
-    { ...reader.checks, chunks: reader.checks.chunks > 0 },
-    { header: true, index: true, chunks: true },
-  );
+  assert.deepEqual({ ...reader.checks, chunks: reader.checks.chunks > 0 }, { header: true, index: true, chunks: true });
 });
 
 test('with small first requests each part is fetched by itself', async (t) => {
@@ -175,7 +172,9 @@ test('memory is a source as a Blob is', async () => {
   assert.deepEqual(means, whole.means.slice(0, means.length));
   for (const kept of [0, 10, 70, rich.length - 1]) {
     const cut = rich.slice(0, kept);
-    const refused = await Promise.all([cut.buffer, new Blob([cut])].map((from) => refusal(() => CsplatReader.open(from))));
+    const refused = await Promise.all(
+      [cut.buffer, new Blob([cut])].map((from) => refusal(() => CsplatReader.open(from))),
+    );
     assert.deepEqual(refused[0], refused[1]);
   }
 });

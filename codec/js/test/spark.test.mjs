@@ -3,7 +3,15 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
-import { ExtWords, PackedWords, half, halvesSuffice, octahedral, paddedCount, sharedExponent } from '../engines/spark-words.mjs';
+import {
+  ExtWords,
+  PackedWords,
+  half,
+  halvesSuffice,
+  octahedral,
+  paddedCount,
+  sharedExponent,
+} from '../engines/spark-words.mjs';
 import { vector } from './helpers.mjs';
 
 /** Value of a float16. */
@@ -28,7 +36,9 @@ function ofOctahedral(word, axisBits, angleBits) {
 }
 
 const ofShared = (word) =>
-  [0, 1, 2].map((c) => ((word >>> (24 + c)) & 1 ? -1 : 1) * ((word >>> (8 * c)) & 255) * (2 ** ((word >>> 27) - 15) / 255));
+  [0, 1, 2].map(
+    (c) => ((word >>> (24 + c)) & 1 ? -1 : 1) * ((word >>> (8 * c)) & 255) * (2 ** ((word >>> 27) - 15) / 255),
+  );
 
 test('float16 is the nearest one', () => {
   for (let bits = 0; bits < 0x7bff; bits += 7) {
@@ -45,13 +55,17 @@ test('rotations and triples come back within their bits', () => {
     const quat = [Math.abs(Math.sin(i)), Math.sin(3 * i), Math.cos(7 * i), Math.sin(11 * i + 1)];
     const norm = Math.hypot(...quat);
     const [w, x, y, z] = quat.map((one) => one / norm);
-    for (const [axis, angle, off] of [[10, 12, 4e-3], [8, 8, 15e-3]]) {
+    for (const [axis, angle, off] of [
+      [10, 12, 4e-3],
+      [8, 8, 15e-3],
+    ]) {
       const found = ofOctahedral(octahedral(w, x, y, z, axis, angle), axis, angle);
       assert.ok(Math.hypot(found[0] - w, found[1] - x, found[2] - y, found[3] - z) < off, `${[w, x, y, z]}: ${found}`);
     }
     const triple = [x, y, z].map((one) => one * 2 ** ((i % 16) - 10));
     const most = Math.max(...triple.map(Math.abs));
-    for (const [c, value] of ofShared(sharedExponent(...triple)).entries()) assert.ok(Math.abs(value - triple[c]) <= most / 250);
+    for (const [c, value] of ofShared(sharedExponent(...triple)).entries())
+      assert.ok(Math.abs(value - triple[c]) <= most / 250);
   }
   assert.deepEqual([octahedral(1, 0, 0, 0, 10, 12) >>> 20, sharedExponent(0, 0, 0)], [0, 0]);
 });
@@ -65,7 +79,11 @@ test('float32 centres are taken where float16 is coarser than the file', () => {
   assert.deepEqual([tile(2 ** -11, 1.5), tile(2 ** -11, 2), tile(1, 70000)].map(halvesSuffice), [true, false, false]);
 });
 
-for (const [name, flat] of [['valid/rich', false], ['valid/codebook_sh_1_3', true], ['valid/combined_tiles', false]]) {
+for (const [name, flat] of [
+  ['valid/rich', false],
+  ['valid/codebook_sh_1_3', true],
+  ['valid/combined_tiles', false],
+]) {
   test(`${name}: both layouts hold its numbers`, async () => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const header = { ...reader.header, flat };
@@ -74,7 +92,9 @@ for (const [name, flat] of [['valid/rich', false], ['valid/codebook_sh_1_3', tru
     const ext = new ExtWords(header);
     const packed = new PackedWords(header, tiles);
     for (let layer = 1; layer <= header.shDegree; layer++) {
-      const bands = header.tiles.map(({ first }, i) => ({ first, count: tiles[i].count, sh: tiles[i].sh[layer - 1] })).filter(({ sh }) => sh);
+      const bands = header.tiles
+        .map(({ first }, i) => ({ first, count: tiles[i].count, sh: tiles[i].sh[layer - 1] }))
+        .filter(({ sh }) => sh);
       ext.addBands(layer, bands);
       packed.addBands(layer, bands);
     }
@@ -85,21 +105,39 @@ for (const [name, flat] of [['valid/rich', false], ['valid/codebook_sh_1_3', tru
       const floats = await reader.readTile(index);
       for (let i = 0; i < floats.count; i++) {
         const at = 4 * (first + i);
-        const near = (found, wanted, off, what) => assert.ok(Math.abs(found - wanted) <= off, `${what} ${i}: ${found}, ${wanted}`);
+        const near = (found, wanted, off, what) =>
+          assert.ok(Math.abs(found - wanted) <= off, `${what} ${i}: ${found}, ${wanted}`);
         const [a, b] = ext.extArrays;
         const scales = [...floats.scales.subarray(3 * i, 3 * i + 3)];
         const thin = flat ? scales.indexOf(Math.min(...scales)) : -1;
         for (let c = 0; c < 3; c++) {
           const mean = floats.means[3 * i + c];
           assert.equal(new Float32Array(a.buffer)[at + c], mean);
-          if (Math.abs(mean) < 65504) near(ofHalf(new Uint16Array(packed.packedArray.buffer)[2 * at + 2 + c]), mean, Math.abs(mean) / 2048 + 1e-7, 'mean');
+          if (Math.abs(mean) < 65504)
+            near(
+              ofHalf(new Uint16Array(packed.packedArray.buffer)[2 * at + 2 + c]),
+              mean,
+              Math.abs(mean) / 2048 + 1e-7,
+              'mean',
+            );
           const colour = 0.5 + 0.28209479177387814 * floats.sh0[3 * i + c];
           near(ofHalf(new Uint16Array(b.buffer)[2 * at + c]), colour, Math.abs(colour) / 2048 + 1e-7, 'colour');
           const bytes = new Uint8Array(packed.packedArray.buffer).subarray(4 * at);
           near(rgbMin + ((rgbMax - rgbMin) * bytes[c]) / 255, colour, (rgbMax - rgbMin) / 509, 'colour');
-          near(ofHalf(new Uint16Array(b.buffer)[2 * at + 3 + c]), c === thin ? -30 : scales[c], Math.abs(scales[c]) / 2048 + 1e-7, 'scale');
+          near(
+            ofHalf(new Uint16Array(b.buffer)[2 * at + 3 + c]),
+            c === thin ? -30 : scales[c],
+            Math.abs(scales[c]) / 2048 + 1e-7,
+            'scale',
+          );
           if (c === thin) assert.equal(bytes[12 + c], 0);
-          else near(lnScaleMin + ((lnScaleMax - lnScaleMin) * (bytes[12 + c] - 1)) / 254, scales[c], (lnScaleMax - lnScaleMin) / 507, 'scale');
+          else
+            near(
+              lnScaleMin + ((lnScaleMax - lnScaleMin) * (bytes[12 + c] - 1)) / 254,
+              scales[c],
+              (lnScaleMax - lnScaleMin) / 507,
+              'scale',
+            );
         }
         near(ofHalf(a[at + 3]), floats.opacities[i], 1 / 2048, 'alpha');
         near((packed.packedArray[at] >>> 24) / 255, floats.opacities[i], 1 / 509, 'alpha');
@@ -120,7 +158,9 @@ for (const [name, flat] of [['valid/rich', false], ['valid/codebook_sh_1_3', tru
           const limit = 2 ** (bits - 1) - 1;
           const size = [2, 4, 4][band];
           for (let k = 0; array && k < 3 * (2 * band + 3); k++, c++) {
-            const word = BigInt(array[size * (first + i) + ((k * bits) >> 5)]) | (BigInt(array[size * (first + i) + ((k * bits) >> 5) + 1] ?? 0) << 32n);
+            const word =
+              BigInt(array[size * (first + i) + ((k * bits) >> 5)]) |
+              (BigInt(array[size * (first + i) + ((k * bits) >> 5) + 1] ?? 0) << 32n);
             const integer = Number(BigInt.asIntN(bits, word >> BigInt((k * bits) & 31)));
             near((integer * most[`sh${band + 1}Max`]) / limit, shN[c], most[`sh${band + 1}Max`] / limit / 1.99, 'sh');
           }

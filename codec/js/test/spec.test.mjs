@@ -24,7 +24,9 @@ test('the index begins behind the header and counts its tiles', () => {
 });
 
 test('the tables of the registry are frozen and complete', () => {
-  assert.throws(() => { spec.CODER_NAMES[0] = 'x'; }, TypeError);
+  assert.throws(() => {
+    spec.CODER_NAMES[0] = 'x';
+  }, TypeError);
   assert.equal(spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SH3], 21);
   assert.equal(spec.CODER_NAMES[spec.CODER_DEFLATE], 'deflate');
 });

@@ -17,8 +17,10 @@ test('workers decode every scene of several tiles to the same arrays', async () 
     const progress = [];
     const scene = await decode(vector(name), { workers: 2, onProgress: (...now) => progress.push(now) });
     assert.equal(scene.workers, 2, name);
-    for (const [part, [, , sha]] of Object.entries(expect.floats)) assert.equal(hash(scene[part]), sha, `${name} ${part}`);
-    for (const [part, [, , sha]] of Object.entries(expect.extra)) assert.equal(hash(scene.extra[part]), sha, `${name} ${part}`);
+    for (const [part, [, , sha]] of Object.entries(expect.floats))
+      assert.equal(hash(scene[part]), sha, `${name} ${part}`);
+    for (const [part, [, , sha]] of Object.entries(expect.extra))
+      assert.equal(hash(scene.extra[part]), sha, `${name} ${part}`);
     const { directory, tiles } = scene.header;
     assert.equal(scene.checks.chunks, directory.length + tiles.reduce((sum, { layers }) => sum + layers.length, 0));
     assert.equal(progress.length, tiles.length);
@@ -71,7 +73,9 @@ test('tiles come from workers in each form', async () => {
     }
     assert.equal(seen.size, reader.header.tiles.length);
     if (form !== 'packed') continue;
-    const lookups = [...seen.values()].flatMap(({ sh }) => sh.flatMap((one, band) => (one?.lookup ? [[`${one.lookup.codebook}.${band}`, one.lookup.table]] : [])));
+    const lookups = [...seen.values()].flatMap(({ sh }) =>
+      sh.flatMap((one, band) => (one?.lookup ? [[`${one.lookup.codebook}.${band}`, one.lookup.table]] : [])),
+    );
     const tables = new Map(lookups);
     assert.ok(lookups.length > tables.size);
     for (const [key, table] of lookups) assert.equal(table, tables.get(key)); // one object for all tiles
@@ -95,8 +99,13 @@ test('where no worker may start, decode does without', () => {
     import { decode } from './decoder.mjs';
     const { workers, count } = await decode(readFileSync(process.argv[1]), { workers: 2 });
     console.log(workers, count);`;
-  const path = fileURLToPath(new URL(`../../../conformance/csplat_conformance/vectors/${several[0].file}`, import.meta.url));
+  const path = fileURLToPath(
+    new URL(`../../../conformance/csplat_conformance/vectors/${several[0].file}`, import.meta.url),
+  );
   const words = ['--experimental-permission', '--allow-fs-read=*', '--input-type=module', '-e', script, path];
-  const { stdout, stderr } = spawnSync(process.execPath, words, { cwd: new URL('..', import.meta.url), encoding: 'utf8' });
+  const { stdout, stderr } = spawnSync(process.execPath, words, {
+    cwd: new URL('..', import.meta.url),
+    encoding: 'utf8',
+  });
   assert.equal(stdout, `0 ${several[0].expect.header.splat_count}\n`, stderr);
 });

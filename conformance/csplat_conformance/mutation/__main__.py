@@ -2,7 +2,7 @@
 
 Usage:
     python -m csplat_conformance.mutation                                  # 400 mutants of the Python decoder
-    python -m csplat_conformance.mutation --decoder javascript --jobs 2    # wants node, and typescript by npx
+    python -m csplat_conformance.mutation --decoder javascript --jobs 2    # wants node, and `npm ci` before
     python -m csplat_conformance.mutation --decoder c                      # wants cc
 
 A mutant is caught where a vector fails. Whatever passes them all reads damaged files, too: one that differs from the

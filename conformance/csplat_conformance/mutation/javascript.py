@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -32,8 +31,6 @@ _OTHERS: Final = (
     "csplat-worker.mjs",
     "workers.mjs",
 )
-#: Finds the parser that the type check of the decoder (codec/js/package.json) runs with.
-_TYPESCRIPT = ("npx", "--yes", "--package", "typescript@5.9.3", "-c", "command -v tsc")
 
 
 class JavaScriptDecoder:
@@ -92,9 +89,8 @@ class JavaScriptDecoder:
 
 
 def _typescript() -> Path:
-    if shutil.which("npx") is None:
-        raise InputError("npx, which finds the parser, is not installed")
-    done = subprocess.run(_TYPESCRIPT, capture_output=True, text=True, check=False)  # noqa: S603 - words of our own
-    if done.returncode:
-        raise InputError(f"typescript cannot be had: {done.stderr.strip().splitlines()[-1:]}")
-    return Path(done.stdout.strip()).resolve().parents[1] / "lib" / "typescript.js"
+    parser = Path("node_modules", "typescript", "lib", "typescript.js")
+    found = [parent / parser for parent in js_folder().parents if (parent / parser).exists()]
+    if not found:
+        raise InputError("typescript, whose parser finds what to change, is absent: run `npm ci` in the checkout")
+    return found[0]

@@ -2,15 +2,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import {
-  automaticPose,
-  cameraPose,
-  directionOf,
-  frontFor,
-  readCamera,
-  upOfCameras,
-  waysUp,
-} from '../autocamera.mjs';
+import { automaticPose, cameraPose, directionOf, frontFor, readCamera, upOfCameras, waysUp } from '../autocamera.mjs';
 import { evened, findFrame, quantiles } from '../frame.mjs';
 import { Rig, pivotOf } from '../rig.mjs';
 import { emptyPose } from '../sceneview.mjs';
@@ -213,7 +205,10 @@ test('a camera of a file turns around the surface that it looks at', () => {
   const samples = scene(ball(3000, [0, 0, 0], 1), 0.01);
   const pose = cameraPose(readCamera(FILE_CAMERA), samples, findFrame(samples, UP), UP);
   assert.deepEqual(pose.viewmat, FILE_CAMERA.viewmat.flat());
-  assert.deepEqual(pose.eye.map((value) => value + 0), [0, 0, -4]);
+  assert.deepEqual(
+    pose.eye.map((value) => value + 0),
+    [0, 0, -4],
+  );
   assert.ok(pose.distance > 2.8 && pose.distance < 4, `${pose.distance}`);
   assert.equal(pose.near, 0.2);
 });
@@ -222,7 +217,13 @@ for (const [what, change] of Object.entries({
   'no viewmat': { viewmat: undefined },
   'a scaled viewmat': { viewmat: FILE_CAMERA.viewmat.map((row) => row.map((value) => 2 * value)) },
   'a mirrored viewmat': { viewmat: [[-1, 0, 0, 0], ...FILE_CAMERA.viewmat.slice(1)] },
-  'NaN in K': { K: [[NaN, 0, 0], [0, 1, 0], [0, 0, 1]] },
+  'NaN in K': {
+    K: [
+      [NaN, 0, 0],
+      [0, 1, 0],
+      [0, 0, 1],
+    ],
+  },
   'no size': { W: 0 },
 })) {
   test(`a camera with ${what} is refused`, () => {
@@ -236,7 +237,10 @@ test('people hold their cameras level', () => {
     return { viewmat: [...right, 0, ...down, 0, ...ahead, 0, 0, 0, 0, 1] };
   };
   const around = [0, 1, 2, 3, 4].map((i) => looking([Math.cos(i), Math.sin(i), -0.3], [0, 0, 1]));
-  assert.deepEqual(upOfCameras(around).map((value) => value + 0), [0, 0, 1]);
+  assert.deepEqual(
+    upOfCameras(around).map((value) => value + 0),
+    [0, 0, 1],
+  );
   const slanted = upOfCameras([looking([1, 0, 0], [0, 0.6, 0.8])]);
   assert.ok(Math.abs(slanted[1] - 0.6) < 1e-9);
 });

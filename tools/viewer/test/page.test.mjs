@@ -37,7 +37,10 @@ test('every parameter is read', () => {
 test('up is a direction of length 1', () => {
   const up = (text) => readWishes(new URLSearchParams({ up: text })).wishes.up;
   assert.deepEqual(up('0,-1,0'), [0, -1, 0]);
-  assert.deepEqual(up('0,3,-4').map((x) => Math.round(1e9 * x) / 1e9), [0, 0.6, -0.8]);
+  assert.deepEqual(
+    up('0,3,-4').map((x) => Math.round(1e9 * x) / 1e9),
+    [0, 0.6, -0.8],
+  );
   assert.deepEqual(up('1e300,0,-0'), [1, 0, -0]);
 });
 

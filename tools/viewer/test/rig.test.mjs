@@ -149,7 +149,11 @@ test('the near plane keeps away from the pivot', () => {
   assert.equal(rig({ distance: 0.5 }).camera(WIDTH, HEIGHT).near, 0.05);
 });
 
-for (const up of [[0, 1, 0], [0, 0, 1], [1, 0, 0]]) {
+for (const up of [
+  [0, 1, 0],
+  [0, 0, 1],
+  [1, 0, 0],
+]) {
   test(`turning ${up} up keeps the pivot in the middle`, () => {
     const some = rig();
     some.orbit(0.3, 0.2);
@@ -184,7 +188,11 @@ test('rotations survive the way through quaternions', () => {
 
 test('the shorter way round is taken', () => {
   const quat = toQuat(turnBasis(lookAlong([0, 0, 1], [0, -1, 0]), [0, 1, 0], 0.5));
-  const half = slerp(quat, quat.map((value) => -value), 0.5);
+  const half = slerp(
+    quat,
+    quat.map((value) => -value),
+    0.5,
+  );
   close([Math.abs(half.reduce((sum, value, i) => sum + value * quat[i], 0))], [1]);
   close(sub([1, 2, 3], [1, 2, 3]), [0, 0, 0]);
 });
