@@ -129,3 +129,31 @@ def make_model():
         return SplatModel(**{**arrays, **fields})
 
     return make
+
+
+@pytest.fixture(scope="session")
+def trained_scene(once, tmp_path_factory):
+    """A scene that was trained for 300 steps on small photographs, see trained.py; its files are everybody's."""
+    pytest.importorskip("numba", reason="training wants the extra [render]")
+    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    from trained import make_trained, run_here
+
+    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained"), run_here))
+
+
+@pytest.fixture(scope="session")
+def tuned_file(once, trained_scene, tmp_path_factory):
+    """A file of the trained scene that was tuned for 100 steps; its files are everybody's."""
+    from trained import make_tuned, run_here
+
+    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
+
+
+@pytest.fixture(scope="session")
+def file_runs(once, tmp_path_factory):
+    """Runs of `csplat train` to files, see file_runs.py."""
+    pytest.importorskip("numba", reason="training wants the extra [render]")
+    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    from file_runs import FileRuns
+
+    return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

@@ -1,8 +1,8 @@
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -57,6 +57,7 @@ def make_data():
     return make
 
 
+@pytest.mark.slow
 def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
     data = make_data(make_model, alpha=False)
     mask = np.ones((SIZE, SIZE), bool)
@@ -76,6 +77,7 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
     assert first.log["entries"][-1]["psnr"] == second.log["entries"][-1]["psnr"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
 def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, make_model, tmp_path, strategy):
     data = make_data(make_model)
@@ -87,6 +89,7 @@ def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, ma
     resumed_as_if_never_stopped(data, options, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [38, 42, 60])  # while splats would go, after that, at the end
 def test_a_run_that_goes_on_late_ends_with_the_share_that_is_wanted(make_data, make_model, tmp_path, steps):
     data = make_data(make_model)
@@ -112,6 +115,7 @@ def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, t
     resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
 def test_training_brings_the_loss_down(make_data, make_model, strategy):
     data = make_data(make_model)
@@ -199,11 +203,14 @@ def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
         train(data, TrainOptions(**QUICK, init="points"))
 
 
-def test_surroundings_are_shown_first_as_a_photograph_showed_them(make_data, make_model, monkeypatch):
-    data, options = make_data(make_model), TrainOptions(**{**QUICK, "iterations": 1})
+def test_surroundings_are_shown_first_as_a_photograph_showed_them(make_data, make_model):
+    data, options = make_data(make_model), TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
     assert "view" not in train(data, options).model.metadata  # an object
-    monkeypatch.setattr("csplat_trainer.loop.scene_frame", lambda _: SimpleNamespace(kind="surrounding"))
-    view = Camera.from_json(train(data, options).model.metadata["view"])
+    rng = np.random.default_rng(0)
+    far = rng.standard_normal((60, 3)) * 40.0
+    points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
+    given = DataSet("surrounded", data.train, data.test, points, np.full((260, 3), 0.5, np.float32))
+    view = Camera.from_json(train(given, replace(options, max_splats=260)).model.metadata["view"])
     taken = [one.camera for one in data.train]
     assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
@@ -218,6 +225,7 @@ def test_points_are_where_splats_start(make_data, make_model):
     assert result.metrics is None
 
 
+@pytest.mark.slow
 def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
     (tmp_path / "train").mkdir()
     frames = []
@@ -228,17 +236,16 @@ def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
         frames.append({"file_path": f"./train/{number}", "transform_matrix": pose.tolist()})
     angle = 2 * np.arctan(0.5 * SIZE / data.train[0].camera.K[0, 0])
     (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    run = [sys.executable, "-m", "csplat_tools", "train", str(tmp_path), "-o", str(tmp_path / "o.ply")]
-    options = ["--max-splats", "50", "--sh-degree", "1", "--iterations", "30", "--size", "40x40", "--seed", "3"]
-    files = ["--report", str(tmp_path / "log.json"), "--plot", str(tmp_path / "loss.png")]
-    done = subprocess.run([*run, *options, *files], capture_output=True, text=True, check=False)
-    assert (0, "") == (done.returncode, done.stdout), done.stderr
+    run = ("train", tmp_path, "-o", tmp_path / "o.ply")
+    options = ("--max-splats", 50, "--sh-degree", 1, "--iterations", 5, "--size", "40x40", "--seed", 3)
+    files = ("--report", tmp_path / "log.json", "--plot", tmp_path / "loss.png")
+    assert "" == call(*run, *options, *files).stdout
     model = read_ply(tmp_path / "o.ply")
     assert (1, "RFU") == (model.sh_degree, model.coordinate_system)
-    assert 30 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
+    assert 5 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
     assert (tmp_path / "loss.png").read_bytes().startswith(b"\x89PNG")
-    again = subprocess.run([*run, "--device", "mps"], capture_output=True, text=True, check=False)
-    assert 2 == again.returncode
+    again = CliRunner().invoke(app, [*map(str, run), "--device", "mps"])
+    assert 2 == again.exit_code
     assert "mps is not supported" in " ".join(again.stderr.split())
 
 
@@ -260,9 +267,10 @@ def call(*words):
     return result
 
 
-QUICK_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30)
+FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alpha", "background", "every", "size"),
     [(True, "auto", 5, None), (False, "auto", 10, "40x30"), (False, "white", 8, None), (True, "random", 8, "40x40")],
@@ -271,7 +279,7 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
     folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
-    told = call("train", folder, "-o", ply, "--background", background, "--report", log, *reading, *QUICK_WORDS)
+    told = call("train", folder, "-o", ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
     call("encode", ply, tmp_path / "a.csplat")
     call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
     said = TrainedOn.of(read_ply(ply).metadata)
@@ -290,25 +298,46 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
         assert judged[name] == pytest.approx(metrics[name], abs=0.01)
 
 
-def test_the_command_trains_to_a_file_and_goes_on_where_it_stopped(make_data, make_model, tmp_path):
-    folder = write_set(tmp_path, make_data(make_model))
-    files, report = ("--checkpoint", tmp_path / "run.npz"), tmp_path / "report.json"
-    words = ("train", folder, *QUICK_WORDS, "--keep", 0.9)
-    told = call(*words, "-o", tmp_path / "a.csplat", *files, "--report", report)
-    model = decode((tmp_path / "a.csplat").read_bytes())
-    assert 0 < len(model) <= 36
-    said = json.loads(report.read_text())
+@pytest.mark.slow
+def test_the_command_trains_to_a_file(file_runs):
+    data, said = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
+    model = decode(data)
     assert 30 == len(said["training"]["losses"])
-    assert (len(model), (tmp_path / "a.csplat").stat().st_size) == (said["file"]["splats"], said["file"]["size_bytes"])
+    assert (len(model), len(data)) == (said["file"]["splats"], said["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(said["file"]["scores"])
-    assert "held-out photographs" in told.stderr
+    assert "held-out photographs" in file_runs.messages
     assert (1.0, 1.0, 1.0) == TrainedOn.of(model.metadata).background
-    assert (tmp_path / "run.tuning.npz").exists()
-    call(*words, "-o", tmp_path / "b.csplat", *files, "--resume", tmp_path / "run.npz")
-    assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
-    # Trained further it is another scene, for which the tuning that there was says nothing.
-    call(*words, "-o", tmp_path / "c.csplat", *files, "--resume", tmp_path / "run.npz", "--iterations", 40)
-    assert (tmp_path / "a.csplat").read_bytes() != (tmp_path / "c.csplat").read_bytes()
+    assert (file_runs.folder / "run.tuning.npz").exists()
+
+
+@pytest.mark.slow
+def test_the_command_goes_on_where_it_stopped(file_runs, tmp_path):
+    for name in ("run.npz", "run.tuning.npz"):
+        shutil.copy(file_runs.folder / name, tmp_path / name)
+    files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
+    for name, more in (("again", ()), ("further", ("--iterations", 40))):
+        file_runs.made(f"{name}.csplat", *files, *more)
+    first, again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("a", "again", "further"))
+    assert first == again
+    assert first != further  # another scene, for which the tuning that there was says nothing
+
+
+@pytest.mark.slow
+def test_from_one_training_come_several_files(file_runs):
+    trained, usual = file_runs.checkpoint.read_bytes(), file_runs.report["file"]
+
+    def made(name, *more):
+        return file_runs.made(name, "--resume", file_runs.checkpoint, *more)[0]["file"]
+
+    few = made("few.csplat", "--keep", 0.5, "--lambda", 0.03)
+    assert usual["splats"] / 2 == pytest.approx(few["splats"], abs=2)
+    assert 0.03 == few["log"]["byte_cost"]
+    bound = usual["size_bytes"] + 200
+    assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
+    wanted = usual["validation"]["psnr"] - 0.05
+    good = made("good.csplat", "--set", "final-share=1", "--target-psnr", wanted)
+    assert wanted <= good["validation"]["psnr"] <= wanted + 0.1
+    assert trained == file_runs.checkpoint.read_bytes()
 
 
 def test_what_was_trained_for_longer_is_tuned_for_longer_and_in_smaller_steps():
@@ -316,28 +345,6 @@ def test_what_was_trained_for_longer_is_tuned_for_longer_and_in_smaller_steps():
     assert FinetuneOptions(lr_exposure=0.01) == brief
     assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
     assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
-
-
-def test_from_one_training_come_files_of_several_sizes(make_data, make_model, tmp_path):
-    folder, run = write_set(tmp_path, make_data(make_model)), tmp_path / "run.npz"
-    words = ("train", folder, *QUICK_WORDS)
-    call(*words, "-o", tmp_path / "a.csplat", "--checkpoint", run)
-    size = (tmp_path / "a.csplat").stat().st_size
-    trained = run.read_bytes()
-    call(*words, "-o", tmp_path / "b.csplat", "--resume", run, "--target-size", f"{size - 30}B")
-    assert (tmp_path / "b.csplat").stat().st_size <= size - 30
-    call(*words, "-o", tmp_path / "c.csplat", "--resume", run, "--keep", 0.4)
-    trained_with = len(decode((tmp_path / "a.csplat").read_bytes()))
-    assert trained_with / 2 == pytest.approx(len(decode((tmp_path / "c.csplat").read_bytes())), abs=2)
-    told = call(*words, "-o", tmp_path / "d.csplat", "--resume", run, "--target-psnr", "5dB")
-    assert "dB on the views that decide" in told.stderr
-    sizes = []
-    for cost in (0, 0.03):
-        told = call(*words, "-o", tmp_path / f"{cost}.csplat", "--resume", run, "--lambda", cost, "--json")
-        assert cost == json.loads(told.stdout)["file"]["log"]["byte_cost"]
-        sizes.append((tmp_path / f"{cost}.csplat").stat().st_size)
-    assert sizes[0] > sizes[1]
-    assert trained == run.read_bytes()
 
 
 def test_a_damaged_validation_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
@@ -373,6 +380,7 @@ def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_mod
     assert not (tmp_path / "a.ply").exists()
 
 
+@pytest.mark.slow
 def test_the_command_says_which_extra_is_missing(tmp_path):
     code = "import sys; sys.modules['numba'] = None; sys.argv = ['csplat', 'train', '.', '-o', sys.argv[1]]"
     code += "; from csplat_tools.__main__ import main; main()"

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
 
-WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 30, "--set", "log_every=10")
+WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 5, "--set", "log_every=2")
 
 
 @pytest.fixture(scope="module")
@@ -33,21 +33,21 @@ def headings(page):
     return re.findall("<h2>(.*?)</h2>", page)
 
 
-def test_a_page_about_a_training_and_its_file(folder, tmp_path):
-    path, report = tmp_path / "page.html", tmp_path / "report.json"
-    call("train", folder, "-o", tmp_path / "a.csplat", *WORDS, "--page", path, "--report", report)
-    page, said = path.read_text(), json.loads(report.read_text())
+@pytest.mark.slow
+def test_a_page_about_a_training_and_its_file(file_runs):
+    page = file_runs.page.read_text()
     assert [
         "How near it comes", "What it looks like", "The training", "The tuning", "Where the bytes are",
         "How it was made",
     ] == headings(page)  # fmt: skip
-    for scores in said["file"]["scores"].values():
+    for scores in file_runs.report["file"]["scores"].values():
         assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
-    assert ["photograph", "source", "before tuning", "file"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
-    assert 12 == page.count('src="data:image/')
+    assert ["photograph", "source", "before tuning", "file"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert 8 == page.count('src="data:image/')
     assert not re.search("(src|href)=.http", page)
 
 
+@pytest.mark.slow
 def test_a_page_about_a_training_alone(folder, tmp_path):
     path = tmp_path / "page.html"
     call("train", folder, "-o", tmp_path / "a.ply", *WORDS, "--page", path)
@@ -56,30 +56,17 @@ def test_a_page_about_a_training_alone(folder, tmp_path):
     assert ["photograph", "trained scene"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
 
 
-def test_the_scene_s_scores_in_a_report_of_a_file_are_those_of_compare(folder, tmp_path):
-    report, compared = tmp_path / "report.json", tmp_path / "compared.json"
-    call("train", folder, "-o", tmp_path / "a.ply", *WORDS)
-    call("train", folder, "-o", tmp_path / "a.csplat", *WORDS, "--keep", 1, "--report", report)
-    call("compare", tmp_path / "a.ply", tmp_path / "a.csplat", "--data", folder, "--report", compared)
+@pytest.mark.slow
+def test_the_scene_s_scores_in_a_report_of_a_file_are_those_of_compare(file_runs, tmp_path):
+    compared = tmp_path / "compared.json"
+    file_runs.made("a.ply", "--resume", file_runs.checkpoint)
+    both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
+    call("compare", *both, "--data", file_runs.data, "--report", compared)
     judged = json.loads(compared.read_text())["photographs"]
     for name, one in (("source", "a"), ("file", "b")):
-        scores = json.loads(report.read_text())["file"]["scores"][name]
+        scores = file_runs.report["file"]["scores"][name]
         for score in ("psnr", "psnr_mean", "ssim"):
             assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
-
-
-def test_a_page_about_a_tuned_file(tmp_path, make_model):
-    from csplat import write_ply
-
-    write_ply(tmp_path / "a.ply", make_model(60, 1))
-    path = tmp_path / "page.html"
-    words = ("--self", "--views", 16, "--view-size", "40x30", "--iterations", 20, "--page", path)
-    call("finetune", tmp_path / "a.ply", tmp_path / "a.csplat", *words)
-    page = path.read_text()
-    assert "by 8 renders of the source" in page.lower()
-    assert "The tuning" in headings(page)
-    assert "The training" not in headings(page)
-    assert ["the source", "before tuning", "file"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)[:9]
 
 
 def test_a_page_is_not_replaced_without_being_told(folder, tmp_path):

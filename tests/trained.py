@@ -1,0 +1,130 @@
+"""Photographs that NumPy draws, the scene that `csplat train` makes of them, and its file by `csplat finetune`.
+
+Nothing of csplat goes into the photographs, and the rest is the command line's: these files show how the whole behaves.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+W, H = 48, 40
+FOCAL = 42.0  # pixels
+VIEWS = 16  # of which every eighth is held out
+DISTANCE = 3.2  # of the cameras from the centre of a ball of radius 1
+_SAMPLES = 3  # rays along each side of a pixel
+
+SETTINGS = "refine_start=50,refine_every=25,lr_means=1e-3"
+TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1, "--threads", 1, "--set", SETTINGS)
+TUNE = ("--attribute-psnr", 28, "--iterations", 100, "--seed", 1, "--threads", 1)
+
+Run = Callable[..., str]
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """A scene, and what it was made of.
+
+    Attributes:
+        data: folder of the photographs.
+        ply: the scene.
+        report: of `csplat train`.
+        checkpoint: after the last step.
+        messages: what the command wrote to stderr.
+    """
+
+    data: Path
+    ply: Path
+    report: Path
+    checkpoint: Path
+    messages: str
+
+
+@dataclass(frozen=True)
+class TunedFile:
+    """A file, and what it was made of.
+
+    Attributes:
+        source: the scene.
+        path: the file.
+        report: of `csplat finetune`.
+        messages: what the command wrote to stderr.
+    """
+
+    source: TrainedScene
+    path: Path
+    report: Path
+    messages: str
+
+
+def write_photographs(folder: Path) -> None:
+    """Write a transforms.json set of a ball with coloured stripes, transparent around it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for number in range(VIEWS):
+        turn, height = 2.4 * number, 0.5 * np.sin(1.7 * number)
+        eye = np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]) * DISTANCE
+        back = eye / DISTANCE
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)  # OpenGL: looks along -z
+        Image.fromarray(_photograph(pose)).save(folder / f"{number:02}.png")
+        frames.append({"file_path": f"{number:02}.png", "transform_matrix": pose.tolist()})
+    document = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+def _photograph(pose: np.ndarray) -> np.ndarray:
+    """Return straight RGBA, [H, W, 4] uint8, of the ball from a pose."""
+    ticks = [(np.arange(_SAMPLES * size) + 0.5) / _SAMPLES for size in (W, H)]
+    x, y = np.meshgrid((ticks[0] - W / 2) / FOCAL, (H / 2 - ticks[1]) / FOCAL)
+    rays = np.stack([x, y, -np.ones_like(x)], axis=2) @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    along, eye = rays @ pose[:3, 3], pose[:3, 3]
+    root = along**2 - (eye @ eye - 1.0)
+    points = eye + (-along - np.sqrt(np.maximum(root, 0.0)))[..., None] * rays
+    colours = 0.5 + 0.4 * np.sin(3.0 * points + np.array([0.0, 1.0, 2.0]))
+    shown = np.where(root[..., None] > 0.0, np.concatenate([colours, np.ones_like(x)[..., None]], axis=2), 0.0)
+    means = shown.reshape(H, _SAMPLES, W, _SAMPLES, 4).mean(axis=(1, 3))
+    means[..., :3] /= np.maximum(means[..., 3:], 1e-9)
+    return np.rint(255.0 * means).astype(np.uint8)
+
+
+def run_alone(*words: object) -> str:
+    """Run `python -m csplat WORDS`; return what it wrote to stderr."""
+    command = [sys.executable, "-m", "csplat", *map(str, words)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stderr
+
+
+def run_here(*words: object) -> str:
+    """Do the same in this process, which has its kernels loaded."""
+    from typer.testing import CliRunner
+
+    from csplat_tools.cli.app import app
+
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    return result.stderr
+
+
+def make_trained(folder: Path, run: Run = run_alone) -> TrainedScene:
+    """Take the photographs and train the scene."""
+    data, ply, report, checkpoint = (folder / name for name in ("photographs", "a.ply", "train.json", "train.npz"))
+    write_photographs(data)
+    messages = run("train", data, "-o", ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
+    return TrainedScene(data, ply, report, checkpoint, messages)
+
+
+def make_tuned(folder: Path, source: TrainedScene, run: Run = run_alone) -> TunedFile:
+    """Tune a file of the trained scene."""
+    path, report = folder / "a.csplat", folder / "finetune.json"
+    messages = run("finetune", source.ply, "-o", path, "--data", source.data, *TUNE, "--report", report)
+    return TunedFile(source, path, report, messages)
