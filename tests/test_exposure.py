@@ -60,6 +60,7 @@ def test_slopes_are_those_of_the_loss_with_the_correction():
     assert value(seen + step) - value(seen - step) == pytest.approx(2.0 * float(np.sum(slope * step)), rel=0.1)
 
 
+@pytest.mark.slow
 def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
     options = TrainOptions(**{**LONGER, "iterations": 600})
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
@@ -83,6 +84,7 @@ def test_a_gpu_learns_none(uneven):
         train(uneven, TrainOptions(**QUICK, lr_exposure=0.02, device="cuda"))
 
 
+@pytest.mark.slow
 def test_tuning_corrects_exposures_too(make_model, uneven):
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
     frozen = Draft.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()

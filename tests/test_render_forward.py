@@ -78,6 +78,7 @@ def test_antialiased_pictures_look_like_the_twins():
     assert not np.allclose(render(model, view).rgb, render(model, view, antialiased=False).rgb, atol=0.01)
 
 
+@pytest.mark.slow
 def test_the_sample_looks_like_the_twins(sample_path):
     model = read_ply(sample_path)
     centre = np.median(model.means, axis=0)
@@ -87,7 +88,7 @@ def test_the_sample_looks_like_the_twins(sample_path):
     view = Camera([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]], viewmat, 96, 72, near=0.05 * spread)
     result = render(model, view)
     assert result.alpha.mean() > 0.1
-    assert_same_picture(model.select(slice(0, 6000)), view)
+    assert_same_picture(model.select(slice(0, None, 8)), view)
 
 
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
