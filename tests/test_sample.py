@@ -17,6 +17,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "tools" / "sample"
 UP = (0.0, -1.0, 0.0)  # y points down
 TURN = np.array([1.0, -1.0, -1.0])  # from the world to the garden, whose y points up
 SOLID = 255
+RECIPE = pytest.mark.area(name="benchmarks")  # compiling the garden takes ten seconds
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,7 @@ def field_at(garden, point):
     return sys.modules["distances"].field(garden, *point)
 
 
+@RECIPE
 def test_the_recipe_makes_the_same_scene_twice(recipe, small, tmp_path):
     made = []
     for name in ("one", "two"):
@@ -60,6 +62,7 @@ def test_the_recipe_makes_the_same_scene_twice(recipe, small, tmp_path):
     assert model.opacities.min() >= 0.0099
 
 
+@RECIPE
 def test_pictures_are_read_back_with_the_cameras_that_took_them(recipe, small, tmp_path):
     recipe.photograph_all(tmp_path, small)
     data = load(tmp_path)
@@ -70,6 +73,7 @@ def test_pictures_are_read_back_with_the_cameras_that_took_them(recipe, small, t
             assert 0.2 < np.mean(picture.pixels[..., 3] == SOLID) < 0.95
 
 
+@RECIPE
 def test_points_to_start_from_lie_on_the_garden(recipe, garden, small, tmp_path):
     points, colours = recipe.photograph_all(tmp_path, small)
     assert (150, 3) == points.shape == colours.shape
@@ -77,6 +81,7 @@ def test_points_to_start_from_lie_on_the_garden(recipe, garden, small, tmp_path)
     assert max(abs(field_at(garden, point)[0]) for point in points * TURN) < 1e-3
 
 
+@RECIPE
 def test_rays_end_at_the_first_surface(recipe, garden):
     """Small steps from the camera find no surface before, but for grazing rays."""
     camera = recipe.cameras(5, 24, between=False)[3]
@@ -91,11 +96,13 @@ def test_rays_end_at_the_first_surface(recipe, garden):
     assert missed <= 0.02 * len(ends)
 
 
+@RECIPE
 def test_a_camera_that_looks_away_sees_nothing(recipe, garden):
     camera = look_at((0.0, -0.1, -4.0), (0.0, -0.1, -8.0), UP, intrinsics(16, 16, 42.0), 16, 16)
     assert not recipe.photograph(garden, camera)[0][..., 3].any()
 
 
+@RECIPE
 def test_gloss_depends_on_the_direction_and_moss_does_not(garden):
     shade, kinds = sys.modules["photograph"]._shade, sys.modules["garden"]
     lamp = np.array([0.46, 0.76, 0.46])
@@ -135,6 +142,7 @@ def test_the_sample_has_something_of_everything(sample_path):
     assert np.abs(model.shN).mean() > 0.01
 
 
+@RECIPE
 def test_the_sample_looks_like_the_garden_it_was_trained_on(recipe, garden, sample_path):
     model = read_ply(sample_path)
     camera = recipe.cameras(5, 200, between=True)[3]
