@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from captures import views_of
+from captures import cameras, views_of
 from extremes import COUNT, write_small_scene
 from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
 
@@ -97,7 +97,7 @@ def chain_of(name: str) -> Chain:
 
 
 def _learn(source: SplatModel) -> Learnt:
-    seen_from = virtual_cameras(source, 9, 32, 24)
+    seen_from = cameras(9)
     half = simplify(source, keep=0.5, views=views_of(seen_from), options=SimplifyOptions(rounds=1, effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
     trained = train(photographs_of(source, seen_from, source.means[:COUNT]), options)
