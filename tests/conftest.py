@@ -187,9 +187,9 @@ def _searched(once, name: str, **goal: float):
 
 @pytest.fixture(scope="session")
 def file_runs(once, tmp_path_factory):
-    """Runs of `csplat train` to files, see trained.py; further ones write into a folder of their own name."""
+    """Runs of `csplat train` to files, see file_runs.py."""
     pytest.importorskip("numba", reason="training wants the extra [render]")
     pytest.importorskip("scipy", reason="data sets want the extra [render]")
-    from trained import FileRuns
+    from file_runs import FileRuns
 
     return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

@@ -80,6 +80,7 @@ def test_a_program_hands_over_a_model_and_views_and_is_told_of_every_step(source
     assert ("tuning", 1.0) == stages[-1]
 
 
+@pytest.mark.slow
 def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(capture):
     model, data = csplat.read_ply(capture / "scene.ply"), csplat_trainer.load(capture)
     found = csplat_trainer.finetune(model, data, COARSE, replace(QUICK, iterations=2))
@@ -97,6 +98,7 @@ def fine():
 # learning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "encoding",
     [
@@ -135,6 +137,7 @@ def test_pixels_that_do_not_count_teach_nothing(source, views):
     assert first.log["looks"] == second.log["looks"]
 
 
+@pytest.mark.slow
 def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
     frozen = Draft.of(source, COARSE).frozen()
     tuned = tune(frozen, views, QUICK)
@@ -325,6 +328,7 @@ def test_a_weight_of_bytes_is_loss_per_bit_and_splat(source):
 # repeating
 
 
+@pytest.mark.slow
 def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
@@ -488,6 +492,8 @@ def test_views_that_judge_teach_unless_they_are_kept_aside():
 
 # the command
 
+BRIEF = ("--preset", "fast", "--iterations", 1)  # where neither codebooks nor learning matter
+
 
 def invoke(*words):
     return CliRunner().invoke(app, [str(word) for word in words])
@@ -542,9 +548,10 @@ def test_verify_proves_what_a_tuned_file_states_and_names_what_it_does_not(tuned
     assert "not proved: sh0, sh1: no error of them is stated, renders are their judge" in proof.stdout
 
 
+@pytest.mark.slow
 def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
     out = tmp_path / "s.csplat"
-    told = call("finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1, "--json")
+    told = call("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF, "--json")
     facts = json.loads(told.stdout)
     assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
     stated = read_stated_errors(out.read_bytes())
@@ -553,7 +560,7 @@ def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
 
 
 def test_settings_of_the_encoder_reach_it(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1)
+    words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF)
     call(*words, "-o", tmp_path / "s.csplat", "--attribute-psnr", 28, "--set", "deflate=zlib")
     assert {"attribute_psnr": 28.0, "deflate": "zlib"}.items() <= read_options((tmp_path / "s.csplat").read_bytes())[
         "asked"
@@ -575,7 +582,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
 
     monkeypatch.setattr("csplat_trainer.tuning.finetuning.decode", wrong)
     out = tmp_path / "s.csplat"
-    result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1)
+    result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF)
     assert "holds other sh0 than were tuned" in str(result.exception)
     assert not out.exists()
 
@@ -603,12 +610,13 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
     assert compared["psnr"] == pytest.approx(facts["scores"]["file"]["psnr"], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
     save_cameras(tmp_path / "cameras.json", cameras(40))
     out = tmp_path / "s.csplat"
     result = call(
         "finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json", "-o", out,
-        "--prune-unseen", "--iterations", 2, "--json", "-q",
+        "--prune-unseen", *BRIEF, "--json", "-q",
     )  # fmt: skip
     facts = json.loads(result.stdout)
     assert (301, 300, 4) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
@@ -618,7 +626,7 @@ def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
 def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     out = tmp_path / "s.csplat"
     result = call(
-        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, "-o", out, "--iterations", 2,
+        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, "-o", out, *BRIEF,
         "--json",
     )  # fmt: skip
     facts = json.loads(result.stdout)
@@ -626,7 +634,7 @@ def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     stated = read_stated_errors(out.read_bytes())
     assert (301, 151) == (stated.source_count, stated.pruned_count)
     call("verify", out, "--source", capture / "scene.ply")
-    again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", "--iterations", 1)
+    again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", *BRIEF)
     assert "need least" not in again.stderr
 
 
@@ -652,7 +660,7 @@ def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share
 
 def test_a_size_that_no_file_of_the_scene_has_is_refused(capture, source, tmp_path):
     write_ply(tmp_path / "one.ply", source.select(slice(0, 1)))
-    words = ("finetune", tmp_path / "one.ply", "--data", capture, "--iterations", 1)
+    words = ("finetune", tmp_path / "one.ply", "--data", capture, *BRIEF)
     result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-size", "300B")
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
     assert "more than 300 (E_INPUT)" in result.stderr
@@ -689,7 +697,7 @@ def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
 
 
 def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 1)
+    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
     np.save(tmp_path / "w.npy", np.ones(300))
     result = invoke(*words, "--importance", tmp_path / "w.npy")
     assert 1 == result.exit_code
@@ -701,16 +709,17 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
 @pytest.mark.slow
 def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--lambda", 0)
+    words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF, "--lambda", 0)
     call(*words, "-o", tmp_path / "a.csplat", "--importance", tmp_path / "s.npz")
     call(*words, "-o", tmp_path / "b.csplat")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_file_says_what_the_ply_does_not(capture, tmp_path):
     out, index = tmp_path / "s.csplat", tmp_path / "index.npy"
     call(
-        "finetune", capture / "scene.ply", "--data", capture, "-o", out, "--iterations", 1, "--source-index", index,
+        "finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF, "--source-index", index,
         "--axes", "RUB", "--unit-metres", 0.5, "--licence", "CC0-1.0",
     )  # fmt: skip
     decoded = decode(out.read_bytes())
@@ -725,15 +734,16 @@ def test_defects_can_be_refused(capture, source, tmp_path):
     broken = source.select(np.arange(300))
     broken.means[0] = np.nan
     write_ply(tmp_path / "broken.ply", broken)
-    words = ("finetune", tmp_path / "broken.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 1)
+    words = ("finetune", tmp_path / "broken.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
     refused = invoke(*words, "--strict")
     assert 1 == refused.exit_code
     assert not (tmp_path / "s.csplat").exists()
     assert "repair" in call(*words).stderr
 
 
+@pytest.mark.slow
 def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", "--iterations", 2)
+    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
     facts = json.loads(call(*words, "--test-every", 0, "--aside", 2, "--json", "-q").stdout)
     assert ({}, None) == (facts["scores"], facts["judged_by"])
     assert (True, 2) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
@@ -747,6 +757,7 @@ def test_every_knob_of_encoder_and_tuning_is_an_option_or_a_setting():
         assert name in options or f"\n  {name.replace('_', '-')}: " in settings, name
 
 
+@pytest.mark.slow
 def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
     words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, "-q")
     short = tmp_path / "run.npz"
@@ -799,7 +810,7 @@ def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
     scene = tmp_path / "scene.ply"
     write_ply(scene, source)
     before = scene.read_bytes()
-    words = ("finetune", scene, "--self", "-o", tmp_path / "s.csplat", "--iterations", 1, "--views", 2)
+    words = ("finetune", scene, "--self", "-o", tmp_path / "s.csplat", *BRIEF, "--views", 2)
     result = invoke(*words, "--view-size", "16x16", "--checkpoint", scene, "--force")
     assert 1 == result.exit_code
     assert "is the input" in result.stderr

@@ -61,6 +61,7 @@ def test_little_work_wakes_no_thread_unless_a_number_is_asked_for():
         assert lanes == seen.max()
 
 
+@pytest.mark.slow
 def test_the_error_of_any_lane_reaches_the_caller():
     with thread_count(available_threads()) as lanes:
         for lane in range(lanes):
@@ -89,6 +90,7 @@ def test_an_error_waits_for_the_lanes_that_still_write():
         assert threading.active_count() <= before + lanes - 1
 
 
+@pytest.mark.slow
 def test_a_child_of_a_fork_does_not_wait_for_a_lock_that_nobody_frees():
     code = (
         "import os, threading, time; import numpy as np; from csplat_render.jit import parallel_kernel, thread_count\n"
@@ -117,6 +119,7 @@ def test_the_number_of_threads_is_given_back():
             assert lanes == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
 def test_a_forked_child_has_threads_of_its_own():
     script = """

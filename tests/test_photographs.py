@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,7 +225,7 @@ def no_compiling(monkeypatch):
         (("compare", "A", "B", "--data", "absent"), "absent"),
         (("compare", "A", "B", "--lpips", "absent.npz"), "absent.npz"),
         (("compare", "A", "B", "--source-index", "absent.npy"), "absent.npy"),
-        (("compare", "A", "B", "--pictures", "A"), "not a folder"),
+        (("compare", "A", "B", "--cameras", "cameras.json", "--pictures", "A"), "not a folder"),
         (("render", "absent.ply", "--orbit", "2", "-o", "o"), "absent.ply"),
         (("render", "A", "--cameras", "absent.json", "-o", "o"), "absent.json"),
         (("render", "A", "--data", "absent", "-o", "o"), "absent"),
@@ -245,11 +246,13 @@ def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, 
     shutil.copy(files[0], "A")
     shutil.copy(files[1], "B")
     (tmp_path / "capture").mkdir()
+    Path("cameras.json").write_text(json.dumps([cameras(1)[0].to_json()]))
     done = invoke(*words)
     assert done.exit_code in (1, 2), (done.stdout, done.exception)
     assert says in done.stderr
 
 
+@pytest.mark.slow
 def test_the_renderer_is_made_ready_once_everything_is_read(files, tmp_path):
     told = []
     data = cameras(2)

@@ -112,6 +112,7 @@ def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):
     assert 0.0 == depth[0, 0]
 
 
+@pytest.mark.slow
 def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
     call("render", ply, "--orbit", 3, "--size", "40x30", "-o", tmp_path / "out")
     assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "out")
@@ -120,6 +121,7 @@ def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
     assert picture[15, 20, 0] > 200
 
 
+@pytest.mark.slow
 def test_an_orbit_with_cameras_leads_along_them(ply, cameras, tmp_path):
     call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", "-o", tmp_path / "along")
     call("render", ply, "--orbit", 2, "--size", "64x48", "-o", tmp_path / "around")
@@ -216,6 +218,7 @@ def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
     assert not film.exists()
 
 
+@pytest.mark.slow
 def test_the_program_starts_without_the_extra_packages():
     code = (
         "import sys; from csplat_tools.cli.app import app\n"

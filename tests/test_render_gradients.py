@@ -35,6 +35,7 @@ def most(errors):
     return error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (3, True)])
 def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
     arrays, weights = random_splats(5, degree, seed=degree), random_gradients(VIEW, seed=1)

@@ -27,7 +27,7 @@ from csplat_tools.study import (
 
 @pytest.fixture
 def source(make_model):
-    return make_model(400, 2)
+    return make_model(150, 2)
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def test_what_no_codebook_serves_stays_as_it_is(source):
     found = cluster_attributes(source, KMeans({"means": 1e-9}))
     assert () == found.books["means"].sizes
     np.testing.assert_array_equal(source.means, found.model.means)
-    assert 400 * 12 == found.attribute_bytes()["means"]
+    assert 150 * 12 == found.attribute_bytes()["means"]
 
 
 def test_rotations_are_unit_and_of_one_sign(source):
@@ -170,7 +170,7 @@ def test_rotations_are_unit_and_of_one_sign(source):
 
 
 def test_the_gauge_keeps_the_shapes(source):
-    found = cluster_attributes(source, KMeans({"quats": 400})).model
+    found = cluster_attributes(source, KMeans({"quats": 150})).model
     largest, _ = covariance_errors(source.quats.T, source.scales.T, found.quats.T, found.scales.T)
     assert largest < 1e-5
     assert (np.diff(found.scales, axis=1) <= 0).all()
@@ -231,7 +231,7 @@ def test_other_words_for_kmeans_are_refused(text, message):
 def test_a_pruned_file_proves_its_errors_and_says_what_is_gone(source):
     result = encode_reduced(source, Reduction(prune_opacity=0.5, sh_degree=1))
     scene = stored(source, result)
-    assert {"splats": 400, "prune_opacity": 0.5, "sh_degree": 1, "sh": "truncated"} == scene.options["reduced"]
+    assert {"splats": 150, "prune_opacity": 0.5, "sh_degree": 1, "sh": "truncated"} == scene.options["reduced"]
     assert (int(np.sum(source.opacities <= 0.5)), False) == (
         scene.stated_errors.pruned_count, scene.stated_errors.refitted,
     )  # fmt: skip
@@ -246,7 +246,8 @@ def test_the_encoders_degree_is_the_reductions(source):
     assert (0, "truncated") == (scene.model.sh_degree, scene.options["reduced"]["sh"])
 
 
-@pytest.mark.parametrize("text", ["24", "0.1,means=200"])
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["24", "0.1,means=60"])
 def test_a_clustered_file_states_its_errors_against_the_source(source, text):
     kmeans = parse_kmeans(text, stages=2)
     reduction = Reduction(prune_opacity=0.2, sh_degree=1, kmeans=kmeans)
@@ -300,6 +301,7 @@ def test_distilled_and_clustered_colours_state_no_error(shell):
     assert 64 >= len(np.unique(np.round(scene.model.opacities, 5)))
 
 
+@pytest.mark.slow
 def test_a_scene_of_one_splat_can_be_distilled(shell):
     one = shell.select(slice(0, 1))
     assert 1 == len(stored(one, encode_reduced(one, Reduction(sh_degree=0, distil=True, views=9))).model)
@@ -332,6 +334,7 @@ def test_impossible_reductions_are_refused(make_model):
             call()
 
 
+@pytest.mark.slow
 def test_pruning_and_clustering_want_no_renderer():
     code = (
         "import sys, json; import csplat_tools.study; from csplat_tools.study.clustering import parse_kmeans;"

@@ -115,6 +115,7 @@ def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, t
     resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
 def test_training_brings_the_loss_down(make_data, make_model, strategy):
     data = make_data(make_model)

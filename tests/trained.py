@@ -64,29 +64,6 @@ class TunedFile:
     messages: str
 
 
-class FileRuns:
-    """Runs of `csplat train` on the photographs, each to a file, with little training.
-
-    The first, of all splats, leaves checkpoints of training and tuning, a report and a page.
-    """
-
-    WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30, "--set", "log_every=10")
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.data = folder, folder / "photographs"
-        self.checkpoint, self.page = folder / "run.npz", folder / "page.html"
-        write_photographs(self.data)
-        self.report, self.messages = self.made(
-            "a.csplat", "--keep", 1, "--checkpoint", self.checkpoint, "--page", self.page
-        )
-
-    def made(self, name: str, *more: object) -> tuple[dict, str]:
-        """Make a file or a PLY; return the report and the messages."""
-        report = self.folder / f"{name}.json"
-        messages = run_here("train", self.data, "-o", self.folder / name, *self.WORDS, "--report", report, *more)
-        return json.loads(report.read_text()), messages
-
-
 def write_photographs(folder: Path) -> None:
     """Write a transforms.json set of a ball with coloured stripes, transparent around it."""
     folder.mkdir(parents=True, exist_ok=True)
