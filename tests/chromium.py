@@ -216,17 +216,16 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def context(browser: Any) -> Iterator[Any]:
     """The profile that all tabs share: one of its own would cost a tab twice as much."""
-    made = browser.new_context(device_scale_factor=1)
+    made = browser.new_context(viewport={"width": 800, "height": 600}, device_scale_factor=1)
     yield made
     made.close()
 
 
 @contextmanager
-def open_tab(context: Any, width: int, height: int) -> Iterator[Tab]:
+def open_tab(context: Any) -> Iterator[Tab]:
     """Open a page; complaints that are left in `problems` at the end are a failure."""
     made = Tab(context.new_page())
     try:
-        made.page.set_viewport_size({"width": width, "height": height})
         made.page.set_default_timeout(60_000)
         made.page.on("console", lambda message: message.type == "error" and made.problems.append(message.text))
         made.page.on("pageerror", lambda error: made.problems.append(str(error)))
@@ -238,8 +237,8 @@ def open_tab(context: Any, width: int, height: int) -> Iterator[Tab]:
 
 @pytest.fixture
 def tab(context: Any) -> Iterator[Tab]:
-    """A fresh page of 160 by 120 pixels."""
-    with open_tab(context, 160, 120) as made:
+    """A fresh page of 800 by 600 pixels."""
+    with open_tab(context) as made:
         yield made
 
 
@@ -256,7 +255,7 @@ def viewer_page(context: Any) -> Iterator[ViewerPage]:
     """The viewer's page, loaded once; tests take `viewer`."""
     site = Site()
     try:
-        with open_tab(context, *ViewerPage.SIZE) as tab:
+        with open_tab(context) as tab:
             page = ViewerPage(tab, site)
             page.load()
             yield page
@@ -281,7 +280,7 @@ def engine_page(context: Any) -> Iterator[EnginePage]:
     """A page with the engine alone, loaded once; tests take `engine`."""
     site = Site()
     try:
-        with open_tab(context, 160, 120) as tab:
+        with open_tab(context) as tab:
             page = EnginePage(tab, site)
             page.load()
             page.start()

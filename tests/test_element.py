@@ -6,11 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import IN_CHROMIUM
 from typer.testing import CliRunner
+from viewer_pages import read_pixels
 
 from csplat import EncodeOptions, encode
 from csplat_tools.cli.app import app
 from csplat_tools.present.export import export_element
+
+pytestmark = IN_CHROMIUM
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
 GUIDE = (Path(__file__).resolve().parent.parent / "codec" / "EMBEDDING.md").read_text("utf-8")
@@ -55,9 +59,9 @@ def told(tab, identity=""):
 
 
 def shown(page, element="csplat-view"):
-    """Which pixels of the settled picture are not black, [120, 160]."""
-    pixels = page.eval_on_selector(element, "async (view) => Array.from(await view.engine.readPixels())")
-    return np.array(pixels, np.uint8).reshape(120, 160, 4)[..., :3].max(axis=2) > 20
+    """Return a mask of the pixels that are not black in the settled picture, [120, 160]."""
+    pixels = f"document.querySelector('{element}').engine.readPixels()"
+    return read_pixels(page, pixels, 160, 120)[..., :3].max(axis=2) > 20
 
 
 def test_a_scene_is_shown_and_then_another_and_then_none(tab, blog):
@@ -91,6 +95,7 @@ def test_a_scene_is_shown_and_then_another_and_then_none(tab, blog):
     assert [] == page.workers
 
 
+@pytest.mark.area(name="chromium")
 def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_they_are_near(tab, site, blog):
     scenes = [
         f'<csplat-view id="{name}" src="/{file}.csplat"></csplat-view>'
@@ -124,26 +129,23 @@ def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_th
     assert (2, True) == (len(page.workers), shown(page, "#b").any())
 
 
-@pytest.mark.parametrize(
-    ("src", "code", "words"),
-    [
-        ("/cut.csplat", "E_TRUNCATED", "ends too early"),
-        ("/none.csplat", "E_INPUT", "could not be read.*404"),
-        ("/scene.csplat", "E_WEBGL2", "no WebGL 2"),
-        ("/scene.csplat", "E_WORKER", "could not start.*worker-src"),
-    ],
-)
-def test_what_went_wrong_is_said_in_words(tab, site, blog, src, code, words):
+@pytest.mark.area(name="chromium")
+def test_what_went_wrong_is_said_in_words(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
-    if code == "E_WEBGL2":
-        tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page = blog(
-        "<csplat-view></csplat-view>", policy=POLICY.replace("blob:", "'none'" if code == "E_WORKER" else "blob:")
-    )
-    page.eval_on_selector("csplat-view", f"(view) => view.src = '{src}'")
-    kind, report = told(tab)
-    assert ("error", code, True) == (kind, report["code"], report["fatal"])
-    assert re.search(words, page.inner_text("csplat-view [role=alert]"), re.DOTALL)
+    cases = [
+        ("/cut.csplat", "E_TRUNCATED", "ends too early", POLICY),
+        ("/none.csplat", "E_INPUT", "could not be read.*404", POLICY),
+        ("/scene.csplat", "E_WORKER", "could not start.*worker-src", POLICY.replace("blob:", "'none'")),
+        ("/scene.csplat", "E_WEBGL2", "no WebGL 2", POLICY),
+    ]
+    for src, code, words, policy in cases:
+        if code == "E_WEBGL2":
+            tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        page = blog("<csplat-view></csplat-view>", policy=policy)
+        page.eval_on_selector("csplat-view", f"(view) => view.src = '{src}'")
+        kind, report = told(tab)
+        assert ("error", code, True) == (kind, report["code"], report["fatal"])
+        assert re.search(words, page.inner_text("csplat-view [role=alert]"), re.DOTALL)
     tab.problems.clear()  # browsers report a status, and what a policy forbids
 
 

@@ -11,8 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import absent
+from viewer_pages import read_pixels
 
 from csplat import EncodeOptions, decode, encode, read_ply
+
+pytestmark = pytest.mark.xdist_group("chromium")
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
@@ -84,29 +87,46 @@ def samples(language):
 
 @pytest.fixture(scope="module")
 def model(request):
-    return decode(encode(read_ply(request.getfixturevalue("sample_path")), FAST))
+    """The first 2,000 splats of the sample, after a round trip."""
+    return decode(encode(read_ply(request.getfixturevalue("sample_path")).select(slice(0, 2000)), FAST))
 
 
-@pytest.fixture
-def results(site, tmp_path, model):
+@pytest.fixture(
+    params=[
+        "copied",
+        # As a user gets the package: npm alone decides which files it holds, and takes seconds.
+        pytest.param("installed", marks=pytest.mark.area(name="engines")),
+    ]
+)
+def results(request, site, tmp_path, model):
     node = shutil.which("node")
     if node is None:
         absent("the samples in JavaScript need Node.js, which is not installed")
     for text in samples("js"):
         name = re.match(r"// (\w+\.mjs)\n", text)[1]
         (tmp_path / name).write_text(text, "utf-8")
-    install_decoder(tmp_path)
+    install = copy_decoder if request.param == "copied" else install_decoder
+    install(tmp_path)
     three = tmp_path / "node_modules" / "three"
     three.mkdir()
     (three / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
     (three / "three.mjs").write_text(THREE)
     (tmp_path / "run.mjs").write_text(RUN)
-    site.add("/scene.csplat", encode(model, replace(FAST, tile_splats=4000)))
+    site.add("/scene.csplat", encode(model, replace(FAST, tile_splats=700)))
     words = json.dumps([site.url("/scene.csplat"), directions(20).tolist()])
     done = subprocess.run([node, "run.mjs", words], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert 0 == done.returncode, done.stderr
     assert {200, 206} == set(site.statuses("/scene.csplat"))
     return json.loads(done.stdout), decode(site._files["/scene.csplat"])
+
+
+def copy_decoder(folder):
+    """Copy the files that the package of the decoder ships."""
+    source, target = ROOT / "codec" / "js", folder / "node_modules" / "csplat-decoder"
+    target.mkdir(parents=True)
+    for pattern in ["package.json", *json.loads((source / "package.json").read_text("utf-8"))["files"]]:
+        for path in source.glob(pattern):
+            (shutil.copytree if path.is_dir() else shutil.copy)(path, target / path.name)
 
 
 def install_decoder(folder):
@@ -126,6 +146,7 @@ def directions(count):
     return values / np.linalg.norm(values, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 def test_the_samples_in_javascript(results):
     given, scene = results
     count = len(scene)
@@ -182,8 +203,9 @@ def check_stream(given, scene):
     assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
 
 
+@pytest.mark.slow
 def test_the_samples_in_python(tmp_path, model):
-    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=1000)))
+    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=200)))
     whole, part = samples("python")
     assert len([line for line in whole.splitlines() if line.strip()]) <= 5
     said = [
@@ -193,23 +215,24 @@ def test_the_samples_in_python(tmp_path, model):
     assert f"{len(model)} float32 3 {model.coordinate_system}\n" == said[0]
     first, *tiles, last = said[1].splitlines()
     assert first.startswith(f"{len(model)} {model.coordinate_system} {{")
-    assert [str(place) for place in range(9)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
+    assert [str(place) for place in range(10)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
     assert last.endswith(f" of {(tmp_path / 'scene.csplat').stat().st_size}")
     assert 0 < len(decode(tmp_path / "part.csplat")) < len(model)
 
 
+@pytest.mark.area(name="chromium")
+@pytest.mark.slow
 def test_the_engine_without_a_page(tab, site, model):
     (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
     site.add("/show.mjs", sample.encode())
     site.add("/scene.csplat", encode(model, FAST))
     page = b"<!doctype html><title>x</title><link rel=icon href=data:,><canvas width=160 height=120></canvas>"
     tab.page.goto(site.add("/page.html", page))
-    pixels = tab.page.evaluate(
-        "import('/show.mjs').then(async ({ show }) => {"
-        " const engine = await show(document.querySelector('canvas'), '/scene.csplat');"
-        " return Array.from(await engine.readPixels()); })"
+    pixels = (
+        "import('/show.mjs').then(async ({ show }) =>"
+        " (await show(document.querySelector('canvas'), '/scene.csplat')).readPixels())"
     )
-    shown = np.array(pixels).reshape(120, 160, 4)[..., :3].max(axis=2) > 40
+    shown = read_pixels(tab.page, pixels, 160, 120)[..., :3].max(axis=2) > 40
     assert 0.1 < shown.mean() < 0.9
 
 

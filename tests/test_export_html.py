@@ -9,86 +9,103 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from viewer_pages import ViewerPage
 
 from csplat import decode, encode, read_ply
 from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
+from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.present.export import export_page, link_modules
+from csplat_tools.present.viewing import view_wishes
 from csplat_tools.present.webroot import PAGE, WORKER, web_files
 
-SIZE = (200, 160)
+pytestmark = pytest.mark.xdist_group("chromium")
 
 
 @pytest.fixture(scope="module")
 def sample(request):
-    return encode(read_ply(request.getfixturevalue("sample_path")))
+    """The file of every sixth splat of the shipped scene."""
+    whole = read_ply(request.getfixturevalue("sample_path"))
+    return encode(whole.select(np.arange(0, len(whole), 6)))
 
 
 def invoke(*words):
     return CliRunner().invoke(app, ["export-html", *map(str, words)])
 
 
-def picture(page):
-    """The settled picture, [H, W, 4] uint8."""
-    page.evaluate("csplatViewer.ready")
-    pixels = page.evaluate("csplatViewer.engine.readPixels().then((pixels) => Array.from(pixels))")
-    return np.array(pixels, np.uint8).reshape(SIZE[1], SIZE[0], 4)
-
-
-def test_the_page_opens_from_a_file_without_a_network(tab, site, sample, tmp_path):
+@pytest.mark.slow
+def test_the_page_opens_from_a_file_without_a_network_and_does_what_the_served_one_does(
+    viewer, tab, sample, make_model, tmp_path
+):
     (tmp_path / "scene.csplat").write_bytes(sample)
     done = invoke(tmp_path / "scene.csplat", tmp_path / "page.html")
     assert 0 == done.exit_code, done.output
-    page = tab.page
-    query = f"?size={SIZE[0]}x{SIZE[1]}"
-    site.add("/scene.csplat", sample)
-    page.goto(site.url(f"/{PAGE}{query}&scene=/scene.csplat"))
-    served = picture(page)
-
-    requests = []
-    page.context.set_offline(True)
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto((tmp_path / "page.html").as_uri() + query)
-    tab.until("'csplatViewer' in window")
-    exported = picture(page)
-
+    viewer.show(sample)
+    served = viewer.picture()
     assert served[..., :3].max() > 100
-    np.testing.assert_array_equal(served, exported)
-    assert page.locator("#error").is_hidden()
-    assert "scene.csplat" == page.inner_text("#title")
+
+    exported, page, requests = ViewerPage(tab, viewer.site), tab.page, []
+    page.on("request", lambda request: requests.append(request.url))
+    page.context.set_offline(True)
+    try:
+        exported.visit((tmp_path / "page.html").as_uri())
+    finally:
+        page.context.set_offline(False)
+    np.testing.assert_array_equal(served, exported.picture())
+    assert exported.error() is None
+    assert "scene.csplat" == exported.text("#title")
     schemes = [re.match(r"\w+", url)[0] for url in requests]
     assert ["blob", "file"] == sorted(schemes)  # the page, and its worker
 
-
-def test_the_page_from_a_file_opens_other_files_and_keeps_what_is_up(tab, make_model, tmp_path):
-    (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), "scene.csplat").page)
     (tmp_path / "other.csplat").write_bytes(encode(make_model(70, 0)))
-    page = tab.page
-    page.goto((tmp_path / "page.html").as_uri())
-    tab.until("'csplatViewer' in window")
-    page.evaluate("csplatViewer.ready")
     page.set_input_files("#file", tmp_path / "other.csplat")
-    tab.until("document.getElementById('summary').textContent.startsWith('70 splats')")
-    assert "other.csplat" == page.inner_text("#title")
+    exported.until("document.getElementById('summary').textContent.startsWith('70 splats')")
+    assert "other.csplat" == exported.text("#title")
     page.click("#upright")
     with page.expect_download() as download:
         page.click("#keep-download")
     assert [0, 0, 1] == decode(Path(download.value.path()).read_bytes()).metadata["up"]
 
 
-def test_the_page_is_forbidden_the_network(tab, site, make_model):
-    exported = export_page(encode(make_model(50, 0)), "small.csplat")
-    page = tab.page
-    url = site.add("/page.html", exported.page)
-    page.goto(url)
-    tab.until("'csplatViewer' in window")
-    page.evaluate("csplatViewer.ready")
+@pytest.fixture
+def cameras(tmp_path):
+    """A file with one camera."""
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 6.5
+    entry = {"K": [[90, 0, 40], [0, 90, 30], [0, 0, 1]], "viewmat": viewmat.tolist(), "W": 80, "H": 60}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    return tmp_path / "cameras.json"
+
+
+@pytest.mark.area(name="chromium")
+@pytest.mark.slow
+def test_a_page_has_its_cameras_axes_and_any_name_and_is_forbidden_the_network(tab, site, make_model, cameras):
+    name = "</script><script>alert('é')</script>&.csplat"
+    wishes = view_wishes(str(cameras), SceneOverrides(coordinate_system="RFU"))
+    url = site.add("/page.html", export_page(encode(make_model(20, 0)), name, wishes).page)
+    viewer = ViewerPage(tab, site)
+    viewer.visit(url)
+    assert list(np.ravel(json.loads(cameras.read_text())[0]["viewmat"])) == viewer.viewmat
+    assert [0, 0, 1] == viewer.pose["up"]
+    assert name == viewer.text("#title")
+    assert f"{name} – csplat viewer" == tab.page.title()
     before = len(site.requests)
-    blocked = page.evaluate("fetch('/other').then(() => 'came', (error) => String(error))")
+    blocked = tab.page.evaluate("fetch('/other').then(() => 'came', (error) => String(error))")
     assert "TypeError" in blocked
     assert before == len(site.requests)
     assert any("Content Security Policy" in problem for problem in tab.problems)
     tab.problems.clear()
+
+
+def test_the_command_puts_cameras_and_axes_into_the_page(make_model, cameras, tmp_path):
+    data = encode(make_model(20, 0))
+    (tmp_path / "scene.csplat").write_bytes(data)
+    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--axes", "RFU"]
+    done = invoke(*words)
+    assert 0 == done.exit_code, done.output
+    wishes = view_wishes(str(cameras), SceneOverrides(coordinate_system="RFU"))
+    assert {"camera", "axes"} == set(wishes)
+    assert export_page(data, "scene.csplat", wishes).page == (tmp_path / "page.html").read_bytes()
 
 
 def test_no_charset_can_spoil_the_page(sample):
@@ -104,32 +121,6 @@ def test_parts_of_the_page_are_what_the_report_says(sample):
     assert len(exported.page) == exported.code_bytes + exported.scene_bytes
     assert abs(exported.scene_bytes / len(sample) - 4 / 3) < 0.001
     assert exported.code_bytes == export_page(b"", "scene.csplat").code_bytes
-
-
-def test_cameras_and_axes_go_into_the_page(tab, tmp_path, make_model):
-    viewmat = np.eye(4)
-    viewmat[2, 3] = 6.5
-    entry = {"K": [[90, 0, 40], [0, 90, 30], [0, 0, 1]], "viewmat": viewmat.tolist(), "W": 80, "H": 60}
-    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
-    (tmp_path / "scene.csplat").write_bytes(encode(make_model(100, 0)))
-    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", tmp_path / "cameras.json", "--axes", "RFU"]
-    done = invoke(*words)
-    assert 0 == done.exit_code, done.output
-    tab.page.goto((tmp_path / "page.html").as_uri())
-    tab.until("'csplatViewer' in window")
-    tab.page.evaluate("csplatViewer.ready")
-    assert list(viewmat.ravel()) == tab.page.evaluate("csplatViewer.rig.camera(80, 60).viewmat")
-    assert [0, 0, 1] == tab.page.evaluate("csplatViewer.rig.pose.up")
-
-
-def test_names_with_markup_stay_text(tab, make_model, tmp_path):
-    name = "</script><script>alert('é')</script>&.csplat"
-    (tmp_path / "page.html").write_bytes(export_page(encode(make_model(20, 0)), name).page)
-    tab.page.goto((tmp_path / "page.html").as_uri())
-    tab.until("'csplatViewer' in window")
-    tab.page.evaluate("csplatViewer.ready")
-    assert name == tab.page.inner_text("#title")
-    assert f"{name} – csplat viewer" == tab.page.title()
 
 
 def test_every_module_is_in_the_page_once(sample):
@@ -207,6 +198,7 @@ def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_page_can_go_to_a_pipe(sample_path):
     words = [sys.executable, "-m", "csplat_tools", "export-html", str(sample_path), "-", "--preset", "fast", "--quiet"]
     done = subprocess.run(words, capture_output=True, check=True)

@@ -37,6 +37,7 @@ def frames_of(path):
         return frames, times, film.info.get("loop")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ending", "tolerance"), [("webp", 6.0), ("gif", 8.0), ("png", 0.0), ("apng", 0.0)])
 def test_a_film_shows_what_the_pictures_show(ply, tmp_path, ending, tolerance):
     film, folder = tmp_path / f"turn.{ending}", tmp_path / "turn"
@@ -61,6 +62,7 @@ def test_the_same_command_writes_the_same_film(ply, tmp_path):
     assert (tmp_path / "one.webp").read_bytes() == (tmp_path / "two.webp").read_bytes()
 
 
+@pytest.mark.slow
 def test_an_mp4_shows_what_the_pictures_show_and_is_the_same_again(ply, tmp_path):
     av = pytest.importorskip("av", reason="MP4 needs PyAV: pip install 'csplat[film]'")
     words = ("render", ply, "--orbit", 5, "--size", "65x49", "--background", "0.9,0.2,0.1", "--fps", 12.5)
@@ -99,6 +101,7 @@ def test_an_existing_film_is_kept_without_force(ply, tmp_path):
     assert film.read_bytes().startswith(b"GIF89a")
 
 
+@pytest.mark.slow
 def test_a_film_of_one_picture_is_a_picture(ply, tmp_path):
     for ending in ("webp", "gif", "png"):
         film = tmp_path / f"still.{ending}"

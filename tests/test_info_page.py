@@ -50,6 +50,7 @@ def page(files):
     return path
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_text_says(files, page):
     text = html.unescape(page.read_text())
     facts = describe_file(files[0].read_bytes())
@@ -64,6 +65,7 @@ def test_the_page_says_what_the_text_says(files, page):
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td>", text)
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_source_beside_the_file(files, page):
     text = page.read_text()
     assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
@@ -72,6 +74,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
     assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: how near", text)[1]
 
 
+@pytest.mark.slow
 def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
     tab.page.set_viewport_size({"width": 400, "height": 700})
     tab.page.goto(page.as_uri())
@@ -86,6 +89,7 @@ def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
     assert grounds[0] != grounds[1]
 
 
+@pytest.mark.slow
 def test_the_page_refers_to_nothing_outside(page):
     text = page.read_text()
     assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
@@ -93,6 +97,7 @@ def test_the_page_refers_to_nothing_outside(page):
     assert "default-src 'none'" in text
 
 
+@pytest.mark.slow
 def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
     target = tmp_path / "page.html"
     target.write_text("mine")
@@ -104,6 +109,7 @@ def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
     assert target.read_text().startswith("<!doctype html>")
 
 
+@pytest.mark.slow
 def test_a_file_without_splats_has_a_page(tmp_path, make_model):
     (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
     write_ply(tmp_path / "empty.ply", make_model(0))
@@ -117,6 +123,7 @@ def test_a_source_without_a_page_is_a_wrong_command_line(files):
     assert 2 == invoke(files[0], "--page", "-").exit_code
 
 
+@pytest.mark.slow
 def test_without_the_renderer_there_is_a_page_but_no_comparison(files, tmp_path):
     code = "import sys; sys.modules['numba'] = sys.modules['PIL'] = None;"
     code += "from csplat_tools.__main__ import main; main()"
@@ -159,6 +166,7 @@ def test_the_hardest_place_is_where_the_error_is():
     assert HardestPlace().found() is None
 
 
+@pytest.mark.slow
 def test_views_that_are_shown_show_detail(sample_path):
     source = read_ply(sample_path)
     views = find_view_set(source, count=0)

@@ -16,9 +16,12 @@ import numpy as np
 import pytest
 import typer
 from interrupts import heed_interrupts
+from typer.testing import CliRunner
+from viewer_pages import ViewerPage
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
+from csplat_tools.cli.app import app
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.present.server import byte_range, open_server
 from csplat_tools.present.viewing import open_scene, view_wishes
@@ -56,27 +59,26 @@ def ask(server, path, method="GET", **headers):
         connection.close()
 
 
-@pytest.mark.parametrize(
-    ("header", "expected"),
-    [
-        (None, None),
-        ("bytes=0-0", (0, 1)),
-        ("bytes=10-19", (10, 10)),
-        ("bytes=990-", (990, 10)),
-        ("bytes=-10", (990, 10)),
-        ("bytes=-5000", (0, 1000)),
-        ("bytes=999-5000", (999, 1)),
-        ("BYTES=0-9", (0, 10)),
-        ("bytes=9-3", None),  # a range that makes no sense is no range
-        ("bytes=-", None),
-        ("bytes=a-b", None),
-        ("bytes=0-1,5-6", None),  # several ranges may be answered with everything
-        ("items=0-1", None),
-        ("bytes=\u0661-2", None),  # a digit, but none of ASCII
-    ],
-)
-def test_ranges(header, expected):
-    assert expected == byte_range(header, SIZE)
+RANGES = {
+    None: None,
+    "bytes=0-0": (0, 1),
+    "bytes=10-19": (10, 10),
+    "bytes=990-": (990, 10),
+    "bytes=-10": (990, 10),
+    "bytes=-5000": (0, 1000),
+    "bytes=999-5000": (999, 1),
+    "BYTES=0-9": (0, 10),
+    "bytes=9-3": None,  # a range that makes no sense is no range
+    "bytes=-": None,
+    "bytes=a-b": None,
+    "bytes=0-1,5-6": None,  # several ranges may be answered with everything
+    "items=0-1": None,
+    "bytes=\u0661-2": None,  # a digit, but none of ASCII
+}
+
+
+def test_ranges():
+    assert RANGES == {header: byte_range(header, SIZE) for header in RANGES}
 
 
 @pytest.mark.parametrize(
@@ -154,31 +156,30 @@ def test_a_file_that_changes_has_another_tag(scene_path, make_model):
         assert 404 == ask(server, "/scene/a%20scene.csplat")[0]
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/scene/",
-        "/scene/other.csplat",
-        "/scene/../secret.txt",
-        "/scene/..%2fsecret.txt",
-        "/scene/%2e%2e/secret.txt",
-        "/tools/viewer/",
-        "/tools/viewer/../../../secret.txt",
-        "/tools/viewer/..%5c..%5csecret.txt",
-        "//etc/passwd",
-        "/etc/passwd",
-        "/codec/js/package.json",
-        "/codec/js/test/adapter.mjs",
-        "/tools/viewer/main.mjs%00.html",
-        "/%",
-    ],
-)
-def test_nothing_else_is_reachable(scene_path, path):
+ELSEWHERE = [
+    "/scene/",
+    "/scene/other.csplat",
+    "/scene/../secret.txt",
+    "/scene/..%2fsecret.txt",
+    "/scene/%2e%2e/secret.txt",
+    "/tools/viewer/",
+    "/tools/viewer/../../../secret.txt",
+    "/tools/viewer/..%5c..%5csecret.txt",
+    "//etc/passwd",
+    "/etc/passwd",
+    "/codec/js/package.json",
+    "/codec/js/test/adapter.mjs",
+    "/tools/viewer/main.mjs%00.html",
+    "/%",
+]
+
+
+def test_nothing_else_is_reachable(scene_path):
     (scene_path.parent / "secret.txt").write_text("secret")
     with served(scene_path) as server:
-        status, _, body = ask(server, path)
-        assert 404 == status
-        assert b"secret" not in body
+        answers = {path: ask(server, path) for path in ELSEWHERE}
+    assert dict.fromkeys(ELSEWHERE, 404) == {path: status for path, (status, _, _) in answers.items()}
+    assert [] == [path for path, (_, _, body) in answers.items() if b"secret" in body]
 
 
 def test_another_name_for_this_machine_is_misdirected(scene_path):
@@ -301,15 +302,16 @@ def test_an_address_of_another_machine_is_refused(scene_path):
         pass
 
 
-def test_the_page_runs_from_the_server(tab, tmp_path, make_model):
-    tab.page.set_viewport_size({"width": 300, "height": 200})
+@pytest.mark.slow
+@pytest.mark.xdist_group("chromium")
+def test_the_page_runs_from_the_server(tab, site, tmp_path, make_model):
     write_ply(tmp_path / "a & b.ply", make_model(200, 1))
+    viewer = ViewerPage(tab, site)
     with served(tmp_path / "a & b.ply", wishes={"axes": "RFU"}) as server:
-        tab.page.goto(server.url)
-        tab.page.evaluate("csplatViewer.ready")
-        assert "a & b.csplat" == tab.page.inner_text("#title")
-        assert "200 splats" in tab.page.inner_text("#summary")
-        assert [0, 0, 1] == tab.page.evaluate("csplatViewer.rig.pose.up")
+        viewer.visit(server.url)
+        assert "a & b.csplat" == viewer.text("#title")
+        assert "200 splats" in viewer.text("#summary")
+        assert [0, 0, 1] == viewer.pose["up"]
         tab.page.goto("about:blank")  # hangs up, so that the server can end
 
 
@@ -332,6 +334,7 @@ def command(*words):
             process.kill()
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
     with command(sample_path, "--no-browser") as process:
         url = process.stdout.readline().strip()
@@ -359,7 +362,7 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
     ],
 )
 def test_the_command_says_what_is_wrong(sample_path, words, status, expected):
-    with command(*(str(sample_path) if word == "SAMPLE" else word for word in words), "--no-browser") as process:
-        out, said = process.communicate(timeout=60)
-    assert (status, "") == (process.returncode, out)
-    assert expected in " ".join(said.split())
+    given = [str(sample_path) if word == "SAMPLE" else word for word in words]
+    done = CliRunner().invoke(app, ["view", *given, "--no-browser"])
+    assert (status, "") == (done.exit_code, done.stdout)
+    assert expected in " ".join(done.stderr.split())

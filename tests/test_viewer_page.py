@@ -108,6 +108,7 @@ def test_an_absent_file_is_explained(viewer):
     viewer.tab.problems.clear()  # a browser may report the status on its console, too
 
 
+@pytest.mark.area(name="chromium")
 def test_a_browser_without_webgl_is_told(tab, site, sample):
     tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     viewer = ViewerPage(tab, site)
@@ -130,6 +131,7 @@ DROP = """async ([text, name]) => {
 }"""
 
 
+@pytest.mark.area(name="chromium")
 def test_a_page_without_a_scene_complains_of_its_address_and_takes_files(tab, site, model, sample):
     viewer = ViewerPage(tab, site)
     viewer.load("?size=big&axes=RRR&camera=[{}]")
@@ -197,6 +199,7 @@ def test_mouse_and_keys_move_the_camera(viewer, light):
     assert viewer.home == viewer.pose  # at once: a person wants no motion
 
 
+@pytest.mark.area(name="chromium")
 def test_fingers_move_the_camera(viewer, light):
     viewer.show(light)
     viewer.settle()
@@ -272,6 +275,7 @@ def test_the_file_says_where_to_stand(viewer, make_model):
     assert "CC0" in viewer.page.locator("#statistics dd").all_inner_texts()
 
 
+@pytest.mark.area(name="chromium")
 def test_the_address_goes_before_what_the_file_says(tab, site, make_model):
     views = [look_at([0.0, 0.0, -4.0]), look_at([3.0, 0.0, -4.0])]
     site.add("/cameras.json", json.dumps(views).encode())
@@ -297,6 +301,7 @@ def test_the_address_goes_before_what_the_file_says(tab, site, make_model):
     assert tab.page.title().startswith("a scene.csplat")
 
 
+@pytest.mark.area(name="chromium")
 def test_a_scene_of_unknown_axes_can_be_turned(viewer, make_model):
     viewer.page.emulate_media(reduced_motion="reduce")
     viewer.show(encode(make_model(100, 0)))

@@ -58,9 +58,15 @@ class ViewerPage:
         self._numbers = itertools.count()
 
     def load(self, query: str = "") -> None:
-        """Load the page with an address, and wait until it shows its scene or says why it does not."""
-        self.page.goto(self.site.url(VIEWER + query))
+        """Load the served page with parameters, and wait until it shows its scene or says why it does not."""
+        self.visit(self.site.url(VIEWER + query))
+
+    def visit(self, url: str) -> None:
+        """Do the same with a page that lies elsewhere."""
+        self._resize()
+        self.page.goto(url)
         self.page.evaluate(_HEED_WHEEL)
+        self.until("'csplatViewer' in window")  # a page of one file starts when all of it has been read
         self.page.evaluate("csplatViewer.ready")
 
     def show(self, data: bytes, name: str = "scene.csplat") -> str:
@@ -79,8 +85,7 @@ class ViewerPage:
     def rest(self) -> None:
         """Bring the page into the state of one that has just been loaded, its scene apart."""
         self.page.bring_to_front()
-        if self.page.viewport_size != {"width": self.SIZE[0], "height": self.SIZE[1]}:
-            self.page.set_viewport_size({"width": self.SIZE[0], "height": self.SIZE[1]})
+        self._resize()
         self.page.emulate_media(reduced_motion="no-preference")
         self.page.evaluate("document.getElementById('help-dialog').close()")
         if not self.hides("#statistics"):
@@ -88,6 +93,11 @@ class ViewerPage:
         self.page.keyboard.press("Escape")
         self.site.requests.clear()
         self.site.ranges, self.site.bytes_per_second = True, 0
+
+    def _resize(self) -> None:
+        size = {"width": self.SIZE[0], "height": self.SIZE[1]}
+        if self.page.viewport_size != size:
+            self.page.set_viewport_size(size)
 
     def until(self, expression: str) -> None:
         """Wait until an expression is true."""
