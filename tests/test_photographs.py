@@ -246,7 +246,7 @@ def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, 
     shutil.copy(files[0], "A")
     shutil.copy(files[1], "B")
     (tmp_path / "capture").mkdir()
-    Path("cameras.json").write_text(json.dumps([cameras(1)[0].to_json()]))
+    Path("cameras.json").write_text(json.dumps([cameras(1)[0].to_json()]), encoding="utf-8")
     done = invoke(*words)
     assert done.exit_code in (1, 2), (done.stdout, done.exception)
     assert says in done.stderr
