@@ -102,6 +102,7 @@ class AnalyticScene:
         ceiling: dB that no precision exceeds.
         plateau: from and to which quality more of it gains nothing; what is above gains as much less.
         jump: dB that every other step of 0.6 dB of quality loses.
+        packing: by what bytes are multiplied where a file is not packed as tightly as can be.
         preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
     """
 
@@ -126,6 +127,7 @@ class AnalyticScene:
     ceiling: float = 97.0
     plateau: tuple[float, float] = (0.0, 0.0)
     jump: float = 0.0
+    packing: float = 1.008
     preset_saving: tuple[str, float] = ("", 0.0)
 
     def model(self) -> SplatModel:
@@ -170,7 +172,7 @@ class AnalyticScene:
             splat = splat + self.sh_bytes * kept * finer
         elif chosen["sh_coding"] == "codebook":
             splat, book = splat + self.index_bytes, self.entry_bytes * kept * chosen["codebook_size"]
-        packed = 1.0 if chosen["deflate_level"] == 12 else 1.008
+        packed = 1.0 if chosen["deflate_level"] == 12 else self.packing
         saved = 1.0
         if contents.options.attribute_psnr is None and quality is None:
             saved -= self.preset_saving[1] * (contents.options.preset == self.preset_saving[0])

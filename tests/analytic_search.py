@@ -153,7 +153,7 @@ class _Splats:
     fitted_psnr = psnr
 
     def coded(self, options, *, graded, quick):
-        graded = graded and self.gradable and options.grades != 1 and self.scene.grading < 1.0
+        graded = graded and self.gradable and options.grades != 1 and self.scene.grading != 1.0
         contents = Contents(options, len(self.model), self.refits, graded=graded, draft=quick and self.refits)
         return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
 
