@@ -44,7 +44,7 @@ test('reads every valid vector', async () => {
 
 test('refuses every invalid vector, but for what it leaves to the others: extra columns, the budget', async () => {
   const taken = [];
-  for (const { name } of manifest.filter(({ error }) => error.code)) {
+  for (const { name } of manifest.filter(({ name, error }) => error.code && !name.endsWith('_beyond_budget'))) {
     const file = vector(name);
     let header;
     try {
@@ -52,7 +52,7 @@ test('refuses every invalid vector, but for what it leaves to the others: extra 
     } catch {
       continue; // it never gets to see these
     }
-    const others = /extra|raw|_beyond_budget/.test(name);
+    const others = /extra|raw/.test(name);
     if ((await decodeAll(file, header)) !== null && !others) taken.push(name);
   }
   assert.deepEqual(taken, []);

@@ -33,11 +33,15 @@ test('bytes behind the end are refused', async () => {
 });
 
 test('flipped bits under repaired checksums give a scene or an error of ours', async () => {
-  for (const name of ['valid/rich', 'extreme/seeded', 'valid/codebook_shape_escape']) {
+  for (const [name, step] of [
+    ['valid/rich', 3],
+    ['extreme/seeded', 11],
+    ['valid/codebook_shape_escape', 2],
+  ]) {
     const file = vector(name);
     let random = 1;
     let refused = 0;
-    for (let at = 0; at < file.length; at++) {
+    for (let at = 0; at < file.length; at += step) {
       random = (Math.imul(random, 1103515245) + 12345) >>> 0;
       const bytes = forged(file, (copy) => (copy[at] ^= 1 << (random >>> 29)));
       await decode(bytes).catch((error) => {
@@ -45,14 +49,14 @@ test('flipped bits under repaired checksums give a scene or an error of ours', a
         refused++;
       });
     }
-    assert.ok(refused > file.length / 4, `${name}: ${refused} of ${file.length} refused`);
+    assert.ok(refused > file.length / step / 4, `${name}: ${refused} of ${file.length / step} refused`);
   }
 });
 
 test('words of all ones and all zeros under repaired checksums do no worse', async () => {
   const file = vector('valid/rich');
-  for (const value of [0xffffffff, 0, 0x7fffffff, 0x80000000]) {
-    for (let at = 8; at + 4 <= file.length; at += 1) {
+  for (const [place, value] of [0xffffffff, 0, 0x7fffffff, 0x80000000].entries()) {
+    for (let at = 8 + 2 * place; at + 4 <= file.length; at += 9) {
       const bytes = forged(file, (_, view) => view.setUint32(at, value, true));
       await decode(bytes).catch((error) => {
         if (!(error instanceof CsplatError)) throw new Error(`${value} at byte ${at}`, { cause: error });

@@ -21,6 +21,25 @@ export const noStream = await streamInflate().then(
   (error) => error.message,
 );
 
+/**
+ * Check each vector of a list, all of them even where some fail.
+ *
+ * @template {{name: string}} T
+ * @param {T[]} vectors
+ * @param {(vector: T) => Promise<void>} check
+ * @returns {Promise<Record<string, string>>} what was thrown for those that failed, by their names: none, one hopes
+ */
+export async function failures(vectors, check) {
+  /** @type {Record<string, string>} */
+  const failed = {};
+  for (const one of vectors) {
+    await check(one).catch((error) => {
+      failed[one.name] = error.stack;
+    });
+  }
+  return failed;
+}
+
 /** SHA-256 of an array's bytes, in hexadecimal. @param {ArrayBufferView} array */
 export const hash = (array) =>
   createHash('sha256')

@@ -43,10 +43,10 @@ for (const [name, make] of Object.entries({ zlib: zlibInflate, DecompressionStre
 
   test(`${name} stops a bomb`, { skip }, async () => {
     const inflate = await make();
-    const bomb = new Uint8Array(deflateRawSync(new Uint8Array(200_000_000)));
+    const bomb = new Uint8Array(deflateRawSync(new Uint8Array(60_000_000)));
     const before = process.memoryUsage().arrayBuffers;
     await assert.rejects(async () => inflate(bomb, 1000), InflateError);
-    assert.ok(process.memoryUsage().arrayBuffers - before < 50_000_000);
+    assert.ok(process.memoryUsage().arrayBuffers - before < 20_000_000);
   });
 
   test(`${name} refuses damage`, { skip }, async () => {
