@@ -27,7 +27,6 @@ test_tier() {
     # Kernels are compiled once, here, and not by each worker of pytest; meanwhile other steps use the other core.
     background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "not area"
     static_checks
-    step "vectors and annexes" "$BIN/python" -m csplat_conformance.recipes --check
     javascript
     # Every vector by the command, as an author of a decoder runs it.
     step "conformance of the decoder" "$BIN/csplat" conformance decoder --level 4

@@ -4,6 +4,8 @@ import fnmatch
 import hashlib
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import jsonschema
@@ -214,3 +216,10 @@ def test_every_attribute_that_a_codebook_may_serve_has_escapes():
     escaped = {attribute for scene in SCENES for attribute, block in blocks(scene) if block.escape}
 
     assert {a for a, names in _spec.ATTRIBUTE_CODINGS.items() if "codebook" in names} == escaped
+
+
+@pytest.mark.area(name="vectors")
+def test_vectors_and_annexes_are_those_of_the_recipes():
+    words = [sys.executable, "-m", "csplat_conformance.recipes", "--check"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (0, "") == (done.returncode, done.stdout + done.stderr)
