@@ -101,12 +101,14 @@ class Site:
         requests: all that came, in order.
         ranges: False for a server that ignores Range and answers 200 with everything.
         bytes_per_second: of each answer to a path that a test added; 0 for as fast as it goes.
+        policy: the Content-Security-Policy of all answers, if any.
     """
 
     def __init__(self) -> None:
         self.requests: list[Request] = []
         self.ranges = True
         self.bytes_per_second = 0
+        self.policy = ""
         self._files: dict[str, bytes | Path] = {}
         self._web = web_files()  # of the package that is being tested, a checkout or a wheel
         site = self
@@ -150,6 +152,8 @@ class Site:
         body = self._body(path)
         asked = handler.headers.get("Range") or ""
         status, headers = 200, {"Content-Type": TYPES.get(Path(path).suffix, "application/octet-stream")}
+        if self.policy:
+            headers["Content-Security-Policy"] = self.policy
         if body is None:
             status, body = 404, b"no such file"
         elif self.ranges:

@@ -245,6 +245,12 @@ def test_the_table_of_sizes_adds_up():
         assert sum(parts) == together == int(megabytes)
 
 
+def test_the_guide_shows_the_examples_as_they_are():
+    examples = ROOT / "tools" / "examples"
+    for name in ("babylon", "playcanvas", "spark", "three"):
+        assert f"```js\n{(examples / name).with_suffix('.mjs').read_text('utf-8')}```\n" in TEXT
+
+
 def test_links_lead_somewhere():
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXT):
         assert (ROOT / "codec" / target).exists(), target

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("numba", reason="our own pictures want the extra [render]")
 pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
-from chromium import absent
+from chromium import IN_CHROMIUM, absent
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.formats import write
@@ -23,6 +23,8 @@ from csplat_bench.viewer.rules import ENGINES
 from csplat_bench.viewer.stage import pinhole, served
 from csplat_render.metrics import psnr
 from csplat_render.paths import orbit_cameras
+
+pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="engines")]
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")
@@ -133,13 +135,6 @@ def test_disposal_leaves_nothing_on_the_gpu(trial):
     assert trial.taken()[1] <= before + 100_000
 
 
-def test_the_guide_shows_the_examples_as_they_are():
-    guide = (EXAMPLES.parent.parent / "codec" / "EMBEDDING.md").read_text("utf-8")
-    for name in ENGINES:
-        assert f"```js\n{(EXAMPLES / name).with_suffix('.mjs').read_text('utf-8')}```\n" in guide
-
-
-@pytest.mark.benchmark
 @pytest.mark.usefixtures("packages")
 def test_the_examples_show_the_sample(browser, sample_path):
     (EXAMPLES / "public").mkdir(exist_ok=True)

@@ -1,6 +1,7 @@
-"""What other programs write csplat reads, what it writes they read: each property of a splat, within a format's step.
+"""Files of other programs are read, and theirs read ours: each property of a splat, within a step of the format.
 
-CONTRIBUTING.md says where they lie and how to get them; who is absent is skipped.
+SPZ's own library is installed on demand. CONTRIBUTING.md says where the other programs are to lie and how to get them;
+tests of a program that is absent are skipped.
 """
 
 import json
@@ -9,12 +10,15 @@ import subprocess
 
 import numpy as np
 import pytest
+from chromium import absent
 from conftest import PEERS, of_peers
 from filed import filed
 
 import csplat
 from csplat.model import SplatModel, normalise_quats
 from csplat.turning import turned
+
+pytestmark = [pytest.mark.slow, pytest.mark.area(name="peers")]
 
 
 def made(degree, reach, antialiased):
@@ -49,6 +53,7 @@ class Spz:
     """SPZ's own library, as WebAssembly."""
 
     wants = "node_modules/@adobe/spz/dist/spz.js"
+    package = "@adobe/spz@0.2.3"
     code = """
         import { readFileSync, writeFileSync } from 'node:fs';
         const [module, file, arrays] = process.argv.slice(1);
@@ -69,6 +74,9 @@ class Spz:
     """
 
     def run(self, file, arrays):
+        if not (PEERS / self.wants).exists():
+            npm = shutil.which("npm") or absent("SPZ's own library comes from npm, which is not installed")
+            run(npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", PEERS, self.package)
         run(shutil.which("node"), "--input-type=module", "-e", self.code, of_peers(self.wants), file, arrays)
 
     def write(self, model, path, format):
