@@ -30,7 +30,7 @@ from csplat import EncodeOptions, SplatModel
 from csplat.encoder import PRESETS
 
 USUAL_QUALITY = 42.0  # dB that each attribute keeps: where bytes per splat are those of the scene
-QUALITIES = np.arange(24.0, 110.0, 0.1)  # dB, those that a search may ask for
+QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, those that a search may ask for
 PSNR_CAP = 99.0  # dB
 BOOKS = tuple(2**power for power in range(5, 13))
 
@@ -224,7 +224,7 @@ class AnalyticScene:
 
     def _files(self, views: Views, *, keep_all: bool) -> Iterator[tuple[Any, Any]]:
         """Yield sizes and errors of all qualities, for every number of splats, coding and degree."""
-        shares = [1.0] if keep_all else np.arange(0.1, 1.001, 0.05)
+        shares = [1.0] if keep_all else np.arange(0.1, 1.001, 0.1)
         for share, coding in itertools.product(shares, ("scalar", "codebook", "none")):
             splats = round(share * self.splats)
             degrees = (0,) if coding == "none" else range(1, self.sh_degree + 1)

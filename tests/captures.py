@@ -136,10 +136,11 @@ def photographed(scene):
     return ViewSet("made", BLACK, teaches, (), seen_from[::8], pictures)
 
 
-def found_within(source, views=None, encoding=None, *, keep_all=False, importance=None, **goal):
+def found_within(source, views=None, encoding=None, *, keep_all=False, importance=None, refit=True, **goal):
     """Return the file on a target, by a brief search in small views: those of forty cameras unless others are given."""
     views = views or judged_by(cameras(40))
     # Fits of larger pictures take fewer steps; these are small all the same, unless virtual ones are to be added.
-    simplifying = SimplifyOptions(effort=1, rounds=2, view_size=SMALL if views.virtual else (960, 720))
+    size = SMALL if views.virtual else (960, 720)
+    simplifying = SimplifyOptions(effort=1, rounds=2, view_size=size, refit=refit)
     chosen = {"keep_all": keep_all, "importance": importance, "simplifying": simplifying}
     return encode_to(source, views=views, options=encoding, **chosen, **goal)

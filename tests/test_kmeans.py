@@ -265,7 +265,7 @@ def test_ranks_follow_frequency_and_keep_the_order_of_equals():
 
 def digest(threads=None):
     """SHA-256 over clusters of two kinds of search; also run by the subprocesses below."""
-    points, weights = blobs(5000, 45, 300, 12.0)
+    points, weights = blobs(3000, 45, 300, 12.0)
     state = hashlib.sha256()
     for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
         scaled = points.astype(np.int32) * scale

@@ -55,7 +55,7 @@ def failures(check, names=tuple(SCENES)):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("goal", [30.0, 38.0, 45.0])
+@pytest.mark.parametrize("goal", [30.0, 38.0])
 def test_a_psnr_is_reached_and_hardly_exceeded(goal):
     def check(name, keep_all):
         above = found_in(name, keep_all=keep_all, psnr=goal).file.psnr() - goal
@@ -150,7 +150,7 @@ def test_what_is_packed_loosely_for_speed_is_not_written():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("goal", [60_000, 90_000, 140_000])
+@pytest.mark.parametrize("goal", [60_000, 90_000])
 def test_a_size_is_filled_and_not_exceeded(goal):
     def check(name, keep_all):
         filled = len(found_in(name, keep_all=keep_all, size_bytes=goal).file) / goal

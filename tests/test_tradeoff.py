@@ -392,7 +392,7 @@ def test_plots_that_stand_alone_are_light_or_dark_as_the_reader_has_it(measured)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fast", "attributes 40 dB", "SH 1", "SH 0, distilled", "k-means 16", "keep 0.5"])
+@pytest.mark.parametrize("name", ["fast", "attributes 40 dB", "SH 1", "SH 0, distilled", "k-means 16", "target 9.0 kB"])
 def test_the_command_of_a_row_makes_its_bytes(swept, tmp_path, monkeypatch, name):
     point = next(one for one in swept[2]["points"] if one["name"] == name)
     monkeypatch.chdir(tmp_path)
