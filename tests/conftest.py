@@ -108,7 +108,7 @@ def small_views():
     """Make virtual views that decide and judge small: for searches and reports whose figures nobody reads."""
     from csplat_tools.views.placing import VirtualSizes
 
-    small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(4, 80, 60))
+    small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(12, 80, 60))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("csplat_tools.views.placing.VIRTUAL_SIZES", small)
         yield

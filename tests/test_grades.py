@@ -28,7 +28,7 @@ from csplat_trainer.tuning.rate import cost_slopes
 from csplat_trainer.tuning.state import TunedScene
 
 ROOT = Path(__file__).resolve().parent.parent
-COUNT = 12_000  # splats, enough for several grades
+COUNT = 8_000  # splats, enough for several grades
 
 
 def unequal(model, seed=0, spread=3.0):

@@ -299,6 +299,7 @@ def test_blas_threads_do_not_change_the_bytes(control):
     assert digest() + "\n" == run.stdout
 
 
+@pytest.mark.slow
 def test_blas_keeps_its_own_thread_count():
     control = nearest._openblas()
     if control is None:

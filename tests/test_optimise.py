@@ -41,6 +41,8 @@ from csplat_tools.views import BLACK, comparison_cameras, elsewhere, with_decide
 from csplat_tools.views.timing import picture_seconds
 from csplat_tools.views.viewset import pose
 
+pytestmark = pytest.mark.usefixtures("small_views")
+
 SMALL = SimplifyOptions(effort=1, rounds=2, view_size=(960, 720))
 
 
@@ -228,19 +230,19 @@ def test_bounds_that_no_number_keeps_are_refused(scene):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "keep_all"),
+    ("name", "views"),
     [
-        ("one splat", True),
+        ("one splat", judged_by(cameras(40))),
         *(
-            pytest.param(name, False, marks=pytest.mark.area(name="extremes"))
+            pytest.param(name, None, marks=pytest.mark.area(name="extremes"))
             for name in ("one splat", "exploded", "all transparent", "float32 limits")
         ),
     ],
 )
-def test_extreme_scenes_meet_a_psnr(name, keep_all):
+def test_extreme_scenes_meet_a_psnr(name, views):
     source = extremes.scene(name)[0]
-    views = around(source)
-    found = found_within(source, views, psnr=17.0, keep_all=keep_all)
+    views = views or around(source)
+    found = found_within(source, views, psnr=17.0)
     assert views.judge(source).psnr(decode(found.data)) >= 17.0
     assert len(decode(found.data)) >= 1
 
@@ -474,10 +476,10 @@ def test_seconds_of_a_picture_are_measured_without_the_first(scene):
         now[0] += camera.W * camera.H / 1e6
 
     source = SimpleNamespace(renderer=lambda *_, **__: draw)
-    assert pytest.approx(0.3072) == picture_seconds(source, views, clock=lambda: now[0])
-    assert [640, 640, 640] == drawn
-    assert pytest.approx(0.3072) == picture_seconds(source, views, mode="exact", clock=lambda: now[0])
-    assert [80] == drawn[3:]
+    assert pytest.approx(0.0192) == picture_seconds(source, views, clock=lambda: now[0])
+    assert [160, 160, 160] == drawn
+    assert pytest.approx(0.0192) == picture_seconds(source, views, mode="exact", clock=lambda: now[0])
+    assert [20] == drawn[3:]
 
 
 @pytest.mark.parametrize(("beside", "said"), [(39.5, "39.50 beside"), (37.0, "37.00 beside: up to 3.0 dB less")])

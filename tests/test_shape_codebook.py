@@ -27,7 +27,7 @@ from csplat.model import normalise_quats
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def few_shapes(make_model, count=4000, kinds=12, seed=0, degree=1, **fields):
+def few_shapes(make_model, count=2500, kinds=12, seed=0, degree=1, **fields):
     """A model whose splats have a few shapes, up to size and a little noise."""
     rng = np.random.default_rng(seed)
     kind = rng.integers(0, kinds, count)
@@ -52,6 +52,7 @@ def books(data):
     return [book for book in decode_scene(data).header.codebooks if book.kind == _spec.CODEBOOK_KIND_SHAPE]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("matrices", [False, True])
 @pytest.mark.parametrize("tile_splats", [65536, 700])
 @pytest.mark.parametrize("escapes", [None, 0.0, 0.3])
