@@ -380,6 +380,11 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
         tune(frozen, views, half, resume=file)
 
 
+def test_a_file_that_is_too_large_adds_its_excess_to_the_loss():
+    budget = Budget(1_000, 1e-4)
+    assert (0.0, 0.0, 0.25) == tuple(budget.overdrawn(size, 4_000.0) for size in (900, 1_000, 1_250))
+
+
 def test_bytes_that_are_free_at_first_are_dear_in_time():
     """A scene whose bits grow while values move far, unless they cost what a run begins with."""
     budget, bits = Budget(100_000, 1e-4), 470_000.0
@@ -465,6 +470,21 @@ def test_learning_rates_rise_and_fall():
     assert shares[-1] == pytest.approx(0.01, rel=0.01)
     assert 2.0 * options.lr_sh0 == options.scaled(2.0).lr_sh0
     assert options.byte_cost == options.scaled(2.0).byte_cost
+
+
+def test_every_learning_rate_rises_with_the_others(source, views, tmp_path):
+    frozen, file, moved = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz", []
+    start = {name: values.copy() for name, values in TunedScene(frozen).parameters.values.items() if values.size}
+    for warm_up in (0, 100):
+        options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
+        tune(frozen, views, options, checkpoint=file)
+        with np.load(file) as stored:
+            moved.append(
+                {name: np.abs(stored[f"values_{name}"] - start[name]).max() / options.share(1) for name in start}
+            )
+    assert {"means", "quats", "scales", "logits", "sh0", "shN"} <= moved[0].keys()
+    for name in start:
+        assert moved[0][name] == pytest.approx(moved[1][name], rel=0.05), name
 
 
 def test_renders_that_teach_are_those_of_the_source(source):
