@@ -18,7 +18,8 @@ shift || true
 
 check_tier() {
     static_checks
-    step "fast tests" "$BIN/python" -m pytest -q -n auto -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
+    step "fast tests" "$BIN/python" -m pytest -q -n auto --dist loadgroup --no-loadscope-reorder \
+        -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
 }
 
 # test_tier EXPRESSION [WORDS...]: EXPRESSION selects Python tests by their markers.
@@ -35,7 +36,7 @@ test_tier() {
     # Unguided: few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
     step "fuzzing" "$BIN/python" tests/fuzz.py --target all --count "${FUZZ_COUNT:-300}" --jobs 1 --plain
     joined
-    step "Python tests" "$BIN/python" -m pytest -q -n auto -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+    step "Python tests" "$BIN/python" -m pytest -q -n auto --dist loadgroup --no-loadscope-reorder -m "$1" --deselect tests/test_behaviour.py "${@:2}"
 }
 
 all_tier() {
@@ -147,7 +148,7 @@ build_and_unpack_wheel() {
         return 1
     }
     NUMBA_CACHE_DIR=$("$BIN/python" tests/wheel.py out/dist/csplat-*.whl "$WHEEL")
-    export NUMBA_CACHE_DIR PYTHONPATH=$PWD/$WHEEL
+    export NUMBA_CACHE_DIR PYTHONPATH=$PWD/$WHEEL${PYTHONPATH:+:$PYTHONPATH}
     "$BIN/python" -c 'import csplat; print("testing", csplat.__file__); assert "wheel" in csplat.__file__'
 }
 
