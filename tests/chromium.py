@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")
 
 #: Marks of a test that needs the browser.
-IN_CHROMIUM = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+IN_CHROMIUM = [pytest.mark.slow]
 
 #: WebGL2 on the CPU, with float render targets and float blending; deterministic pictures at one pixel per pixel.
 ARGUMENTS = [

@@ -38,20 +38,14 @@ def of_peers(name: str) -> Path:
 T = TypeVar("T")
 
 #: Files whose tests take longest: pytest-xdist hands these out first, so that no worker ends up alone with one.
-LONGEST = ()
+LONGEST = ("test_viewer_page", "test_tradeoff", "test_finetune", "test_element", "test_conformance_encoder", "test_cli")
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with `data_dir` as shared_data; keep each file on one worker, the longest files first.
-
-    Tests of several files that share an expensive fixture name a group of their own: `xdist_group("tuned_file")`.
-    """
+    """Mark tests with `data_dir` as shared_data, and put the longest files first."""
     for item in items:
         if "data_dir" in getattr(item, "fixturenames", ()):
             item.add_marker("shared_data")
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
     ranks = {name: rank for rank, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
 

@@ -18,7 +18,7 @@ shift || true
 
 check_tier() {
     static_checks
-    step "fast tests" "$BIN/python" -m pytest -q -n auto --dist loadgroup --no-loadscope-reorder \
+    step "fast tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder \
         -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
 }
 
@@ -36,7 +36,7 @@ test_tier() {
     # Unguided: few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
     step "fuzzing" "$BIN/python" tests/fuzz.py --target all --count "${FUZZ_COUNT:-300}" --jobs 1 --plain
     joined
-    step "Python tests" "$BIN/python" -m pytest -q -n auto --dist loadgroup --no-loadscope-reorder -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+    step "Python tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$1" --deselect tests/test_behaviour.py "${@:2}"
 }
 
 all_tier() {

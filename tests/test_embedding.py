@@ -15,8 +15,6 @@ from viewer_pages import read_pixels
 
 from csplat import EncodeOptions, decode, encode, read_ply
 
-pytestmark = pytest.mark.xdist_group("chromium")
-
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
 FAST = EncodeOptions(preset="fast")

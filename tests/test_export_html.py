@@ -19,8 +19,6 @@ from csplat_tools.present.export import export_page, link_modules
 from csplat_tools.present.viewing import view_wishes
 from csplat_tools.present.webroot import PAGE, WORKER, web_files
 
-pytestmark = pytest.mark.xdist_group("chromium")
-
 
 @pytest.fixture(scope="module")
 def sample(request):

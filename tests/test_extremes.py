@@ -36,7 +36,7 @@ from csplat_render import render
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.virtual import virtual_cameras
 
-pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.xdist_group("extremes")]
+pytestmark = [pytest.mark.extremes, pytest.mark.slow]
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 QUALITIES = {10.0: 12.0, 120.0: 44.0}  # dB that are asked of each attribute, and that the pictures keep at least

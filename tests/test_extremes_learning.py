@@ -51,7 +51,6 @@ pytestmark = [
     pytest.mark.extremes,
     pytest.mark.slow,
     pytest.mark.usefixtures("small_views"),
-    pytest.mark.xdist_group("extremes"),
 ]
 LONG = pytest.mark.area(name="extremes")
 

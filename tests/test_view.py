@@ -303,7 +303,6 @@ def test_an_address_of_another_machine_is_refused(scene_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("chromium")
 def test_the_page_runs_from_the_server(tab, site, tmp_path, make_model):
     write_ply(tmp_path / "a & b.ply", make_model(200, 1))
     viewer = ViewerPage(tab, site)
