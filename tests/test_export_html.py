@@ -38,6 +38,7 @@ def test_the_page_opens_from_a_file_without_a_network_and_does_what_the_served_o
     (tmp_path / "scene.csplat").write_bytes(sample)
     done = invoke(tmp_path / "scene.csplat", tmp_path / "page.html")
     assert 0 == done.exit_code, done.output
+    viewer.load()  # afresh: other tests have turned its camera
     viewer.show(sample)
     served = viewer.picture()
     assert served[..., :3].max() > 100
