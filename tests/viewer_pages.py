@@ -146,6 +146,7 @@ class ViewerPage:
 
     def picture(self) -> np.ndarray:
         """Return the settled picture, [H, W, 4] uint8, the top row first."""
+        self.settle()  # while the camera glides to its place a slow machine draws fewer pixels
         width, height = self.page.evaluate("[csplatViewer.stage.width, csplatViewer.stage.height]")
         return read_pixels(self.page, "csplatViewer.engine.readPixels()", width, height)
 
