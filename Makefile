@@ -43,7 +43,7 @@ check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files
 test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
 	tests/run.sh test
 
-test-all: $(VENV)/.all ## the same and all areas: engines, torch, S3, Dask, peers, benchmarks, long fuzzing; an hour
+test-all: $(VENV)/.all ## the same and all areas: engines, torch, S3, Dask, peers, benchmarks, long fuzzing
 	tests/run.sh all
 
 lint: $(VENV)/.dev ## style, types and import contracts alone

@@ -62,7 +62,7 @@ def search(
         photo_psnr: of the source against photographs, dB, which decide a loss.
         grades: splats may be sorted by importance.
         effort: of the refit.
-        tried: is filled with the files that are made, for who wants them of a search that is refused.
+        tried: receives the files that are made, even if the search is refused.
         target: as for `Target`.
     """
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
@@ -170,7 +170,7 @@ def _encoded(file):
 
 @dataclass(frozen=True)
 class _Session:
-    """What all numbers of splats share: the whole order of removal."""
+    """The order of removal, which every number of splats shares."""
 
     order: Order
     splats: int

@@ -26,7 +26,7 @@ COUNT = 300
 FAR = 10_000.0
 TINY = 1e-42  # denormal
 PRESETS = ("fast", "balanced", "small")
-COPIES = 2_000  # of a million: learning looks at each splat again and again, and all are alike
+COPIES = 2_000  # stands in for a million identical splats, each of which every training step would visit
 
 Columns = dict[str, np.ndarray]
 

@@ -73,7 +73,7 @@ class Fate(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a mutant.
+    """The verdict on a mutant.
 
     Attributes:
         fate: what became of it.
@@ -193,7 +193,7 @@ def _failed(tree: Tree, tests: Sequence[str]) -> dict[str, str]:
     return {"failed": plugin.failed or ("" if passed else f"pytest ends with status {status}")}
 
 
-_tree: Tree  # of a worker
+_tree: Tree  # set once in each worker process
 
 
 def _claim(trees: Any) -> None:

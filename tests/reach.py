@@ -1,4 +1,4 @@
-"""Which tests reach which lines of the product, and processes that run tests in a copy of the project.
+"""Map lines of the product to the tests that reach them, and run tests in a copy of the project.
 
 A `Tree` is a copy of the project that stays at one place, so that what numba has compiled is found again; one file of
 it may be changed for a while. `Map.make` runs the tests there once under `coverage`, with a context for each test and
@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 #: Decorators whose functions are compiled, so that coverage does not see their lines.
 COMPILING = {"kernel", "inline", "spliced", "relaxed_kernel", "parallel_kernel", "njit", "jit"}
 
-_DATA_BYTES = 8 << 30  # of a process in a tree: a mutant that allocates without bound fails at once
+_DATA_BYTES = 8 << 30  # memory limit of a test process: a mutant that allocates without bound fails at once
 _MAP_SECONDS = 4 * 3600.0  # a map of the slowest suite so far took half an hour
 _SLACK_FACTOR, _SLACK_SECONDS = 5.0, 60.0  # the time limit of tests, on what they took; other processes may be busy
 _SHARED_SECONDS = 0.05  # tests that use slower fixtures of their module stay together
