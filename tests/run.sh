@@ -24,7 +24,8 @@ check_tier() {
 
 # test_tier EXPRESSION [WORDS...]: EXPRESSION selects Python tests by their markers.
 test_tier() {
-    step "wheel" build_and_unpack_wheel
+    step "wheel" build_wheel
+    use_wheel
     # Kernels are compiled once, here, and not by each worker of pytest; meanwhile other steps use the other core.
     background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "not area"
     static_checks
@@ -34,7 +35,7 @@ test_tier() {
     # Two inputs, as processes: tests/test_conformance_encoder.py takes them all, in its own process.
     step "conformance of the encoder" "$BIN/csplat" conformance encoder --level 3 --filter '*/double,*/duplicates'
     # Unguided: few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
-    step "fuzzing" "$BIN/python" tests/fuzz.py --target all --count "${FUZZ_COUNT:-300}" --jobs 1 --plain
+    step "fuzzing" "$BIN/python" tests/fuzz.py --target all --count "${FUZZ_COUNT:-200}" --jobs 1 --plain
     joined
     step "Python tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$1" --deselect tests/test_behaviour.py "${@:2}"
 }
@@ -63,30 +64,34 @@ javascript() {
         step "layout (prettier)" npm run --silent format:check
     fi
     step "JavaScript" javascript_tests
-    if have chromium "the decoder in a browser"; then
-        step "JavaScript in Chromium" node codec/js/test/browser.mjs chromium
-    fi
 }
 
 SUMMARY=""
 
+# step NAME COMMAND...: run it in a subshell, whose CPU time is that of this step alone, whatever runs beside it.
 step() {
-    local name=$1 began cpu
-    shift
-    printf '\n== %s\n' "$name"
-    began=$SECONDS
-    cpu_seconds && cpu=$CPU
-    "$@"
-    cpu_seconds && noted "$name" $((SECONDS - began)) $((CPU - cpu))
+    printf '\n== %s\n' "$1"
+    (timed out/step.seconds "${@:2}")
+    noted "$1" out/step.seconds
 }
 
-# noted NAME WALL CPU: print the seconds of a step, and keep them for the table.
+# timed FILE COMMAND...: write the seconds of wall and of CPU time that a command took; for a subshell of its own.
+timed() {
+    local began=$SECONDS
+    "${@:2}"
+    cpu_seconds
+    echo "$((SECONDS - began)) $CPU" >"$1"
+}
+
+# noted NAME FILE: print the seconds of a step, and keep them for the table.
 noted() {
-    printf -- '-- %d s, CPU %d s\n' "$2" "$3"
-    SUMMARY+=$(printf '%-28s %5d %5d' "$1" "$2" "$3")$'\n'
+    local wall cpu
+    read -r wall cpu <"$2"
+    printf -- '-- %d s, CPU %d s\n' "$wall" "$cpu"
+    SUMMARY+=$(printf '%-28s %5d %5d' "$1" "$wall" "$cpu")$'\n'
 }
 
-# Set CPU to the CPU seconds of this shell and of all children that have ended; a subshell would count its own.
+# Set CPU to the CPU seconds of this shell and of all its children that have ended.
 cpu_seconds() {
     local file=out/times.$BASHPID
     times >"$file"
@@ -97,15 +102,7 @@ cpu_seconds() {
 # background NAME COMMAND...: run a step beside the following ones; `joined` waits for it and prints what it printed.
 background() {
     BACKGROUND_NAME=$1
-    shift
-    (
-        began=$SECONDS
-        status=0
-        "$@" >out/background.log 2>&1 || status=$?
-        cpu_seconds
-        echo "$((SECONDS - began)) $CPU" >out/background.seconds
-        exit $status
-    ) &
+    (timed out/background.seconds "${@:2}") >out/background.log 2>&1 &
     BACKGROUND=$!
 }
 
@@ -115,8 +112,7 @@ joined() {
     printf '\n== %s\n' "$BACKGROUND_NAME"
     cat out/background.log
     [ $status = 0 ] || exit $status
-    # shellcheck disable=SC2046  # two numbers
-    noted "$BACKGROUND_NAME" $(cat out/background.seconds)
+    noted "$BACKGROUND_NAME" out/background.seconds
 }
 
 # have PROGRAM WHAT: false, with one loud line, if WHAT must be skipped; a failure if CI=true.
@@ -140,13 +136,16 @@ javascript_tests() {
     grep -E '(tests|pass|fail|skipped) [0-9]+' "$log"
 }
 
-# The wheel's files go before the checkout on the path of every process: what is tested is what users install.
-build_and_unpack_wheel() {
+build_wheel() {
     rm -rf out/dist
     "$BIN/python" -m build --wheel --no-isolation --outdir out/dist . >out/build.log 2>&1 || {
         cat out/build.log
         return 1
     }
+}
+
+# The wheel's files go before the checkout on the path of every process: what is tested is what users install.
+use_wheel() {
     NUMBA_CACHE_DIR=$("$BIN/python" tests/wheel.py out/dist/csplat-*.whl "$WHEEL")
     export NUMBA_CACHE_DIR PYTHONPATH=$PWD/$WHEEL${PYTHONPATH:+:$PYTHONPATH}
     "$BIN/python" -c 'import csplat; print("testing", csplat.__file__); assert "wheel" in csplat.__file__'

@@ -6,6 +6,7 @@ No compression library takes part, so that a vector never changes because a libr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 
 from csplat import _spec
 
@@ -14,8 +15,10 @@ __all__ = ["apply_transforms", "to_bytes"]
 
 def to_bytes(values: Sequence[int], width: int) -> bytes:
     """Write integers little-endian, modulo 2^(8·width): what a sequence is when no byte transform follows."""
-    modulus = 1 << (8 * width)
-    return b"".join((value % modulus).to_bytes(width, "little") for value in values)
+    data = bytearray(width * len(values))
+    for plane in range(width):
+        data[plane::width] = bytes([value >> (8 * plane) & 255 for value in values])
+    return bytes(data)
 
 
 def apply_transforms(values: Sequence[int], width: int, transforms: Sequence[int]) -> bytes:
@@ -31,19 +34,17 @@ def apply_transforms(values: Sequence[int], width: int, transforms: Sequence[int
             signed = [x - modulus if x >= modulus // 2 else x for x in elements]
             elements = [2 * v if v >= 0 else -2 * v - 1 for v in signed]
         elif transform == _spec.TRANSFORM_BYTE_PLANES:
-            packed = bytes(x >> (8 * plane) & 255 for plane in range(width) for x in elements)
+            packed = bytes([x >> (8 * plane) & 255 for plane in range(width) for x in elements])
         elif transform == _spec.TRANSFORM_RUN_LENGTH:
             packed = _run_length(to_bytes(elements, width) if packed is None else packed)
     return to_bytes(elements, width) if packed is None else packed
 
 
 def _run_length(data: bytes) -> bytes:
-    runs: list[list[int]] = []
-    for value in data:
-        if runs and runs[-1][0] == value and runs[-1][1] < _spec.RUN_MAX:
-            runs[-1][1] += 1
-        else:
-            runs.append([value, 1])
+    runs: list[tuple[int, int]] = []
+    for value, equal in groupby(data):
+        whole, rest = divmod(len([*equal]), _spec.RUN_MAX)
+        runs += [(value, _spec.RUN_MAX)] * whole + [(value, rest)] * (rest > 0)
     values = bytes(value for value, _ in runs)
     low = bytes((length - 1) & 255 for _, length in runs)
     return values + low + bytes((length - 1) >> 8 for _, length in runs)
