@@ -395,10 +395,14 @@ def test_overlapping_chunks_are_read_once():
 
 
 @pytest.mark.slow
-def test_the_validator_shares_nothing_with_the_decoder():
-    code = "import sys, csplat_conformance.validator; print(*sorted(sys.modules))"
+def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_with_encoder_and_renderer():
+    code = (
+        "import sys, csplat_conformance.validator; print(*sorted(sys.modules))\n"
+        "import csplat_conformance.encoders; print(*sorted(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = [name for name in done.stdout.split() if name.startswith("csplat")]
+    by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
+    loaded = [name for name in by_validator if name.startswith("csplat")]
 
     # `csplat.inputs` lets go of memory that was looked at: it knows nothing of what is in it.
     assert {"csplat", "csplat._spec", "csplat.inputs", "csplat_conformance"} == {
@@ -407,3 +411,5 @@ def test_the_validator_shares_nothing_with_the_decoder():
     assert {"csplat_conformance.room", "csplat_conformance.validator"} == {
         ".".join(name.split(".")[:2]) for name in loaded if name.startswith("csplat_conformance.")
     }
+    unwanted = ("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch")
+    assert [] == [name for name in by_suite if name.startswith(unwanted)]
