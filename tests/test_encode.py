@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -294,25 +292,6 @@ def test_bytes_do_not_depend_on_threads(make_model, coding):
     options = {"sh_coding": coding, "tile_splats": 500, "codebook_size": 64}
     one, two, four = (encode(model, EncodeOptions(threads=n, **options)) for n in (1, 2, 4))
     assert one == two == four
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_blas_threads():
-    code = (
-        "import hashlib, numpy as np, csplat.model; r = np.random.default_rng(0);"
-        "f = lambda *s: r.standard_normal((3000, *s)).astype('f4');"
-        "q = csplat.model.normalise_quats(f(4));"
-        "m = csplat.SplatModel(means=f(3), quats=q, scales=f(3), opacities=r.random(3000).astype('f4'), sh0=f(3),"
-        " shN=f(15, 3));"
-        "o = csplat.EncodeOptions(sh_coding='codebook', codebook_size=128);"
-        "print(hashlib.sha256(csplat.encode(m, o)).hexdigest())"
-    )
-    digests = set()
-    for threads in ("1", "2"):
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        digests.add(done.stdout)
-    assert 1 == len(digests)
 
 
 @pytest.mark.parametrize(
