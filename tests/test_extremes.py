@@ -1,7 +1,7 @@
 """Scenes at the extremes: from PLY to file, back, and to pictures. Figures and words stand in codec/EXTREMES.md.
 
 Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, learning
-is tried on three; all others, and the million splats, are in the area `extremes`.
+is tried on two; all others, and the million splats, are in the area `extremes`.
 """
 
 import numpy as np
