@@ -135,7 +135,7 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_n
 @pytest.mark.slow
 def test_the_javascript_decoder_passes_by_the_protocol():
     # One for each kind of thing that its adapter says; the next test has all of them, in one process.
-    names = ["valid/empty", "valid/scene_facts", "extreme/extra_names", "invalid/quat_radicand"]
+    names = ["extreme/extra_names", "invalid/quat_radicand"]
     report = run_command(JS_ADAPTER, Choice(pattern=",".join(names), exact=True))
 
     assert {*names} == {outcome.name for outcome in report.outcomes}
