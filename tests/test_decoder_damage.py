@@ -95,11 +95,13 @@ def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
         if not name.endswith("crc"):
             places.setdefault((field.structure, name.rpartition(".")[2]), []).append(name)
     tried = 0
-    for name in {place for names in places.values() for place in (names[0], names[-1])}:
-        for value in extremes(BUILT.fields[name]):
+    first = {names[0] for names in places.values()}
+    for name in first | {names[-1] for names in places.values()}:
+        # Of the last place of a field every other one.
+        for value in [*extremes(BUILT.fields[name])][:: 1 if name in first else 2]:
             check_one(BUILT.patched({name: value}))
             tried += 1
-    assert tried > 700
+    assert tried > 600
 
 
 def check_one(data: bytes) -> None:
