@@ -20,10 +20,16 @@ from csplat_conformance.validator import validate
 
 @pytest.fixture(scope="module")
 def beyond():
-    """Each case and its file, by name, but those that are vectors: all decoders and the validator meet these anyway."""
+    """Cases and their files, by name.
+
+    Those that are vectors all decoders and the validator meet anyway: of a mask the first bit and the last. Of the bits
+    between them in reserved fields every third is here, in flags all.
+    """
     vectors = {vector.data: vector.error for vector in load() if vector.error}
     found = {}
-    for case in cases():
+    for number, case in enumerate(cases()):
+        if case.rule.field.startswith("reserved_") and number % 3:
+            continue
         data, rule = case.data(), case.rule
         wanted = {"code": rule.code, "clause": rule.clause, "offset": case.offset}
         if not wanted.items() <= (vectors.get(data) or {}).items():
