@@ -305,9 +305,22 @@ def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_the_journal_of_a_process_that_was_killed_is_read_and_goes_on(tmp_path):
+    code = (
+        "import os, signal, sys; from pathlib import Path; from csplat_tools.batches.records import *\n"
+        "with open_journal(Path(sys.argv[1])) as journal:\n"
+        "    journal.begin(['a.csplat', 'b.csplat'])\n"
+        "    journal.add(Record('a.ply', 'a.csplat', ('encode',), '1', 'done', sha256='0'))\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    assert -signal.SIGKILL == subprocess.run([sys.executable, "-c", code, tmp_path], check=False).returncode
+    with open_journal(tmp_path) as journal:
+        assert (["a.csplat"], {"b.csplat"}) == (list(journal.records), journal.pending)
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
-def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_path, make_model, number):
+def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, make_model):
     stuck, out = scenes / "stuck.ply", tmp_path / "out"
     os.mkfifo(stuck)  # of no size: it comes last
     command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
@@ -318,9 +331,9 @@ def test_a_batch_that_is_ended_in_the_middle_goes_on_where_it_ended(scenes, tmp_
         preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
     )
     with stuck.open("wb"):  # waits for the process that reads it
-        batch.send_signal(number)
+        batch.send_signal(signal.SIGINT)
         batch.wait()
-    assert (130 if number == signal.SIGINT else -number) == batch.returncode
+    assert 130 == batch.returncode
     assert "Traceback" not in batch.communicate()[1]
     noted = [name for name, one in read_journal(out)[0].items() if one.state == "done"]
     stuck.unlink()

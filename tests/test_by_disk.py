@@ -55,7 +55,7 @@ def states(stated, **changes):
 
 @pytest.mark.parametrize("indexed", [True, False])
 def test_what_is_true_is_proved(make_model, indexed):
-    source = make_model(700, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(700, dtype=np.int32)})
+    source = make_model(450, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(450, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -65,7 +65,7 @@ def test_what_is_true_is_proved(make_model, indexed):
 
 @pytest.mark.parametrize("indexed", [True, False])
 def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
-    model = make_model(900, 0)
+    model = make_model(500, 0)
     doubles = model.means.astype(np.float64) + np.array([5e5, 4e6, 30.0])
     source = replace(model, means_double=doubles, means=(doubles - [5e5, 4e6, 30.0]).astype(np.float32),
                      origin=(5e5, 4e6, 30.0))  # fmt: skip
@@ -78,13 +78,13 @@ def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("attribute", ["means", "sh0", "extra"])
 def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute):
-    source = make_model(600, 1, extra={"label": np.arange(600, dtype=np.int32)})
+    source = make_model(450, 1, extra={"label": np.arange(450, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     if attribute == "extra":
         changed = replace(source, extra={"label": source.extra["label"] // 2})
     else:
         array = getattr(source, attribute).copy()
-        array[[3, 300, 599]] += np.float32(0.7)
+        array[[3, 200, 449]] += np.float32(0.7)
         changed = replace(source, **{attribute: array})
     at_once, in_parts = both(changed, result.data, index=result.source_index if indexed else None)
     assert at_once == in_parts
@@ -175,7 +175,7 @@ def test_a_source_index_is_looked_at_in_parts(index, words):
 
 
 def test_the_disk_is_asked_before_and_nothing_stays_there(make_model, tmp_path, monkeypatch):
-    source = make_model(700, 1)
+    source = make_model(450, 1)
     result = encode_with_report(source, OPTIONS)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     both(source, result.data)

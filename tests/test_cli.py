@@ -199,11 +199,16 @@ def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):
     assert expected in " ".join(result.stderr.replace("│", "").split())
 
 
-@pytest.mark.slow
-def test_without_the_extra_packages_all_help_is_there_and_settings_say_what_they_want(ply, tmp_path):
-    code = """
+#: What a process without numba imports and says, as JSON; its last word is a list of command lines.
+WITHOUT_NUMBA = """
 import contextlib, io, json, sys
 sys.modules["numba"] = None
+import csplat.ply, csplat.encoder, csplat.decoder
+by_codec = sorted(sys.modules)
+from csplat_tools.cli.app import app
+with contextlib.redirect_stdout(io.StringIO()):
+    app(["info", "--help"], standalone_mode=False)
+by_info = sorted(sys.modules)
 from csplat_tools.__main__ import main
 ends = []
 for words in json.loads(sys.argv.pop()):
@@ -211,16 +216,23 @@ for words in json.loads(sys.argv.pop()):
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.suppress(SystemExit):
         main()
     ends.append((out.getvalue(), err.getvalue()))
-print(json.dumps(ends))
+print(json.dumps([by_codec, by_info, ends]))
 """
-    commands = [(name, "--help-all") for name in ("encode", "decode", "simplify", "finetune")]
+
+
+@pytest.mark.slow
+def test_a_process_imports_little_and_without_the_extra_packages_settings_say_what_they_want(ply, tmp_path):
+    commands = [(name, "--help-all") for name in ("encode", "simplify", "finetune")]
     commands.append(("simplify", str(ply), str(tmp_path / "o.ply"), "--keep", "0.5", "--set", "rounds=1"))
     done = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(commands)], capture_output=True, text=True, check=True
-    )  # fmt: skip
-    *helps, (_, refused) = json.loads(done.stdout)
+        [sys.executable, "-c", WITHOUT_NUMBA, json.dumps(commands)], capture_output=True, text=True, check=True
+    )
+    by_codec, by_info, (*helps, (_, refused)) = json.loads(done.stdout)
+    assert [] == [name for name in by_codec if name.startswith("csplat_tools")]
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "groups", "options", "settings")}
+    assert {"csplat_tools.cli.info"} == {name for name in by_info if name.startswith("csplat_tools.cli.")} - shared
     assert all("--report" in text for text, _ in helps)
-    for text, _ in helps[2:]:
+    for text, _ in helps[1:]:
         assert "Settings of --set: this needs numba: pip install 'csplat[render]'" in text
     assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n" == refused
 
@@ -794,27 +806,13 @@ def test_lint_does_not_fix_what_would_be_guesswork(tmp_path, ply):
 
 
 def test_runs_the_conformance_suite():
-    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/*", "--json").stdout)
+    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/q*", "--json").stdout)
     assert report["passed"] is True
     assert ["L1", "L2", "L3"] == list(report["levels"])
 
 
 def test_a_filter_that_finds_nothing_fails():
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
-
-
-@pytest.mark.slow
-def test_the_codec_does_not_import_the_program_and_a_command_imports_itself_alone():
-    code = (
-        "import sys, csplat.ply, csplat.encoder, csplat.decoder\n"
-        "assert 'csplat_tools' not in sys.modules\n"
-        "from csplat_tools.cli.app import app\n"
-        "app(['info', '--help'], standalone_mode=False)\n"
-        "print(*(name for name in sys.modules if name.startswith('csplat_tools.cli.')), file=sys.stderr)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "groups", "options", "settings")}
-    assert {"csplat_tools.cli.info"} == set(done.stderr.split()) - shared
 
 
 def test_a_misspelt_command_is_told_which_was_meant():
@@ -859,9 +857,9 @@ def test_version_names_program_and_format():
 def test_works_in_pipes_and_gives_the_same_bytes_in_every_process(ply, csplat_file):
     encoded = program("encode", "-", "-", "--quiet", "--threads", 1, input=ply.read_bytes())
     assert (0, b"", csplat_file.read_bytes()) == (encoded.returncode, encoded.stderr, encoded.stdout)
-    back = program("decode", "-", "-", "--quiet", input=encoded.stdout)
-    assert (0, b"") == (back.returncode, back.stderr)
-    assert back.stdout.startswith(b"ply\n")
+    back = invoke("decode", "-", "-", "--quiet", input=encoded.stdout)
+    assert (0, b"") == (back.exit_code, back.stderr_bytes)
+    assert back.stdout_bytes.startswith(b"ply\n")
 
 
 def test_commands_read_standard_input(tmp_path, ply, csplat_file):
@@ -876,16 +874,15 @@ def test_commands_read_standard_input(tmp_path, ply, csplat_file):
     assert "standard input" in invoke("encode", "-", "-", input=b"nonsense").stderr
 
 
-@pytest.mark.slow
-def test_a_closed_pipe_is_no_traceback(csplat_file):
-    with subprocess.Popen(
-        [*PROGRAM, "info", str(csplat_file), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as running:
-        assert running.stdout is not None
-        assert running.stderr is not None
-        running.stdout.close()  # before it has begun to write
-        assert running.stderr.read() == b""
-        assert running.wait(20) == 1
+def test_a_closed_pipe_is_no_traceback(csplat_file, monkeypatch, capsys):
+    near, far = os.pipe()
+    os.close(near)
+    with os.fdopen(far, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        status = status_of("info", csplat_file, "--json")
+        monkeypatch.undo()
+        assert (1, "") == (status, capsys.readouterr().err)
+        pipe.write("what the interpreter flushes when it ends")
 
 
 def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):

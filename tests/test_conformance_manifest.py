@@ -35,6 +35,7 @@ def named(name):
 
 
 @pytest.mark.slow
+@pytest.mark.area(name="vectors")
 def test_the_manifest_is_valid_by_its_schema():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     jsonschema.Draft202012Validator(SCHEMA).validate(MANIFEST)

@@ -94,12 +94,12 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     made = expected(recipe.scene)
     floats = change(made.floats) if change else made.floats
     antialiased = bool(made.header["scene_flags"]) and change is not None
-    scores = []
-    for number, view in enumerate(recipe.views):
-        reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
-        scores.append(psnr(reference, views.reference_picture(floats, view.camera, antialiased)) - view.psnr)
 
-    assert min(scores) < 0
+    def is_near(number, view):
+        reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
+        return psnr(reference, views.reference_picture(floats, view.camera, antialiased)) >= view.psnr
+
+    assert not all(is_near(number, view) for number, view in enumerate(recipe.views))
 
 
 @pytest.mark.slow

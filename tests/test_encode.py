@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -84,7 +82,7 @@ def test_codebooks_with_escapes_come_back(make_model, escapes):
 @pytest.mark.parametrize("means_coding", ["morton", "axis"])
 @pytest.mark.parametrize("deflate", ["libdeflate", "zlib"])
 def test_codings_change_bytes_but_not_what_is_decoded(make_model, means_coding, deflate):
-    model = make_model(300, 1)
+    model = make_model(300, 0)
     decoded, result = round_trip(model, means_coding=means_coding, deflate=deflate)
     reference, other = round_trip(model)
     np.testing.assert_array_equal(
@@ -136,9 +134,9 @@ def test_extra_columns_keep_their_bits_in_any_byte_order(make_model, dtype):
 
 
 def test_absent_bands_cost_nothing(make_model):
-    model = make_model(3000, 1)
-    silent = replace(model, shN=np.zeros((3000, 15, 3), np.float32))
-    plain = replace(model, shN=np.zeros((3000, 0, 3), np.float32))
+    model = make_model(2000, 1)
+    silent = replace(model, shN=np.zeros((2000, 15, 3), np.float32))
+    plain = replace(model, shN=np.zeros((2000, 0, 3), np.float32))
     assert len(encode(silent)) - len(encode(plain)) < 200
 
 
@@ -187,7 +185,7 @@ def test_all_splats_in_one_point(make_model):
 
 
 def test_what_lies_on_a_grid_of_powers_of_two_comes_back_as_it_was(make_model):
-    model = make_model(2000, 0)
+    model = make_model(800, 0)
     means, scales = np.rint(model.means * 1024) / 1024, np.rint(model.scales * 16) / 16
     decoded, result = round_trip(replace(model, means=means, scales=scales), attribute_psnr=80)
     index = result.source_index
@@ -280,7 +278,7 @@ def wild_models(draw):
 
 @pytest.mark.slow
 @given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
-@settings(max_examples=80, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, suppress_health_check=list(HealthCheck))
 def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
     # CNF-6
     with suppress(InputError):
@@ -290,29 +288,10 @@ def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
 @pytest.mark.parametrize("coding", ["scalar", "codebook"])
 def test_bytes_do_not_depend_on_threads(make_model, coding):
     # CNF-10
-    model = make_model(2000, 2)
-    options = {"sh_coding": coding, "tile_splats": 500, "codebook_size": 64}
+    model = make_model(1000, 2)
+    options = {"sh_coding": coding, "tile_splats": 250, "codebook_size": 32}
     one, two, four = (encode(model, EncodeOptions(threads=n, **options)) for n in (1, 2, 4))
     assert one == two == four
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_blas_threads():
-    code = (
-        "import hashlib, numpy as np, csplat.model; r = np.random.default_rng(0);"
-        "f = lambda *s: r.standard_normal((3000, *s)).astype('f4');"
-        "q = csplat.model.normalise_quats(f(4));"
-        "m = csplat.SplatModel(means=f(3), quats=q, scales=f(3), opacities=r.random(3000).astype('f4'), sh0=f(3),"
-        " shN=f(15, 3));"
-        "o = csplat.EncodeOptions(sh_coding='codebook', codebook_size=128);"
-        "print(hashlib.sha256(csplat.encode(m, o)).hexdigest())"
-    )
-    digests = set()
-    for threads in ("1", "2"):
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        digests.add(done.stdout)
-    assert 1 == len(digests)
 
 
 @pytest.mark.parametrize(
@@ -358,13 +337,13 @@ def test_refuses_metadata_that_is_not_json(make_model):
 
 
 def test_importance_decides_who_is_coded_finely(make_model):
-    model = make_model(2000, 3)
-    importance = np.where(np.arange(2000) < 200, 1.0, 1e-6)
+    model = make_model(800, 3)
+    importance = np.where(np.arange(800) < 80, 1.0, 1e-6)
     options = EncodeOptions(preset="small")
     result = encode_with_report(model, options, importance=importance)
     decoded = csplat.decode(result.data)
     error = ((decoded.shN - model.shN[result.source_index]) ** 2).sum(axis=(1, 2))
-    favoured = result.source_index < 200
+    favoured = result.source_index < 80
     assert float(error[favoured].mean()) < 0.5 * float(error[~favoured].mean())
 
 
@@ -449,11 +428,11 @@ def test_sh_that_no_codebook_can_escape_is_coded_by_itself(make_model, preset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("preset", "seed"), [(name, seed) for seed, name in enumerate((*PRESET_NAMES, *PRESET_NAMES))])
+@pytest.mark.parametrize(("preset", "seed"), [(name, seed) for seed, name in enumerate(PRESET_NAMES)])
 def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
     """Enough splats for cut tiles and codebooks, with importances from nothing to huge."""
     rng = np.random.default_rng(seed)
-    model = make_model(700, 2, seed)
+    model = make_model(500, 2, seed)
 
     def spread(values: np.ndarray, decades: float) -> np.ndarray:
         factors = 10.0 ** rng.uniform(-decades, decades, (len(values),) + (1,) * (values.ndim - 1))
@@ -466,7 +445,7 @@ def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
         shN=spread(model.shN, 3),
         scales=np.clip(spread(model.scales, 1), -60, 60),
     )
-    importance = np.where(rng.random(700) < 0.5, 0.0, 10.0 ** rng.uniform(-12, 12, 700))
+    importance = np.where(rng.random(500) < 0.5, 0.0, 10.0 ** rng.uniform(-12, 12, 500))
     for weights in (None, importance):
         result = encode_with_report(wild, EncodeOptions(preset=preset), importance=weights)
         measured = measure_errors(wild, csplat.decode(result.data), result.source_index)

@@ -275,7 +275,7 @@ def test_values_that_are_cut_are_told_from_rounded_ones(tmp_path, name, cut):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/strong_colours", "ordinary/needles_and_discs"])
+@pytest.mark.parametrize("name", ["ordinary/strong_colours", "ordinary/needles_and_discs"])
 def test_coarse_steps_are_not_cuts(tmp_path, name, preset):
     for psnr in (20.0, 30.0, 90.0):
         _, errors, _ = judged(name, model_of(name, tmp_path), preset=preset, attribute_psnr=psnr)

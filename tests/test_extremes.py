@@ -1,7 +1,7 @@
 """Scenes at the extremes: from PLY to file, back, and to pictures. Figures and words stand in codec/EXTREMES.md.
 
 Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, learning
-is tried on three; all others, and the million splats, are in the area `extremes`.
+is tried on two; all others, and the million splats, are in the area `extremes`.
 """
 
 import numpy as np
@@ -190,13 +190,10 @@ def test_the_ends_of_quality_hold_what_they_state(name, preset, quality):
         assert judge(name, (160, 120)).psnr(decoded) >= QUALITIES[quality]
 
 
+@LONG
 @pytest.mark.parametrize(
     ("name", "preset"),
-    [
-        pytest.param(name, preset, marks=() if (name, preset) == ("needles", "balanced") else LONG)
-        for name in DRAWN
-        for preset in PRESETS
-    ],
+    [(name, preset) for name in DRAWN for preset in PRESETS],
 )
 def test_pictures_are_as_good_as_the_guide_says(name, preset):
     size, psnr = guide_figures()[name][PRESETS.index(preset)]

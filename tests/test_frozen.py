@@ -49,12 +49,11 @@ def assert_seen_is_decoded(frozen, held, result):
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("values", ["start", "moved"])
-def test_what_is_seen_is_what_is_decoded(make_model, way, values):
+def test_what_is_seen_is_what_is_decoded_at_the_start_and_moved(make_model, way):
     model = make_model(260, 3)
     frozen = Draft.of(model, EncodeOptions(**WAYS[way])).frozen()
-    held = moved(frozen) if values == "moved" else frozen.start()
-    assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
+    for held in (frozen.start(), moved(frozen)):
+        assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 
 
 @pytest.mark.parametrize("way", ["scalar", "codebook", "escapes", "tiles, axis", "shapes"])
@@ -160,13 +159,13 @@ def test_refuses_a_part_without_its_source(make_model):
     [
         {"preset": "small"},
         {"sh_coding": "scalar", "attribute_psnr": 40.0},
-        {"shape_codebook_size": 512},
+        {"shape_codebook_size": 200},
         {},
-        {"tile_splats": 400},
+        {"tile_splats": 160},
     ],
 )
 def test_the_sample_is_decoded_as_it_was_seen(sample_path, options):
-    frozen = Draft.of(read_ply(sample_path).select(slice(0, None, 6)), EncodeOptions(**options)).frozen()
+    frozen = Draft.of(read_ply(sample_path).select(slice(0, None, 15)), EncodeOptions(**options)).frozen()
     held = moved(frozen, share=0.02)
     assert_seen_is_decoded(frozen, held, frozen.coded(held).write())
 

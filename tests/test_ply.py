@@ -509,8 +509,11 @@ def test_refuses_every_prefix_of_a_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_flipped_header_bit_is_read_or_refused(tmp_path):
-    """Of all lines that name a column but the first two, the name alone: the rest is the same."""
+def test_flipped_header_bits_are_read_or_refused(tmp_path):
+    """Every third bit, which reaches each place within a byte.
+
+    Of all lines that name a column but the first two, the name alone: the rest is the same.
+    """
     names = columns_of(0, normals=False)
     write_rows(tmp_path / "a.ply", names, random_rows(names, 2))
     data = (tmp_path / "a.ply").read_bytes()
@@ -518,7 +521,8 @@ def test_every_flipped_header_bit_is_read_or_refused(tmp_path):
     starts = np.cumsum([0, *map(len, lines)]).tolist()
     columns = [number for number, line in enumerate(lines) if line.startswith(b"property float ")]
     same = {starts[number] + at for number in columns[2:] for at in range(len("property float "))}
-    for bit in (8 * byte + place for byte in range(starts[-1]) if byte not in same for place in range(8)):
+    bits = [8 * byte + place for byte in range(starts[-1]) if byte not in same for place in range(8)]
+    for bit in bits[::3]:
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
         with suppress(InputError):

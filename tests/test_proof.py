@@ -358,11 +358,11 @@ def test_a_description_accounts_for_every_byte(make_model, options):
 @pytest.mark.slow
 def test_damage_is_described_or_refused_but_never_a_crash(make_model):
     data = encode(make_model(4, 1), EncodeOptions(sh_coding="codebook", codebook_size=2))
-    for place, change in zip(range(len(data)), cycle((0x01, 0xFF, 0x80)), strict=False):
+    for place, change in zip(range(0, len(data), 2), cycle((0x01, 0xFF, 0x80)), strict=False):
         damaged = bytearray(data)
         damaged[place] ^= change
         with suppress(CsplatError):
             describe_file(bytes(damaged)).as_json()
-    for length in range(len(data)):
+    for length in range(0, len(data), 3):
         with pytest.raises(CsplatError):
             describe_file(data[:length])

@@ -32,7 +32,6 @@ REPRESENTATIVES = (
     # L1
     "half_a_file",
     "writes_nothing",
-    "refuses_the_unusual",
     "input_appended",
     "temporary_left",
     "time_in_options",
