@@ -186,7 +186,7 @@ def scenes(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=24, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(BOTH), st.sampled_from(BOTH), scenes())
 def test_what_two_formats_call_exact_is_exact_from_one_to_the_other(tmp_path, first, second, model):
     one, other = formats.named(first), formats.named(second)
