@@ -1,7 +1,6 @@
 """`csplat render`: which files it writes, what is in them, and what it refuses."""
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -199,18 +198,6 @@ def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
     assert 1 == result.exit_code
     assert "is wanted for two outputs" in result.stderr
     assert not film.exists()
-
-
-@pytest.mark.slow
-def test_the_program_starts_without_the_extra_packages():
-    code = (
-        "import sys; from csplat_tools.cli.app import app\n"
-        "app(['--help'], standalone_mode=False)\n"  # which imports every command
-        "assert 'csplat_tools.cli.render' in sys.modules\n"
-        "loaded = {'numba', 'PIL', 'scipy', 'matplotlib', 'torch'} & set(sys.modules)\n"
-        "sys.exit(' '.join(loaded) or 0)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 def test_names_that_are_not_unique_are_numbered():

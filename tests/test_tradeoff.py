@@ -71,7 +71,7 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swept(capture, tmp_path_factory):
-    """A sweep over every group, judged by photographs; one point cannot be made: no splat is so opaque."""
+    """A sweep over every group but simplify, judged by photographs; one point cannot be made: no splat is so opaque."""
     folder = tmp_path_factory.mktemp("swept")
     made, check = [], ViewSet.__post_init__
 
@@ -83,7 +83,7 @@ def swept(capture, tmp_path_factory):
         patch.setattr(ViewSet, "__post_init__", keep)
         result = invoke(
             capture / "a & b.ply", "--data", capture, "--what",
-            "presets,precision=40,strategies=0.3:0.97:16,targets=3kB,simplify=0.5,finetune", "--iterations", "5",
+            "presets,precision=40,strategies=0.3:0.97:16,targets=3kB,finetune", "--iterations", "5",
             "--preset", "fast", "-o", folder / "report.html", "--report", folder / "report.json",
         )  # fmt: skip
     assert 0 == result.exit_code, (result.stderr, result.exception)
@@ -111,8 +111,7 @@ def test_every_group_has_its_points(swept):
         "fast": "presets", "balanced": "presets", "small": "presets", "attributes 40 dB": "precision",
         "SH 0": "strategies", "opacity > 0.3": "strategies", "opacity > 0.97": "strategies",
         "SH 0, opacity > 0.97": "strategies", "k-means 16": "strategies", "SH 0, distilled": "strategies",
-        "target 3.0 kB": "targets", "keep 0.5": "simplify", "tuned": "finetune",
-        "tuned, keep 0.5": "finetune",
+        "target 3.0 kB": "targets", "tuned": "finetune", "tuned, keep 0.5": "finetune",
     } == names  # fmt: skip
 
 
@@ -159,6 +158,7 @@ def test_what_is_searched_for_is_what_a_row_says(setting, monkeypatch):
     wanted = Wanted(what=("targets", "simplify"), preset="fast", psnr=(30.0,), sizes=(9000,), keep=(0.7,))
     tried = {one.name: one for one in candidates(setting, wanted)}
     for name, goal in (("target 30 dB", "psnr"), ("target 9.0 kB", "size"), ("keep 0.7", "keep")):
+        assert ("simplify" if goal == "keep" else "targets") == tried[name].family
         with pytest.raises(InputError, match="none"):
             tried[name].make(lambda *_: None)
         source, words = asked.pop()
@@ -188,10 +188,10 @@ def test_no_file_is_chosen_by_what_judges(swept):
 
 
 @pytest.mark.slow
-def test_simplified_and_tuned_files_hold_what_was_asked_for(swept):
+def test_tuned_files_hold_what_was_asked_for(swept):
     _, _, report, _ = swept
     points = {one["name"]: one for one in report["points"]}
-    assert SPLATS / 2 == points["keep 0.5"]["splats"]
+    assert SPLATS / 2 == points["tuned, keep 0.5"]["splats"]
     assert SPLATS + 1 == report["scene"]["splats"]
     assert SPLATS == points["tuned"]["splats"]  # one lies where no photograph shows it
     assert {"choosing", "encoding", "tuning"} == set(points["tuned"]["seconds"]["stages"])
