@@ -58,7 +58,7 @@ def photograph(scene, folder):
     K = intrinsics(W, H, 60.0)
     document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
-    hidden = scene.select(np.concatenate([[0], np.arange(300)]))
+    hidden = scene.select(np.concatenate([[0], np.arange(len(scene))]))
     hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), scene.means]))
     write_ply(folder / "scene.ply", hidden)
     return folder

@@ -1,6 +1,7 @@
 """The axes table: wherever a scene comes from, all that shows it agrees on up, also after its way through files."""
 
 import base64
+import functools
 import json
 import re
 
@@ -40,11 +41,16 @@ def call(*words):
 
 
 def trained(write, up):
-    def make(folder, _make_model):
+    @functools.cache
+    def known(folder):
+        folder.mkdir()
         write(folder, up=up)
         return train(load(folder), TrainOptions(**ALMOST_NONE)).model
 
-    return make
+    return lambda folder, _make_model: known(folder.parent / write.__name__)
+
+
+TRANSFORMS = trained(write_transforms, (1, 0, 0))
 
 
 def untold(**fields):
@@ -56,8 +62,8 @@ def untold(**fields):
     [
         (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
         (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
-        (trained(write_transforms, (0, 0, 1)), [], "unspecified", (0, 0, 1)),
-        (trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0)),
+        (TRANSFORMS, [], "unspecified", (1, 0, 0)),
+        (TRANSFORMS, ["--up", "-y"], "unspecified", (0, -1, 0)),
         (untold(), [], "unspecified", None),
         (untold(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
         (untold(), ["--axes", "LUF"], "LUF", (0, 1, 0)),

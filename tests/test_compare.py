@@ -25,9 +25,10 @@ def renderer():
 
 @pytest.fixture
 def scene(make_model):
-    """A cloud of splats of some size."""
+    """A ball of splats of some size: it covers a picture from afar, so that no nearer views are tried."""
     model = make_model(400, 1)
-    return replace(model, scales=model.scales * np.float32(0.3) - np.float32(1.5))
+    distances = np.linalg.norm(model.means, axis=1, keepdims=True)
+    return replace(model, means=model.means / distances, scales=model.scales * np.float32(0.3) - np.float32(1.5))
 
 
 @pytest.fixture
@@ -218,7 +219,6 @@ def test_no_camera_is_refused(scene):
         compare_models(scene, scene, [])
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_the_cameras_of_psnr_come_from_the_source_alone(scene):
     cameras = comparison_cameras(scene)
@@ -255,7 +255,7 @@ def test_json_has_psnr_at_the_top(files, camera_file):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("renderer")
+@pytest.mark.usefixtures("renderer", "small_views")
 def test_the_virtual_cameras_are_the_default_and_a_glance_sees_what_they_do(files, scene):
     from csplat_render.warmup import warm_up
 

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 from viewer_pages import ViewerPage
 
-from csplat import decode, encode, read_ply
+from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
 from csplat_tools.files.facts import SceneOverrides
@@ -175,8 +173,9 @@ def test_modules_that_cannot_be_linked_are_noticed(texts, expected):
         link_modules(texts, ["a.mjs"])
 
 
-def test_a_ply_is_encoded(sample_path, tmp_path):
-    done = invoke(sample_path, tmp_path / "page.html", "--preset", "fast")
+def test_a_ply_is_encoded(make_model, tmp_path):
+    write_ply(tmp_path / "scene.ply", make_model(50, 1))
+    done = invoke(tmp_path / "scene.ply", tmp_path / "page.html", "--preset", "fast")
     assert 0 == done.exit_code, done.output
     assert "encoded with the preset fast" in done.stderr
     assert re.search(r"page\.html: [\d.]+ kB, of which the scene [\d.]+ kB", done.stderr.replace("\n", " "))
@@ -197,13 +196,12 @@ def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_the_page_can_go_to_a_pipe(sample_path):
-    words = [sys.executable, "-m", "csplat_tools", "export-html", str(sample_path), "-", "--preset", "fast", "--quiet"]
-    done = subprocess.run(words, capture_output=True, check=True)
-    assert done.stdout.startswith(b"<!doctype html>")
-    assert done.stdout.endswith(b"</html>\n")
-    assert b"" == done.stderr
+def test_the_page_can_go_to_a_pipe(sample, tmp_path):
+    (tmp_path / "scene.csplat").write_bytes(sample)
+    done = invoke(tmp_path / "scene.csplat", "-", "--quiet")
+    assert (0, "") == (done.exit_code, done.stderr)
+    assert export_page(sample, "scene.csplat").page == done.stdout_bytes
+    assert done.stdout_bytes.endswith(b"</html>\n")
 
 
 def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path):

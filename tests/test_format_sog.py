@@ -259,8 +259,8 @@ def test_bombs_are_not_unpacked(tmp_path):
 
 def test_damage_is_refused_or_read(tmp_path):
     whole = zipped(tmp_path / "a.sog", files_of(*splats(1, sh=False))).read_bytes()
-    damaged = [whole[:size] for size in range(0, len(whole), 31)]
-    for place in range(0, len(whole), 7):
+    damaged = [whole[:size] for size in range(0, len(whole), 61)]
+    for place in range(0, len(whole), 11):
         data = bytearray(whole)
         data[place] ^= 1 << place % 8
         damaged.append(bytes(data))
@@ -279,9 +279,9 @@ def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
     files = files_of(*splats(1, sh=False))
     folder = foldered(tmp_path / "a", files)
     whole = files["sh0.webp"]
-    for place in range(len(whole)):
+    for place in range(0, len(whole), 2):
         data = bytearray(whole)
-        data[place] ^= 1 << place % 8
+        data[place] ^= 1 << place // 2 % 8
         (folder / "sh0.webp").write_bytes(data)
         try:
             csplat.read(folder)
@@ -294,12 +294,12 @@ def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
 
 
 def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
-    model = make_model(1500, 1, antialiased=True)
+    model = make_model(600, 1, antialiased=True)
     csplat.write(tmp_path / "a.sog", model)
     back = csplat.read(tmp_path / "a.sog")
     assert back.antialiased
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
-    assert 1500 == len(set(rows))
+    assert 600 == len(set(rows))
     # Half a step of 65,535 in the logarithms, where a step is largest.
     logs = np.log1p(np.abs(model.means.astype(float)).max()) / 65535
     assert np.abs(model.means[rows] - back.means).max() < logs * (1 + np.abs(model.means).max())

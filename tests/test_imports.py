@@ -45,8 +45,8 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 @pytest.mark.slow
-def test_cameras_need_no_numba_and_the_renderer_no_torch():
+def test_the_renderer_needs_no_torch():
+    """That cameras need no numba, test_interface.py says."""
     pytest.importorskip("numba", reason="the renderer wants the extra [render]")
-    assert not modules_after("from csplat_render import Camera, render") & {"numba", "scipy", "torch"}
     loaded = {name.split(".")[0] for name in modules_after("import csplat_render.rasterise, csplat_render.twin")}
     assert not loaded & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy

@@ -1,6 +1,7 @@
 """`csplat info --page`: one page about one file, and what stands beside it; hardest places, and views worth showing."""
 
 import html
+import json
 import re
 import subprocess
 import sys
@@ -25,6 +26,8 @@ from csplat_tools.pages.bars import Bar, draw_bars
 from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.views import comparison_cameras, find_view_set, showing_cameras
 from csplat_tools.views.viewset import ViewSet
+
+pytestmark = pytest.mark.usefixtures("small_views")
 
 
 def invoke(*words):
@@ -55,6 +58,7 @@ def test_the_page_says_what_the_text_says(files, page):
     text = html.unescape(page.read_text())
     facts = describe_file(files[0].read_bytes())
     assert "<h1>a & b.csplat</h1>" in text
+    assert "a & b" not in page.read_text()  # names are no markup
     for name, one in facts.attributes.items():
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
     for record in facts.stated_errors.records:
@@ -125,15 +129,20 @@ def test_a_source_without_a_page_is_a_wrong_command_line(files):
 
 @pytest.mark.slow
 def test_without_the_renderer_there_is_a_page_but_no_comparison(files, tmp_path):
-    code = "import sys; sys.modules['numba'] = sys.modules['PIL'] = None;"
-    code += "from csplat_tools.__main__ import main; main()"
-    words = [sys.executable, "-c", code, "info", str(files[0]), "--page", str(tmp_path / "a.html")]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert (0, "") == (done.returncode, done.stderr)
+    code = """import json, sys
+sys.modules["numba"] = sys.modules["PIL"] = None
+from typer.testing import CliRunner
+from csplat_tools.cli.app import app
+file, source, folder = sys.argv[1:]
+for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
+    done = CliRunner().invoke(app, ["info", file, "--page", *words])
+    print(json.dumps([done.exit_code, done.stderr]))"""
+    words = [sys.executable, "-c", code, *map(str, files), str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    alone, compared = map(json.loads, done.stdout.splitlines())
+    assert [0, ""] == alone
     assert "How exact it says it is" in (tmp_path / "a.html").read_text()
-    again = [*words[:-1], str(tmp_path / "b.html"), "--source", str(files[1])]
-    done = subprocess.run(again, capture_output=True, text=True, check=False)
-    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n" == done.stderr
+    assert [1, "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n"] == compared
     assert not (tmp_path / "b.html").exists()
 
 

@@ -21,8 +21,9 @@ from csplat_tools.cli.app import app
 
 @pytest.fixture
 def files(make_model, tmp_path):
-    """One scene as a model, a PLY and a .csplat file."""
-    model = make_model(60, 1)
+    """One scene as a model, a PLY and a .csplat file: a ball, which virtual cameras see from afar."""
+    model = make_model(60, 1, scales=np.full((60, 3), -1.5, np.float32))
+    model = replace(model, means=model.means / np.linalg.norm(model.means, axis=1, keepdims=True))
     csplat.write_ply(tmp_path / "scene.ply", model)
     (tmp_path / "scene.csplat").write_bytes(csplat.encode(model))
     return model, tmp_path / "scene.ply", tmp_path / "scene.csplat"
@@ -164,12 +165,19 @@ def test_a_ply_that_is_to_be_decoded_is_called_what_it_is(files):
 
 
 @pytest.mark.slow
-def test_what_wants_an_extra_says_so_and_what_does_not_works_without(files):
+def test_the_program_starts_without_extras_and_what_wants_one_says_so(files):
     code = f"""
 import sys
+from csplat_tools.cli.app import app
+app(["--help"], standalone_mode=False)  # which imports every command
+assert "csplat_tools.cli.render" in sys.modules
+loaded = {{"numba", "PIL", "scipy", "matplotlib", "torch"}} & set(sys.modules)
+assert not loaded, loaded
 sys.modules["numba"] = None
 import csplat, csplat_render, csplat_tools, csplat_trainer
+from csplat_render import Camera, render
 from csplat_render.virtual import virtual_cameras
+assert not {{"scipy", "torch"}} & set(sys.modules)
 path = {str(files[1])!r}
 model = csplat.read_ply(path)
 csplat_tools.encode_to(path, errors={{"means": 0.01}})
@@ -189,7 +197,7 @@ for call in (
     else:
         raise SystemExit("nothing was said")
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 # targets

@@ -128,6 +128,7 @@ def state(root):
 
 
 @pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_every_mutant_has_its_fate_and_the_test_that_notices_it(shop):
     entries = {one["new"]: one for one in json.loads(state(shop).read_text())["mutants"]}
     test = "tests/test_prices.py::test_"
@@ -148,6 +149,7 @@ def test_every_mutant_has_its_fate_and_the_test_that_notices_it(shop):
 
 
 @pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_an_older_suite_catches_a_survivor_and_the_table_names_its_test(shop, tmp_path):
     made(tmp_path / "older")
     (tmp_path / "older" / "tests" / "test_prices.py").write_text(OLDER)

@@ -81,6 +81,7 @@ def test_a_mutant_knows_its_line():
     assert ("a.py", 3, "a\n     < b", "(a\n     <= b)") == (one.file, one.line, one.old, one.new)
 
 
+@in_depth
 def test_a_sample_is_repeatable_and_holds_programs_alone():
     decoder = PythonDecoder([])
     first, again, other = (sample(decoder, 40, seed) for seed in (0, 0, 1))
@@ -94,6 +95,7 @@ def test_a_sample_is_repeatable_and_holds_programs_alone():
 # What becomes of it --------------------------------------------------------------------------------
 
 
+@in_depth
 def test_a_mutant_that_fails_a_vector_is_caught(few):
     few("valid/one_splat", "valid/means_morton")
     decoder = PythonDecoder([])
@@ -102,6 +104,7 @@ def test_a_mutant_that_fails_a_vector_is_caught(few):
     assert (Fate.CAUGHT, "valid/means_morton") == (result.fate, result.by)
 
 
+@in_depth
 def test_a_mutant_that_only_a_fuzzed_file_shows_is_missed(few):
     few("valid/one_splat")
     decoder = PythonDecoder([BY_NAME[name].data for name in ("valid/quats", "valid/means_morton")])
@@ -111,6 +114,7 @@ def test_a_mutant_that_only_a_fuzzed_file_shows_is_missed(few):
     assert result.by.startswith("file 1: ")
 
 
+@in_depth
 def test_a_mutant_that_changes_nothing_is_the_same(few):
     few("valid/means_morton", "invalid/chunk_crc")
     decoder = PythonDecoder([BY_NAME["valid/rich"].data])
@@ -137,6 +141,7 @@ def test_what_another_decoder_may_leave_unread_must_be_refused():
     assert not any(vector.error["optional"] for vector, _ in judging.vectors() if vector.error)
 
 
+@in_depth
 def test_the_command_prints_survivors_and_score(few, monkeypatch, capsys):
     few("valid/one_splat")
     monkeypatch.setattr(command, "fuzzed", lambda _count, _seed: [])

@@ -39,16 +39,22 @@ def figure(seed=0):
     return model_of(np.concatenate([body, legs, crumbs])), 4120
 
 
+def same(cameras, others):
+    return all((a.viewmat == b.viewmat).all() for a, b in zip(cameras, others, strict=True))
+
+
 def on_picture(points, camera):
     p = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     return p[:, :2] / p[:, 2:] * [camera.K[0, 0], camera.K[1, 1]] + [camera.K[0, 2], camera.K[1, 2]]
 
 
-@pytest.mark.parametrize("size", [(320, 240), (240, 320), (400, 100)])
+@pytest.mark.parametrize("size", [(240, 320), (400, 100)])
 def test_an_orbit_shows_an_object_whole_down_to_its_feet(size):
     model, count = figure()
     assert "object" == scene_frame(model).kind
     cameras = orbit_cameras(model, 6, *size)
+    if size == (240, 320):
+        assert same(cameras, orbit_cameras(figure()[0], 6, *size))
     places = np.concatenate([on_picture(model.means[:count], camera) for camera in cameras])
     assert ((places > 0) & (places < size)).all()
     filled = np.max(np.abs(places - np.array(size) / 2) / (np.array(size) / 2), axis=0)
@@ -80,7 +86,9 @@ def test_a_path_inside_of_surroundings_stays_before_the_wall_and_goes_back():
     model = niche()
     frame = scene_frame(model)
     assert "surrounding" == frame.kind
-    places = np.stack([camera.position for camera in orbit_cameras(model, 48, 64, 48)])
+    cameras = orbit_cameras(model, 48, 64, 48)
+    assert same(cameras, orbit_cameras(niche(), 48, 64, 48))
+    places = np.stack([camera.position for camera in cameras])
     assert places[:, 0].min() > -0.9
     assert np.ptp(places, axis=0).max() > 0.3 * frame.extent
     steps = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)  # the last one to the first, too
@@ -109,8 +117,7 @@ def test_surroundings_that_carry_cameras_are_travelled_along_them():
     known = ring(40, 90.0)
     carrying = SplatModel(**{**vars(niche()), "cameras": [camera.to_json() for camera in known]})
     wanted = orbit_cameras(niche(), 8, 64, 48, along=known)
-    for a, b in zip(wanted, orbit_cameras(carrying, 8, 64, 48), strict=True):
-        assert (a.viewmat == b.viewmat).all()
+    assert same(wanted, orbit_cameras(carrying, 8, 64, 48))
 
 
 def test_a_film_sways_around_the_view_that_a_scene_is_shown_from_first():
@@ -133,12 +140,6 @@ def test_one_camera_that_is_known_makes_a_film_that_stands_still():
         assert np.allclose(known.viewmat, camera.viewmat)
 
 
-@pytest.mark.parametrize("make", [lambda: figure()[0], niche])
-def test_the_same_scene_has_the_same_path(make):
-    for a, b in zip(orbit_cameras(make(), 5), orbit_cameras(make(), 5), strict=True):
-        assert (a.viewmat == b.viewmat).all()
-
-
 def test_scenes_of_nothing_one_point_and_no_end_have_a_path():
     for means, size in ((np.zeros((0, 3)), 0.1), (np.zeros((1, 3)), 0.1), (figure()[0].means, 1e25)):
         assert all(np.isfinite(camera.viewmat).all() for camera in orbit_cameras(model_of(means, size), 3))
@@ -152,4 +153,4 @@ def test_refuses_a_path_of_no_cameras():
 def test_the_circle_of_an_empty_scene_is_one(make_model):
     cameras = orbit_cameras(make_model(0), 4, 64, 48)
     wanted = orbit([0, 0, 0], 1.0, [0, -1, 0], 4, K, 64, 48, near=cameras[0].near)
-    assert all((a.viewmat == b.viewmat).all() for a, b in zip(wanted, cameras, strict=True))
+    assert same(wanted, cameras)

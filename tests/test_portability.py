@@ -53,6 +53,9 @@ POSIX_NAMES = {
 }
 IMPORT = re.compile(r"^ *(?:import|from) (?P<module>\w+)", re.MULTILINE)
 
+#: What every file contains that uses them, and many that do not: a search that takes a tenth of the time.
+ANY = re.compile(rf"{'|'.join(POSIX_MODULES)}|\.(?:{'|'.join(POSIX_NAMES.values())})")
+
 #: Files of the product that use them, each with the reason.
 USERS = {
     "codec/csplat/inputs.py": "advice on pages that were read, if the system takes any",
@@ -85,6 +88,8 @@ def product_files():
 def posix_uses(path):
     """Return what a file uses of the tables above, as `os.pread`."""
     text = path.read_text("utf-8")
+    if not ANY.search(text):
+        return []
     found = {match["module"] for match in re.finditer(IMPORT, text) if match["module"] in POSIX_MODULES}
     for module, names in POSIX_NAMES.items():
         found |= {f"{module}.{name}" for name in re.findall(rf"\b{module}s?\.({names})\b", text)}

@@ -14,8 +14,6 @@ from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
 
-WORDS = ("--max-splats", 40, "--sh-degree", 1, "--iterations", 5, "--set", "log_every=2")
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -48,18 +46,12 @@ def test_a_page_about_a_training_and_its_file(file_runs):
 
 
 @pytest.mark.slow
-def test_a_page_about_a_training_alone(folder, tmp_path):
-    path = tmp_path / "page.html"
-    call("train", folder, "-o", tmp_path / "a.ply", *WORDS, "--page", path)
+def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_compare(file_runs, tmp_path):
+    compared, path = tmp_path / "compared.json", tmp_path / "page.html"
+    file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
     page = path.read_text()
     assert ["How near it comes", "What it looks like", "The training", "How it was made"] == headings(page)
-    assert ["photograph", "trained scene"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", page)
-
-
-@pytest.mark.slow
-def test_the_scene_s_scores_in_a_report_of_a_file_are_those_of_compare(file_runs, tmp_path):
-    compared = tmp_path / "compared.json"
-    file_runs.made("a.ply", "--resume", file_runs.checkpoint)
+    assert ["photograph", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
     both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
     call("compare", *both, "--data", file_runs.data, "--report", compared)
     judged = json.loads(compared.read_text())["photographs"]

@@ -1,6 +1,7 @@
 """Warming up: what it compiles is all that the commands run, and it says so."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -8,10 +9,13 @@ import pytest
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+
 # The versions of each kernel that are known after warming up, and those that using it for a scene adds.
 _USE = """
-import json, sys
+import json, os, sys
 import numpy as np
+import csplat_tools.optimise.simplify, csplat_render.judge, csplat_render.lpips, csplat_render.similarity
 from csplat.model import SplatModel
 from csplat_render.warmup import warm_up
 
@@ -35,7 +39,6 @@ plain = compiled()
 """
 _SIMPLIFY = """
 prepare_renderer(quiet=True, simplify=True)
-from csplat_render.virtual import virtual_cameras
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 before = compiled()
 simplify(model, keep=0.5, options=SimplifyOptions(views=2, view_size=(32, 24), rounds=1, effort=1))
@@ -46,22 +49,32 @@ warm_up(gradients=False, ssim=True, lpips=True)
 from csplat_render.convolving import convolve
 from csplat_render.lpips import SCALE
 from csplat_render.judge import Judge
-from csplat_render.virtual import virtual_cameras
+from csplat_render.cameras import intrinsics, look_at
 before = compiled()
 def lpips(a, b):
     kernel = np.full((11, 11, 3, 64), 0.1, np.float32)
     return float(convolve((a - b) / SCALE, kernel, np.zeros(64, np.float32), 4, 2).mean())
-judge = Judge.of_source(model, virtual_cameras(model, 1, 64, 48), (0.0, 0.0, 0.0))
+camera = look_at((4.0, 4.0, 4.0), (0.5, 0.5, 0.5), (0.0, 0.0, 1.0), intrinsics(64, 48, 60.0), 64, 48)
+judge = Judge.of_source(model, [camera], (0.0, 0.0, 0.0))
 judge.scores(model.select(np.arange(30)), lpips=lpips)
 """
-_TELL = "print(json.dumps([plain, before, compiled()]))"
+_TELL = "print(json.dumps([plain, before, compiled()]), flush=True)"
 
 
-def versions_by(*parts):
-    """Run parts of a program; return how many versions of each kernel there were at each of three times."""
-    code = "".join([_USE, *parts, _TELL])
+@pytest.fixture(scope="module")
+def versions():
+    """How many versions of each kernel there are at three times of each part: in processes that share imports alone."""
+    parts = [f"{part}{_TELL}" for part in (_PLAIN + _SIMPLIFY, _COMPARE)]
+    code = f"""{_USE}
+for part in {parts!r}:
+    if os.fork() == 0:
+        exec(part)
+        os._exit(0)
+    if os.wait()[1]:
+        sys.exit("a part failed")
+"""
     run = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(run.stdout)
+    return [json.loads(line) for line in run.stdout.splitlines()]
 
 
 def assert_nothing_was_compiled(before, after):
@@ -70,13 +83,13 @@ def assert_nothing_was_compiled(before, after):
 
 
 @pytest.mark.slow
-def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_renderer_needs_less():
-    plain, before, after = versions_by(_PLAIN, _SIMPLIFY)
+def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_renderer_needs_less(versions):
+    plain, before, after = versions[0]
     assert_nothing_was_compiled(before, after)
     assert "csplat_render.blending_sums.sum_removal" in {name for name in after if after[name] > plain.get(name, 0)}
 
 
 @pytest.mark.slow
-def test_nothing_is_left_to_compile_after_warming_up_for_compare():
-    _, before, after = versions_by(_COMPARE)
+def test_nothing_is_left_to_compile_after_warming_up_for_compare(versions):
+    _, before, after = versions[1]
     assert_nothing_was_compiled(before, after)
