@@ -164,12 +164,12 @@ def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) 
     Raises:
         InputError: a file lacks some of the weights.
     """
-    if importlib.util.find_spec("torch") is None:
-        return None
     heads_path = heads_path or _heads_path()
-    torch: Any = importlib.import_module("torch")
+    if heads_path is None or importlib.util.find_spec("torch") is None:
+        return None
+    torch: Any = importlib.import_module("torch")  # takes two seconds
     backbones = sorted((Path(cache or torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
-    if heads_path is None or not backbones:
+    if not backbones:
         return None
     backbone = torch.load(backbones[-1], map_location="cpu", weights_only=True)
     heads = torch.load(heads_path, map_location="cpu", weights_only=True)
