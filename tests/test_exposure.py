@@ -62,7 +62,7 @@ def test_slopes_are_those_of_the_loss_with_the_correction():
 
 @pytest.mark.slow
 def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
-    options = TrainOptions(**{**LONGER, "iterations": 600})
+    options = TrainOptions(**{**LONGER, "iterations": 450})
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
     assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # of what teaches
     found = np.array(corrected.log["exposures"])
