@@ -633,7 +633,7 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
     out, report, page = (tmp_path / name for name in ("s.csplat", "report.json", "page.html"))
     call(
         "finetune", capture / "scene.ply", "--self", "-o", out, "--attribute-psnr", 28, "--iterations", 60,
-        "--views", 16, "--lr-factor", 1, "--view-size", "48x36", "--report", report, "-q",
+        "--views", 16, "--lr-factor", 1, "--view-size", "48x36", *BARE, "--report", report, "-q",
         "--page", page,
     )  # fmt: skip
     facts = json.loads(report.read_text())

@@ -248,8 +248,8 @@ def test_bounds_that_no_number_keeps_are_refused(scene):
 )
 def test_extreme_scenes_meet_a_psnr(name, views):
     source = extremes.scene(name)[0]
-    views = views or around(source)
-    found = found_within(source, views, psnr=17.0)
+    find, views = (found_within, around(source)) if views is None else (search, views)
+    found = find(source, views, psnr=17.0)
     assert views.judge(source).psnr(decode(found.data)) >= 17.0
     assert len(decode(found.data)) >= 1
 

@@ -81,8 +81,8 @@ def swept(ply, data, _):
 
 
 def targeted(ply, data, folder):
-    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-loss", 3, "--keep-all", "--json")
-    report = json.loads(call(*words))["target"]
+    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-loss", 3, "--keep-all", "--preset", "fast")
+    report = json.loads(call(*words, "--json"))["target"]
     return report["views"], report["photographs"]["source"]
 
 
