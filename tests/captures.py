@@ -128,7 +128,7 @@ def judged_by(seen_from):
 
 def photographed(scene):
     """Return photographs that a scene misses by 25 dB, every eighth of which judges."""
-    seen_from = camera_sequence(scene, 96, SMALL, seed=3)
+    seen_from = camera_sequence(scene, 48, SMALL, seed=3)
     rng, draw = np.random.default_rng(1), renderer(scene, BLACK)
     noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
     pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]

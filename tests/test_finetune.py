@@ -33,6 +33,7 @@ from csplat_render.cameras import save_cameras
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.training.report import ply_splat_bytes
 from csplat_tools.training.searching import smallest_reaching
 from csplat_trainer.loss import PhotometricLoss
@@ -43,7 +44,7 @@ from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
 from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
 
 BLACK = np.zeros(3, np.float32)
-QUICK = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, log_every=10)
+QUICK = FinetuneOptions(iterations=30, warm_up=5, validate_every=10, log_every=5)
 FEW = FinetuneOptions(iterations=12, warm_up=2, validate_every=4, log_every=2)
 COARSE = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16)
 
@@ -51,6 +52,12 @@ COARSE = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=
 @pytest.fixture(scope="module")
 def source():
     return shell(8)
+
+
+@pytest.fixture(scope="module")
+def coarse(source):
+    """The scene as a coarse file holds it, with a codebook."""
+    return Draft.of(source, COARSE).frozen()
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +82,7 @@ def test_a_program_hands_over_a_model_and_views_and_is_told_of_every_step(source
     assert len(found.data) < len(csplat.encode(source))
     assert psnr(found.decoded, views.validation) > psnr(decode(found.plain.data), views.validation)
     assert np.array_equal(decode(found.data).sh0, found.decoded.sh0)
-    assert list(range(10, 61, 10)) == [one.iteration for one in steps]
+    assert list(range(5, 31, 5)) == [one.iteration for one in steps]
     assert {"measuring sensitivity", "tuning"} <= {stage for stage, _ in stages}
     assert ("tuning", 1.0) == stages[-1]
 
@@ -118,8 +125,8 @@ def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(sou
     assert len(after) < 1.1 * len(before)
 
 
-def test_pixels_that_do_not_count_teach_nothing(source, views):
-    frozen, taken = Draft.of(source, COARSE).frozen(), [one.camera for one in views.train]
+def test_pixels_that_do_not_count_teach_nothing(coarse, views):
+    taken = [one.camera for one in views.train]
     mask = np.ones((taken[0].H, taken[0].W), bool)
     mask[:, ::3] = False
 
@@ -132,15 +139,14 @@ def test_pixels_that_do_not_count_teach_nothing(source, views):
             shown.append(View(one.camera, Picture(one.camera, pixels, mask)))
         return Views(shown, shown[:2], BLACK)
 
-    first, second = (tune(frozen, hidden(value), FEW) for value in (0, 250))
+    first, second = (tune(coarse, hidden(value), FEW) for value in (0, 250))
     assert np.array_equal(first.held.sh0, second.held.sh0)
     assert first.log["looks"] == second.log["looks"]
 
 
 @pytest.mark.slow
-def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
-    frozen = Draft.of(source, COARSE).frozen()
-    tuned = tune(frozen, views, QUICK)
+def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
+    frozen, tuned = coarse, tune(coarse, views, FEW)
     decoded = decode(frozen.coded(tuned.held).write().data)
     rasteriser, error = Rasteriser(), []
     rows = np.argsort(frozen.source_index)
@@ -157,9 +163,8 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(source, views):
 
 @pytest.mark.slow
 def test_costly_bytes_make_small_files(source, views):
-    sizes = []
+    sizes, frozen = [], Draft.of(source, EncodeOptions(sh_coding="scalar")).frozen()
     for cost in (0.0, 1e-3, 1e-2):
-        frozen = Draft.of(source, EncodeOptions(sh_coding="scalar")).frozen()
         tuned = tune(frozen, views, replace(QUICK, byte_cost=cost))
         sizes.append(len(frozen.coded(tuned.held).write().data))
     assert sizes[0] > sizes[1] > sizes[2]
@@ -176,20 +181,20 @@ def test_what_does_not_get_better_stays_as_it_was(fine):
 @pytest.mark.slow
 def test_a_run_that_gains_nothing_ends_early(fine):
     frozen, views = fine
-    options = replace(FEW, iterations=60, patience=2, byte_cost=0.0).scaled(5.0)
+    options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     log = tune(frozen, views, options).log
     assert log["settled"]
-    assert 2 / 3 * 60 < log["steps"] < 60  # not before values have calmed down
+    assert 2 / 3 * 30 < log["steps"] < 30  # not before values have calmed down
     assert not tune(frozen, views, replace(options, patience=0)).log["settled"]
 
 
 @pytest.mark.slow
 def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
     frozen, views = fine
-    options = replace(FEW, iterations=60, patience=2, byte_cost=0.0).scaled(5.0)
+    options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     assert tune(frozen, views, options, size_bytes=10**9).log["settled"]
     monkeypatch.setattr(Budget, "overdrawn", lambda *_: 1e-3)
-    assert 60 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
+    assert 30 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
 
 
 # gradients
@@ -234,8 +239,8 @@ def test_sums_by_entry_agree_with_their_twin():
     assert np.allclose(slow[3], values[index == 3].sum(axis=0), atol=1e-5)
 
 
-def test_a_step_moves_values_through_their_quantisers(source, views):
-    scene = TunedScene(Draft.of(source, COARSE).frozen())
+def test_a_step_moves_values_through_their_quantisers(coarse, views):
+    scene = TunedScene(coarse)
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
@@ -317,8 +322,8 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
         assert np.abs(gradient - expected / step).max() < 0.05 / step  # integers are rounded, this is not
 
 
-def test_a_weight_of_bytes_is_loss_per_bit_and_splat(source):
-    scene = TunedScene(Draft.of(source, COARSE).frozen())
+def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
+    scene = TunedScene(coarse)
     seen, _ = scene.seen()
     costs = Costs.counted(scene.frozen, scene.stored(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
@@ -362,9 +367,9 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
 def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
     frozen = Draft.of(source, EncodeOptions(attribute_psnr=34.0)).frozen()
     before = len(frozen.coded(frozen.start()).write().data)
-    options, costs = replace(QUICK, iterations=200, validate_every=10, byte_cost=2e-3), []
-    for share in (0.92, 1.5):
-        tuned = tune(frozen, views, options, size_bytes=int(share * before))
+    options, costs = replace(QUICK, byte_cost=4e-3), []
+    for share, steps in ((0.93, 120), (1.5, 60)):
+        tuned = tune(frozen, views, replace(options, iterations=steps), size_bytes=int(share * before))
         assert len(frozen.coded(tuned.held).write().data) <= share * before
         best = next(look for look in tuned.log["looks"] if look["iteration"] == tuned.log["best_iteration"])
         assert best["size_bytes"] == len(frozen.coded(tuned.held).write().data)
@@ -398,8 +403,8 @@ def test_bytes_that_are_free_at_first_are_dear_in_time():
     assert 0.98 * 100_000 < 37_500 + bits / 8
 
 
-def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_path):
-    frozen, file = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz"
+def test_a_checkpoint_of_other_views_or_options_is_refused(coarse, views, tmp_path):
+    frozen, file = coarse, tmp_path / "c.npz"
     tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
     with pytest.raises(InputError, match="another byte_cost"):
         tune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
@@ -409,8 +414,8 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(source, views, tmp_pa
         tune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
-def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(source, views, tmp_path):
-    file, frozen = tmp_path / "run.npz", Draft.of(source, COARSE).frozen()
+def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(coarse, views, tmp_path):
+    file, frozen = tmp_path / "run.npz", coarse
     tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
     arrays = dict(np.load(file))
     facts = json.loads(arrays["facts"].tobytes())
@@ -421,9 +426,9 @@ def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(source, views
         tune(frozen, views, replace(QUICK, iterations=6, lr_exposure=0.01), resume=file)
 
 
-def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_path):
+def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views, tmp_path):
     file = tmp_path / "c.npz"
-    tune(Draft.of(source, COARSE).frozen(), views, replace(QUICK, iterations=5), checkpoint=file)
+    tune(coarse, views, replace(QUICK, iterations=5), checkpoint=file)
     other = Draft.of(source, replace(COARSE, attribute_psnr=29.0)).frozen()
     with pytest.raises(InputError, match="another scene"):
         tune(other, views, QUICK, resume=file)
@@ -436,11 +441,11 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, views, tmp_pat
     for content in (*wrong, (tmp_path / "n.npz").read_bytes(), (tmp_path / "n.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(InputError, match="not a checkpoint") as caught:
-            tune(Draft.of(source, COARSE).frozen(), views, QUICK, resume=tmp_path / "bad.npz")
+            tune(coarse, views, QUICK, resume=tmp_path / "bad.npz")
         assert "pickle" not in str(caught.value)
 
 
-def test_values_that_are_not_finite_end_a_run(source, views, monkeypatch):
+def test_values_that_are_not_finite_end_a_run(coarse, views, monkeypatch):
     """Kernels survive NaN, so a loss may be finite all the same; a file cannot hold it."""
     step = TunedScene.step
 
@@ -450,7 +455,7 @@ def test_values_that_are_not_finite_end_a_run(source, views, monkeypatch):
 
     monkeypatch.setattr(TunedScene, "step", spoilt)
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="a value is not finite at step 4"):
-        tune(Draft.of(source, COARSE).frozen(), views, FEW)
+        tune(coarse, views, FEW)
 
 
 # options and views
@@ -472,8 +477,8 @@ def test_learning_rates_rise_and_fall():
     assert options.byte_cost == options.scaled(2.0).byte_cost
 
 
-def test_every_learning_rate_rises_with_the_others(source, views, tmp_path):
-    frozen, file, moved = Draft.of(source, COARSE).frozen(), tmp_path / "c.npz", []
+def test_every_learning_rate_rises_with_the_others(coarse, views, tmp_path):
+    frozen, file, moved = coarse, tmp_path / "c.npz", []
     start = {name: values.copy() for name, values in TunedScene(frozen).parameters.values.items() if values.size}
     for warm_up in (0, 100):
         options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
@@ -512,7 +517,8 @@ def test_views_that_judge_teach_unless_they_are_kept_aside():
 
 # the command
 
-BRIEF = ("--preset", "fast", "--iterations", 1)  # where neither codebooks nor learning matter
+BARE = ("--set", "sh-coding=none,shape-codebook-size=0")  # neither SH nor codebooks, which take time
+BRIEF = ("--preset", "fast", "--iterations", 1, *BARE)  # where learning does not matter, either
 
 
 def invoke(*words):
@@ -528,6 +534,20 @@ def call(*words):
 @pytest.fixture(scope="module")
 def capture(source, tmp_path_factory):
     return photograph(source, tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture
+def brief_fits(monkeypatch):
+    """Fit the splats that are left in a quarter of the usual steps, once."""
+    brief = partial(SimplifyOptions, effort=1, bands=False)
+    monkeypatch.setattr("csplat_tools.training.choosing.SimplifyOptions", brief)
+
+
+@pytest.fixture
+def no_fits(monkeypatch):
+    """Leave the splats that are left as they were: where their number is the point."""
+    bare = partial(SimplifyOptions, refit=False, bands=False)
+    monkeypatch.setattr("csplat_tools.training.choosing.SimplifyOptions", bare)
 
 
 @pytest.mark.slow
@@ -613,7 +633,7 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
     out, report, page = (tmp_path / name for name in ("s.csplat", "report.json", "page.html"))
     call(
         "finetune", capture / "scene.ply", "--self", "-o", out, "--attribute-psnr", 28, "--iterations", 60,
-        "--views", 16, "--lr-factor", 1, "--view-size", "48x36", "--report", report, "-q",
+        "--views", 16, "--lr-factor", 1, "--view-size", "48x36", *BARE, "--report", report, "-q",
         "--page", page,
     )  # fmt: skip
     facts = json.loads(report.read_text())
@@ -643,6 +663,7 @@ def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("brief_fits")
 def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     out = tmp_path / "s.csplat"
     result = call(
@@ -658,7 +679,7 @@ def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     assert "need least" not in again.stderr
 
 
-SMALL = ("--preset", "small", "--iterations", 10)
+SMALL = ("--preset", "small", "--iterations", 10, "--set", "sh-coding=scalar,shape-codebook-size=0")
 
 
 @pytest.fixture(scope="module")
@@ -669,6 +690,7 @@ def whole(capture, tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_fits")
 @pytest.mark.parametrize(("share", "splats"), [(0.9, (80, 270)), (1.15, (300, 300))], ids=["fewer splats", "finer"])
 def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share, splats):
     size, out = int(share * whole["size_bytes"]), tmp_path / "s.csplat"
@@ -695,6 +717,7 @@ def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_pa
     facts = json.loads(report.read_text())
     assert wanted <= facts["validation"]["psnr"]
     assert out.stat().st_size == facts["size_bytes"] > whole["size_bytes"]
+    words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF)
     result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-psnr", 90)
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
     assert "90 dB are not reached" in result.stderr
@@ -729,7 +752,7 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
 @pytest.mark.slow
 def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
-    words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF, "--lambda", 0)
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--preset", "fast", "--iterations", 1, "--lambda", 0)
     call(*words, "-o", tmp_path / "a.csplat", "--importance", tmp_path / "s.npz")
     call(*words, "-o", tmp_path / "b.csplat")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
@@ -779,10 +802,10 @@ def test_every_knob_of_encoder_and_tuning_is_an_option_or_a_setting():
 
 @pytest.mark.slow
 def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, "-q")
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, *BARE, "-q")
     short = tmp_path / "run.npz"
-    call(*words, "-o", tmp_path / "a.csplat", "--iterations", 12, "--checkpoint", short, "--checkpoint-every", 8)
-    call(*words, "-o", tmp_path / "b.csplat", "--iterations", 12, "--resume", short, "--checkpoint", short)
+    call(*words, "-o", tmp_path / "a.csplat", "--iterations", 6, "--checkpoint", short, "--checkpoint-every", 4)
+    call(*words, "-o", tmp_path / "b.csplat", "--iterations", 6, "--resume", short, "--checkpoint", short)
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
 
 

@@ -51,9 +51,9 @@ def relative(found, expected):
 @pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
-    model = replace(scene(), antialiased=antialiased)
+    model = replace(scene(30), antialiased=antialiased)
     behind = (0.2, 0.5, 0.9)
-    expected = removal_exact(model, views(2), np.arange(60), background=behind, transmittance_min=0.0)
+    expected = removal_exact(model, views(2), np.arange(30), background=behind, transmittance_min=0.0)
     wide = measure_removal(model, views(2), background=behind, dtype=np.float64, transmittance_min=0.0)
     assert relative(wide.error, expected).max() < 1e-9
     narrow = measure_removal(model, views(2), background=behind, transmittance_min=0.0)
@@ -79,7 +79,7 @@ def test_the_pass_agrees_on_the_sample(sample_path):
 def assert_the_pass_agrees(source, camera):
     model = source.select(slice(0, None, max(1, len(source) // 500)))
     found = measure_removal(model, [camera], transmittance_min=0.0)
-    rows = np.argsort(-found.error)[:120:24]
+    rows = np.argsort(-found.error)[:120:40]
     expected = removal_exact(model, [camera], rows, transmittance_min=0.0)
     off = relative(found.error[rows], expected).max()
     print(f"{off:.1e} off taking splats away one by one")
@@ -88,9 +88,9 @@ def assert_the_pass_agrees(source, camera):
 
 @pytest.mark.slow
 def test_finished_pixels_are_all_that_it_leaves_out():
-    model = scene(count=120)
-    model = replace(model, opacities=np.full(120, 0.97, np.float32), scales=model.scales + np.float32(1.0))
-    exact = removal_exact(model, views(1), np.arange(120))
+    model = scene(count=60)
+    model = replace(model, opacities=np.full(60, 0.97, np.float32), scales=model.scales + np.float32(1.0))
+    exact = removal_exact(model, views(1), np.arange(60))
     found = measure_removal(model, views(1)).error
     assert abs(found.sum() / exact.sum() - 1.0) < 2e-2
     assert np.corrcoef(found, exact)[0, 1] > 0.999
@@ -152,13 +152,13 @@ def test_threads_change_nothing(threads):
 @pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_splats_at_a_slant_lose_no_row(antialiased):
-    model = scene(count=60, seed=4)
-    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (60, 1))  # needles: most rows of their boxes are empty
+    model = scene(count=30, seed=4)
+    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (30, 1))  # needles: most rows of their boxes are empty
     model = replace(model, scales=scales, antialiased=antialiased)
-    expected = removal_exact(model, views(1), np.arange(60), transmittance_min=0.0)
+    expected = removal_exact(model, views(1), np.arange(30), transmittance_min=0.0)
     found = measure_removal(model, views(1), dtype=np.float64, transmittance_min=0.0)
     assert relative(found.error, expected)[expected > 0.0].max() < 1e-9
-    assert np.count_nonzero(expected) > 40
+    assert np.count_nonzero(expected) > 20
 
 
 @pytest.mark.parametrize("name", [name for name, _ in adversarial()])

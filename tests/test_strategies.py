@@ -303,8 +303,11 @@ def test_distilled_and_clustered_colours_state_no_error(shell):
 
 @pytest.mark.slow
 def test_a_scene_of_one_splat_can_be_distilled(shell):
+    from captures import cameras, views_of
+
     one = shell.select(slice(0, 1))
-    assert 1 == len(stored(one, encode_reduced(one, Reduction(sh_degree=0, distil=True, views=9))).model)
+    result = encode_reduced(one, Reduction(sh_degree=0, distil=True), views=views_of(cameras(9)))
+    assert 1 == len(stored(one, result).model)
 
 
 def test_given_cameras_decide_and_one_is_not_enough(shell):

@@ -1,6 +1,5 @@
 import json
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -26,7 +25,7 @@ from csplat_trainer.pictures import Picture
 from csplat_trainer.starting import scene_of, starting_splats
 from csplat_trainer.tuning import FinetuneOptions
 
-SIZE = 48
+SIZE = 32
 QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
 
 
@@ -82,11 +81,10 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
 def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, make_model, tmp_path, strategy):
     data = make_data(make_model)
     options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
-    whole = train(data, options)
+    whole, _ = resumed_as_if_never_stopped(data, options, tmp_path)
     counts = [entry["splat_count"] for entry in whole.log["entries"]]
     assert counts[1] == counts[2] == len(whole.model)
     assert len(train(data, replace(options, final_share=1.0)).model) / 2 == pytest.approx(counts[2], abs=3)
-    resumed_as_if_never_stopped(data, options, tmp_path)
 
 
 @pytest.mark.slow
@@ -95,9 +93,9 @@ def test_a_run_that_goes_on_late_ends_with_the_share_that_is_wanted(make_data, m
     data = make_data(make_model)
     trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
     whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
-    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.25)
+    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.75)  # two times that splats go, each of 100 steps
     left = train(data, options, outputs=Outputs(resume=tmp_path / "trunk.npz"))
-    assert 0.25 * len(whole.model) == pytest.approx(len(left.model), abs=3)
+    assert 0.75 * len(whole.model) == pytest.approx(len(left.model), abs=3)
 
 
 def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, tmp_path, monkeypatch):
@@ -110,19 +108,18 @@ def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, t
 
     monkeypatch.setattr(CpuEngine, "step", watched)
     options = TrainOptions(**QUICK, half_size=0.5)
-    train(make_data(make_model), options)
-    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths
     resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # of the run that did not stop
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
 def test_training_brings_the_loss_down(make_data, make_model, strategy):
     data = make_data(make_model)
-    options = TrainOptions(**{**QUICK, "iterations": 300, "refine_every": 50}, strategy=strategy, lr_means=2e-3)
+    options = TrainOptions(**{**QUICK, "iterations": 150, "refine_every": 30}, strategy=strategy, lr_means=4e-3)
     result = train(data, options)
     losses = result.log["losses"]
-    assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:20])
+    assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
     assert result.metrics["psnr_mean"] > 15
     assert len(result.model) <= 80
 
@@ -142,7 +139,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, t
 
 
 def resumed_as_if_never_stopped(data, options, folder):
-    """Compare a run with one that goes on from the middle of it; return its log and the checkpoint of that."""
+    """Compare a run with one that goes on from the middle of it; return the run and the checkpoint of that."""
     outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"
 
     def stop(now):
@@ -155,7 +152,7 @@ def resumed_as_if_never_stopped(data, options, folder):
     assert np.array_equal(whole.model.shN, again.model.shN)
     assert whole.log["losses"] == again.log["losses"]
     assert whole.log.get("exposures") == again.log.get("exposures")
-    return whole.log, stopped
+    return whole, stopped
 
 
 def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_path):
@@ -237,7 +234,7 @@ def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
     angle = 2 * np.arctan(0.5 * SIZE / data.train[0].camera.K[0, 0])
     (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     run = ("train", tmp_path, "-o", tmp_path / "o.ply")
-    options = ("--max-splats", 50, "--sh-degree", 1, "--iterations", 5, "--size", "40x40", "--seed", 3)
+    options = ("--max-splats", 50, "--sh-degree", 1, "--iterations", 5, "--size", "24x24", "--seed", 3)
     files = ("--report", tmp_path / "log.json", "--plot", tmp_path / "loss.png")
     assert "" == call(*run, *options, *files).stdout
     model = read_ply(tmp_path / "o.ply")
@@ -273,22 +270,17 @@ FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("alpha", "background", "every", "size"),
-    [(True, "auto", 5, None), (False, "auto", 10, "40x30"), (False, "white", 8, None), (True, "random", 8, "40x40")],
+    [(True, "auto", 5, None), (False, "auto", 10, "24x20"), (False, "white", 8, None), (True, "random", 8, "24x24")],
 )
 def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, alpha, background, every, size):
     folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
     told = call("train", folder, "-o", ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
-    call("encode", ply, tmp_path / "a.csplat")
-    call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
     said = TrainedOn.of(read_ply(ply).metadata)
-    assert said == TrainedOn.of(read_ply(tmp_path / "b.ply").metadata)
     assert (every, size) == (said.test_every, None if said.size is None else "{}x{}".format(*said.size))
     assert said.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
     assert str(said) in told.stderr
-    assert str(said) in call("info", tmp_path / "a.csplat").stdout
-    assert said.as_json() == json.loads(call("info", tmp_path / "a.csplat", "--json").stdout)["metadata"]["training"]
     colour = ",".join(str(value) for value in said.background)
     judged = json.loads(call("compare", ply, ply, "--data", folder, "--background", colour, "--json", *reading).stdout)[
         "photographs"
@@ -296,6 +288,17 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
     metrics = json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
         assert judged[name] == pytest.approx(metrics[name], abs=0.01)
+
+
+@pytest.mark.parametrize("said", [TrainedOn((1.0, 1.0, 1.0), 5), TrainedOn((0.0, 0.0, 0.0), 10, (24, 20), 0.05)])
+def test_a_file_and_its_ply_hand_on_what_a_scene_was_trained_on(make_model, tmp_path, said):
+    ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
+    write_ply(ply, make_model(10, 0, metadata={"training": said.as_json()}))
+    call("encode", ply, file, "-q")
+    call("decode", file, back, "-q")
+    assert said == TrainedOn.of(read_ply(back).metadata)
+    assert str(said) in call("info", file).stdout
+    assert said.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
 
 
 @pytest.mark.slow
@@ -329,8 +332,8 @@ def test_from_one_training_come_several_files(file_runs):
     def made(name, *more):
         return file_runs.made(name, "--resume", file_runs.checkpoint, *more)[0]["file"]
 
-    few = made("few.csplat", "--keep", 0.5, "--lambda", 0.03)
-    assert usual["splats"] / 2 == pytest.approx(few["splats"], abs=2)
+    few = made("few.csplat", "--keep", 0.75, "--lambda", 0.03)
+    assert 0.75 * usual["splats"] == pytest.approx(few["splats"], abs=2)
     assert 0.03 == few["log"]["byte_cost"]
     bound = usual["size_bytes"] + 200
     assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
@@ -380,12 +383,8 @@ def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_mod
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.slow
-def test_the_command_says_which_extra_is_missing(tmp_path):
-    code = "import sys; sys.modules['numba'] = None; sys.argv = ['csplat', 'train', '.', '-o', sys.argv[1]]"
-    code += "; from csplat_tools.__main__ import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "o.ply")], capture_output=True, text=True, check=False
-    )
-    assert 1 == done.returncode
-    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == done.stderr.strip()
+def test_the_command_says_which_extra_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    result = CliRunner().invoke(app, ["train", ".", "-o", str(tmp_path / "o.ply")])
+    assert 1 == result.exit_code
+    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == result.stderr.strip()

@@ -44,7 +44,7 @@ def photographs(kind, folder):
 def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands):
     """None is called with background, split or size: the PLY names them. `encode` searches, which takes long."""
     data, ply, log = photographs(kind, tmp_path / "data"), tmp_path / "s.ply", tmp_path / "log.json"
-    quick = ("--max-splats", 60, "--sh-degree", 1, "--iterations", 20, "--set", "init=box")
+    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--set", "init=box")
     size = "x".join(map(str, SIZE))
     call("train", data, "-o", ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
     said = TrainedOn.of(read_ply(ply).metadata)
@@ -81,8 +81,8 @@ def swept(ply, data, _):
 
 
 def targeted(ply, data, folder):
-    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-loss", 3, "--keep-all", "--json")
-    report = json.loads(call(*words))["target"]
+    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-loss", 3, "--keep-all", "--preset", "fast")
+    report = json.loads(call(*words, "--json"))["target"]
     return report["views"], report["photographs"]["source"]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -47,17 +47,22 @@ class Coding:
 
     def options(self, encoding: EncodeOptions, splats: int) -> EncodeOptions:
         """Options of the encoder with this coding."""
-        size = encoding.codebook_size
-        if self.sh == "codebook" and self.share is not None and size is None:
-            size = 1 << round(math.log2(min(max(self.share * splats, _ENTRIES[0]), _ENTRIES[1])))
-        return replace(
-            encoding,
-            sh_coding=encoding.sh_coding if self.sh is None else self.sh,
-            codebook_size=size,
-            sh_degree=encoding.sh_degree if self.degree is None else self.degree,
-            adaptive=encoding.adaptive if self.adaptive is None else self.adaptive,
-            grades=encoding.grades if self.graded else 1,
-        )
+        return _options_of(self, encoding, splats)
+
+
+@lru_cache(maxsize=256)  # a search compares the options of its files a thousand times, and each is checked when made
+def _options_of(coding: Coding, encoding: EncodeOptions, splats: int) -> EncodeOptions:
+    size = encoding.codebook_size
+    if coding.sh == "codebook" and coding.share is not None and size is None:
+        size = 1 << round(math.log2(min(max(coding.share * splats, _ENTRIES[0]), _ENTRIES[1])))
+    return replace(
+        encoding,
+        sh_coding=encoding.sh_coding if coding.sh is None else coding.sh,
+        codebook_size=size,
+        sh_degree=encoding.sh_degree if coding.degree is None else coding.degree,
+        adaptive=encoding.adaptive if coding.adaptive is None else coding.adaptive,
+        grades=encoding.grades if coding.graded else 1,
+    )
 
 
 class Part(Protocol):
