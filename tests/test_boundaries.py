@@ -106,7 +106,7 @@ def test_the_validator_finds_what_lies_beyond(beyond):
     assert [] == failures(beyond, check)
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="vectors")
 def test_valid_vectors_hold_both_ends_of_each_range(valid):
     (full,) = [recipe.scene.tiles[0].blocks for recipe in sound_recipes() if recipe.name == FULL_TILE]
     in_streams = {"sparse_params.present_count": {sum(full[_spec.ATTRIBUTE_SH0 + 1].mask)}}
@@ -120,7 +120,7 @@ def test_valid_vectors_hold_both_ends_of_each_range(valid):
     assert [] == failures({named(rule): rule for rule in RANGES}, check)
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="vectors")
 def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
     def check(rule):
         values = {value for built in valid(rule.structure) for value in held(built, rule)}

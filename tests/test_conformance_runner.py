@@ -175,7 +175,7 @@ VALID_FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_a_fault_on_a_valid_file_has_an_outcome_of_its_own(faulty):
     def check(fault):
         status, levels, message = VALID_FAULTS[fault]
@@ -199,7 +199,7 @@ BROKEN_FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_a_fault_on_a_broken_file_has_an_outcome_of_its_own(faulty):
     def check(fault):
         status, message = BROKEN_FAULTS[fault]
@@ -216,6 +216,7 @@ def test_another_code_fails_where_exactness_is_asked_for(faulty):
     assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
 
 
+@pytest.mark.area(name="suite")
 def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread(faulty):
     names = ["json_open", "json_coded_garbage", "json_beyond_budget", "error_counts"]
     pattern = ",".join(f"invalid/{name}" for name in names)

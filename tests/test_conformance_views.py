@@ -17,6 +17,9 @@ from csplat_conformance.reference import expected
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice, run_builtin, run_command
 
+#: `make test` asks our decoder and rasteriser for these pictures by the command.
+pytestmark = pytest.mark.area(name="suite")
+
 RENDERED = [vector for vector in load() if vector.views]
 
 # Copies the picture that a camera asks for, with a fault to order; without imports that take long.
@@ -65,7 +68,6 @@ def test_a_scene_is_seen_by_two_cameras_and_not_dark(vector):
         assert psnr(picture, np.zeros_like(picture)) < 25
 
 
-@pytest.mark.slow
 def test_our_renderer_comes_near_enough():
     report = run_builtin(Choice(pattern="render/*", levels=(4,)))
 
@@ -86,7 +88,6 @@ MISTAKES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     name, change = MISTAKES[mistake]
@@ -102,7 +103,6 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     assert not all(is_near(number, view) for number, view in enumerate(recipe.views))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "status", "message"),
     [
@@ -147,7 +147,6 @@ def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
     assert "SKIPPED: reference pictures" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("ellipsoids")
 def test_a_picture_that_looks_different_is_out_of_date(monkeypatch, capsys):
     assert 0 == recipes.main()

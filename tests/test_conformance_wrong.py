@@ -83,7 +83,7 @@ def test_a_right_decoder_is_not_caught():
     assert [] == list(wrong.catch(nothing, covering("CHK-1", "HDR-2", "QUA-2")).failed)
 
 
-@pytest.mark.slow
+@in_depth
 @pytest.mark.parametrize("gpu", [gpu for gpus in GPUS.values() for gpu in gpus], ids=str)
 def test_a_decoder_in_single_precision_is_a_renderer_and_not_exact(gpu):
     vectors = covering("CNF-7", "CNF-8", "QUA-2", "LEV-1")
@@ -101,6 +101,7 @@ def test_a_renderer_may_be_off_by_2_ulp_and_an_exact_decoder_by_none(ulps, by, f
     assert {"L3"} >= {outcome.level for outcome in caught.failed}
 
 
+@in_depth
 def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_chunks():
     # CHK-6: frame and CRC of these chunks are looked at all the same.
     def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):

@@ -7,6 +7,8 @@ pytest.importorskip("numba", reason="the kernel wants the extra [render]")
 
 from csplat_render.convolving import convolve, convolve_twin
 
+pytestmark = pytest.mark.area(name="rasteriser")
+
 CASES = [
     # picture, kernel (height, width, in, out), stride, padding
     ((13, 11, 3), (5, 3, 3, 4), 1, 2),

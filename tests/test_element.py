@@ -14,7 +14,7 @@ from csplat import EncodeOptions, encode
 from csplat_tools.cli.app import app
 from csplat_tools.present.export import export_element
 
-pytestmark = IN_CHROMIUM
+pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="chromium")]
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
 GUIDE = (Path(__file__).resolve().parent.parent / "codec" / "EMBEDDING.md").read_text("utf-8")
@@ -95,7 +95,6 @@ def test_a_scene_is_shown_and_then_another_and_then_none(tab, blog):
     assert [] == page.workers
 
 
-@pytest.mark.area(name="chromium")
 def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_they_are_near(tab, site, blog):
     scenes = [
         f'<csplat-view id="{name}" src="/{file}.csplat"></csplat-view>'
@@ -129,7 +128,6 @@ def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_th
     assert (2, True) == (len(page.workers), shown(page, "#b").any())
 
 
-@pytest.mark.area(name="chromium")
 def test_what_went_wrong_is_said_in_words(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
     cases = [

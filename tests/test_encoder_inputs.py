@@ -38,7 +38,7 @@ def test_ordinary_inputs_must_be_taken_and_broken_ones_refused():
         assert name.startswith("nasty/") == one.may_refuse
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_an_input_is_the_scene_that_it_says(tmp_path):
     # Written by hand there, read by our reader here: the two know nothing of each other.
     def check(one):
@@ -87,7 +87,7 @@ def test_rows_that_are_no_splats_are_not_in_the_source(name, left_out):
     assert {64} == {len(ENCODABLE[name].source()) for name in ("nasty/nan_normals", "nasty/nan_extra")}
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_inputs_show_what_lint_knows(tmp_path):
     found = set()
     for one in INPUTS.values():
@@ -100,7 +100,7 @@ def test_inputs_show_what_lint_knows(tmp_path):
     assert {"flat-scales"} == known - found
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="suite")
 def test_different_splats_keep_their_distance():
     def check(one):
         means = np.unique(one.source().means.astype(np.float64), axis=0)  # in the order of x

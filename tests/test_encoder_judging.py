@@ -26,7 +26,7 @@ from csplat_conformance.process import Ended
 from csplat_conformance.report import Outcome, Report, Status, to_json, to_junit, to_table
 from csplat_conformance.stated import Source
 
-pytestmark = pytest.mark.slow  # together: tests of the encoder suite
+pytestmark = pytest.mark.area(name="suite")
 
 INPUTS = {one.name: one for one in all_inputs()}
 PLAIN = "ordinary/degree_1"

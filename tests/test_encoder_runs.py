@@ -20,7 +20,7 @@ from csplat_conformance.report import Status
 from csplat_conformance.stated import prove
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.slow  # together: tests of the encoder suite
+pytestmark = pytest.mark.area(name="suite")
 
 INPUTS = {one.name: one for one in all_inputs()}
 COMMAND = "encoder {ply} {out} {index}"

@@ -200,6 +200,7 @@ def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
 # gradients
 
 
+@pytest.mark.area(name="rasteriser")
 def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     """A sum over users, against finite differences of the loss by an entry's values."""
     frozen = Draft.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)).frozen()

@@ -48,7 +48,7 @@ def relative(found, expected):
 # the pass
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
     model = replace(scene(30), antialiased=antialiased)
@@ -103,6 +103,7 @@ def test_the_picture_is_that_of_the_renderer():
         np.testing.assert_allclose(picture, render(model, camera, background=(0.1, 0.2, 0.3)).rgb, atol=2e-5)
 
 
+@pytest.mark.area(name="rasteriser")
 def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
     model = scene(count=30)
     wanted = [render(scene(count=30, seed=1), camera, mode="exact").rgb for camera in views(2)]
@@ -118,6 +119,7 @@ def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
     assert gain == pytest.approx(found.error[row] + 2.0 * found.product[row], rel=2e-3)
 
 
+@pytest.mark.area(name="rasteriser")
 def test_bands_and_weights_are_those_of_a_single_splat():
     model = scene(count=1)
     camera = views(1)[0]
@@ -149,7 +151,7 @@ def test_threads_change_nothing(threads):
         np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_splats_at_a_slant_lose_no_row(antialiased):
     model = scene(count=30, seed=4)

@@ -14,6 +14,8 @@ from csplat_render import rasterise, render
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_render.warmup import warm_up
 
+pytestmark = pytest.mark.area(name="rasteriser")
+
 W, H = 50, 37
 
 

@@ -27,6 +27,8 @@ from csplat_render import Camera
 from csplat_render.rasterise import Rasteriser, Splats
 from csplat_render.virtual import virtual_cameras
 
+pytestmark = pytest.mark.area(name="rasteriser")
+
 
 def most(errors):
     """The largest error; printed."""
@@ -35,7 +37,6 @@ def most(errors):
     return error
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (3, True)])
 def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
     arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)

@@ -102,7 +102,7 @@ def quaternion(R):
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
     model, views = small_scene(3, antialiased=antialiased), cameras()
@@ -129,6 +129,7 @@ def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
         np.testing.assert_allclose(sum((s**2).sum() for s in slopes) / pixels, found.opacity_squares[row], rtol=2e-5)
 
 
+@pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_matrix_of_the_shape_predicts_what_a_small_error_costs(antialiased):
     model, view = small_scene(antialiased=antialiased), cameras(1)
@@ -148,7 +149,7 @@ def test_the_matrix_of_the_shape_predicts_what_a_small_error_costs(antialiased):
         np.testing.assert_allclose(expected, (direction * roots) @ matrix @ (direction * roots), rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.area(name="rasteriser")
 def test_colour_is_that_of_finite_differences():
     model, views = small_scene(3), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64, metric=True)
@@ -173,6 +174,7 @@ def test_colour_is_that_of_finite_differences():
     np.testing.assert_allclose(found.colour_squares, sums, rtol=1e-5)
 
 
+@pytest.mark.area(name="rasteriser")
 def test_means_are_nearly_those_of_finite_differences():
     model, views = small_scene(degree=0), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64)

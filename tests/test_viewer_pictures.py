@@ -19,7 +19,7 @@ from csplat_render import render
 from csplat_render.cameras import intrinsics, load_cameras, look_at
 from csplat_render.virtual import virtual_cameras
 
-pytestmark = IN_CHROMIUM
+pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="chromium")]
 
 #: Well above the 38 dB that are asked for: leaving out all SH costs 33, 8-bit rounding alone leaves 59.
 GOOD = 50.0
@@ -134,7 +134,6 @@ def test_background_and_degree_can_be_chosen(engine, part, camera):
         assert psnr(engine.picture(camera, degree=degree), reference(model, camera, sh_degree=degree)) >= GOOD
 
 
-@pytest.mark.area(name="chromium")
 def test_every_format_of_the_picture_is_good_enough(engine, part, camera):
     data = encode(part, FAST)
     model = decode(data)
@@ -194,7 +193,6 @@ def one_coefficient_each():
     return make(means, sh0=coefficients[:, 0], shN=coefficients[:, 1:])
 
 
-@pytest.mark.area(name="chromium")
 @pytest.mark.parametrize("coding", [{"sh_coding": "scalar"}, {"sh_coding": "codebook", "codebook_size": 60}])
 def test_each_coefficient_alone_from_six_directions(engine, coding):
     data = encode(one_coefficient_each(), EncodeOptions(preset="fast", sh_step=0.01, sh0_step=0.01, **coding))
@@ -216,7 +214,6 @@ def test_no_splats_are_the_background(engine):
     assert np.abs(engine.picture(in_front(), (0.2, 0.4, 0.8)) - (0.2, 0.4, 0.8)).max() <= 0.5 / 255 + 1e-9
 
 
-@pytest.mark.area(name="chromium")
 def test_one_splat(engine):
     data = encode(make([[0.3, -0.2, 0.0]], sh0=[[1, 0, -1]], scales=[[-1, -2, -3]]))
     engine.open(data)
@@ -240,7 +237,6 @@ def test_extremes_are_drawn_as_the_rasteriser_draws_them(engine):
     assert {} == unlike(engine, files, lambda _: in_front(size=200), 45)
 
 
-@pytest.mark.area(name="chromium")
 def test_far_from_the_origin_the_picture_does_not_change(engine):
     rng = np.random.default_rng(0)
     near = make(
@@ -337,7 +333,6 @@ def test_a_damaged_file_is_refused_and_the_next_one_shown(engine, part, camera):
     assert psnr(engine.picture(camera), reference(decode(data), camera)) >= GOOD
 
 
-@pytest.mark.area(name="chromium")
 def test_the_picture_comes_back_after_the_gpu_was_taken_away(engine, part, camera):
     engine.open(encode(part, FAST))
     before = engine.picture(camera)
@@ -372,7 +367,6 @@ def test_more_splats_than_the_gpu_has_room_for_are_refused(engine, part):
     engine.page.evaluate(f"void (engine.renderer.capabilities.splatsMax = {room})")
 
 
-@pytest.mark.area(name="chromium")
 def test_nothing_is_left_after_closing(engine, sample):
     engine.open(encode(sample.select(slice(0, 500)), FAST))
     engine.picture(in_front(size=64))

@@ -9,7 +9,10 @@ import pytest
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+pytestmark = [
+    pytest.mark.area(name="rasteriser"),
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system"),
+]
 
 # The versions of each kernel that are known after warming up, and those that using it for a scene adds.
 _USE = """
@@ -82,14 +85,12 @@ def assert_nothing_was_compiled(before, after):
     assert {} == {name: count for name, count in after.items() if count != before.get(name, 0)}
 
 
-@pytest.mark.slow
 def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_renderer_needs_less(versions):
     plain, before, after = versions[0]
     assert_nothing_was_compiled(before, after)
     assert "csplat_render.blending_sums.sum_removal" in {name for name in after if after[name] > plain.get(name, 0)}
 
 
-@pytest.mark.slow
 def test_nothing_is_left_to_compile_after_warming_up_for_compare(versions):
     _, before, after = versions[1]
     assert_nothing_was_compiled(before, after)
