@@ -24,6 +24,7 @@ def random_weights():
     )
 
 
+@pytest.mark.area(name="rasteriser")
 def test_the_published_pictures_have_their_published_distances(data_dir):
     Image = pytest.importorskip("PIL.Image", reason="reading PNG files needs pillow: pip install 'csplat[render]'")
     folder = data_dir / "lpips"
@@ -39,6 +40,7 @@ def test_the_published_pictures_have_their_published_distances(data_dir):
     assert 0.0 == distance(reference, reference)
 
 
+@pytest.mark.area(name="rasteriser")
 def test_the_distance_is_symmetric_positive_and_grows(random_weights):
     rng = np.random.default_rng(1)
     a = rng.random((48, 40, 3))
