@@ -13,7 +13,7 @@ is made smaller and saved below out/fuzz, exit status 1. What reaches edges betw
 joins the corpus.
 
     python tests/fuzz.py --seconds 60
-    python tests/fuzz.py --target others --seconds 600 --seed 7
+    python tests/fuzz.py --target others --target ply --seconds 600 --seed 7
     python tests/fuzz.py --target decoder --count 100000 --jobs 2 scene.csplat
     python tests/fuzz.py --target ply --replay tests/corpus/ply
 
@@ -64,11 +64,11 @@ class TooSlowError(BaseException):
 
 def main() -> int:
     args = arguments()
-    targets = list(TARGETS) if args.target == "all" else [args.target]
+    targets = list(TARGETS) if "all" in args.target else args.target
     if "others" in targets:
         for name, why in missing_others().items():
             print(f"SKIPPED: the decoder in {name}: {why}", file=sys.stderr)
-        if args.target == "others" and len(missing_others()) == len(("JavaScript", "C")):
+        if targets == ["others"] and len(missing_others()) == len(("JavaScript", "C")):
             return 1
     if args.replay:
         return replay(targets[0], args.files)
@@ -88,7 +88,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*", type=Path, help="further valid files to start from, of one target")
     parser.add_argument(
-        "--target", choices=(*TARGETS, "all"), default="decoder", help="what is fuzzed (default decoder)"
+        "--target", action="append", choices=(*TARGETS, "all"), help="what is fuzzed; may repeat (default decoder)"
     )
     parser.add_argument("--seconds", type=float, help="stop after this time, shared among the targets (default 60)")
     parser.add_argument("--count", type=int, help="stop after this many cases of each target")
@@ -100,9 +100,11 @@ def arguments() -> argparse.Namespace:
         "--replay", action="store_true", help="read files, or those of folders, as they are: what becomes of them?"
     )
     args = parser.parse_args()
-    if args.replay and (args.target == "all" or not args.files):
+    args.target = args.target or ["decoder"]
+    one = len(args.target) == 1 and args.target != ["all"]
+    if args.replay and not (one and args.files):
         parser.error("--replay wants one --target and files")
-    if args.files and args.target == "all":
+    if args.files and not one:
         parser.error("files belong to one --target")
     if args.seconds is None and args.count is None:
         args.seconds = 60.0
