@@ -7,7 +7,7 @@ recorded hash; `make test-all` runs all of them.
     python tests/areas.py list                # each area, and whether its sources have changed
     python tests/areas.py changed             # names of those that have
     python tests/areas.py expression          # the -m expression of `make test`
-    python tests/areas.py expression --fast   # the same of `make check`: without slow tests and without any area
+    python tests/areas.py expression --fast   # the same of `make check`: no slow tests, areas or shared scenes
     python tests/areas.py extras              # the extras of pyproject.toml that changed areas need
     python tests/areas.py record [NAME ...]   # record the hashes of areas whose tests passed; default: all
 """
@@ -93,11 +93,11 @@ def expression(areas: list[Area], *, fast: bool = False, root: Path = ROOT) -> s
 
     Args:
         areas: all areas.
-        fast: `make check`: neither slow tests nor areas.
+        fast: `make check`: neither slow tests nor areas nor scenes that no clone has.
         root: root of the project.
     """
     if fast:
-        return "not slow and not area"
+        return "not slow and not area and not shared_data"
     names = [area.name for area in areas if area.is_changed(root)]
     return " or ".join(["not area", *(f"area(name='{name}')" for name in names)])
 

@@ -38,7 +38,14 @@ def of_peers(name: str) -> Path:
 T = TypeVar("T")
 
 #: Files whose tests take longest: pytest-xdist hands these out first, so that no worker ends up alone with one.
-LONGEST = ("test_viewer_page", "test_tradeoff", "test_finetune", "test_element", "test_conformance_encoder", "test_cli")
+LONGEST = (
+    "test_finetune",
+    "test_tradeoff",
+    "test_conformance_encoder",
+    "test_viewer_page",
+    "test_cli",
+    "test_viewer_pictures",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -49,8 +49,8 @@ def test_a_pattern_without_files_is_an_error(project):
         areas.load(file)[0].digest(root)
 
 
-def test_fast_tests_are_neither_slow_nor_of_an_area():
-    assert "not slow and not area" == areas.expression([], fast=True)
+def test_fast_tests_are_neither_slow_nor_of_an_area_and_want_no_shared_scenes():
+    assert "not slow and not area and not shared_data" == areas.expression([], fast=True)
 
 
 def test_markers_and_file_name_the_same_areas():

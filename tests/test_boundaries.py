@@ -87,6 +87,7 @@ def test_the_decoder_refuses_what_lies_beyond(beyond):
     assert [] == failures(beyond, check)
 
 
+@pytest.mark.slow
 def test_the_javascript_decoder_refuses_what_lies_beyond(beyond, javascript):
     def check(pair):
         case, data = pair

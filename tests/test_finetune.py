@@ -125,6 +125,7 @@ def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(sou
     assert len(after) < 1.1 * len(before)
 
 
+@pytest.mark.slow
 def test_pixels_that_do_not_count_teach_nothing(coarse, views):
     taken = [one.camera for one in views.train]
     mask = np.ones((taken[0].H, taken[0].W), bool)
@@ -881,6 +882,7 @@ def test_cameras_that_see_nothing_are_refused(source, tmp_path):
     assert "no view shows any splat" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_trained_scene_loses_less_when_tuned(data_dir):
     """Lego with few splats, coarse: tuning by photographs regains most of what quantisation lost."""
     from csplat_trainer.data import load

@@ -47,6 +47,7 @@ def test_colours_stay_within_a_step_and_a_chroma_step(shift, scale):
     assert float(error.max()) <= 1.5 + 0.75 * 2**shift
 
 
+@pytest.mark.slow
 @given(st.integers(-(2**20), 2**20), st.integers(-(2**20), 2**20), st.integers(-(2**20), 2**20))
 def test_integers_come_back_within_one_step_without_a_shift(r, g, b):
     rgb = np.array([[r], [g], [b]], np.float64)

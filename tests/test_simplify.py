@@ -84,6 +84,7 @@ def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
     assert positions[:, 1].min() < 0.0 < positions[:, 1].max()  # from above and from below
 
 
+@pytest.mark.slow
 def test_no_camera_looks_at_a_long_object_from_inside(source):
     long = replace(source, means=source.means * np.float32([1.0, 12.0, 1.0]))
     frame, cloud = scene_frame(long), sample_cloud(long, 20_000, np.random.default_rng(0))

@@ -147,6 +147,7 @@ def test_targets_are_reached(swept):
     assert {"goal", "chosen"} <= set(points["target 3.0 kB"]["settings"]["target"])
 
 
+@pytest.mark.slow
 def test_what_is_searched_for_is_what_a_row_says(setting, monkeypatch):
     asked = []
 
@@ -360,6 +361,7 @@ def test_plots_of_a_page_take_its_colours(swept):
     assert [] == [one for one in inside if "<style" in one or "#123457" in one]
 
 
+@pytest.mark.slow
 def test_plots_repeat_themselves(measured):
     assert draw_plot("sh-layers", measured, inline=True) == draw_plot("sh-layers", measured, inline=True)
 

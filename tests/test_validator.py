@@ -86,6 +86,7 @@ def test_valid_vectors_break_nothing(sound):
     assert [] == failures(VALID, check)
 
 
+@pytest.mark.slow
 def test_invalid_vectors_break_their_clause_at_their_byte(broken):
     def check(vector):
         offset = vector.error["offset"]
