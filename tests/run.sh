@@ -21,7 +21,7 @@ shift || true
 check_tier() {
     static_checks
     step "fast tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder \
-        -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
+        --maxfail 25 -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
 }
 
 # test_tier EXPRESSION [WORDS...]: EXPRESSION selects Python tests by their markers.

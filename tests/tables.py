@@ -30,6 +30,11 @@ def failures(cases: Mapping[str, T] | Iterable[T], check: Callable[[T], None]) -
         try:
             check(case)
         except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001 - every case is checked, whatever fails
-            reason = " ".join(str(error).split())
-            failing.append(f"{name}: {type(error).__name__}: {reason}"[: len(name) + _SHOWN])
+            reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("AssertionError: ").split())
+            failing.append(f"{name}: {reason}"[: len(name) + _SHOWN])
     return failing
+
+
+def differing(wanted: Mapping[str, object], found: Mapping[str, object]) -> list[str]:
+    """Return the names whose values differ, or that only one has: `assert [] == differing(wanted, found)`."""
+    return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
