@@ -460,6 +460,16 @@ def test_every_prefix_of_colmap_files_is_refused(tmp_path):
             read(tmp_path / name)
 
 
+def test_points_with_a_number_that_is_none_are_left_out(tmp_path):
+    rows = ("1 0 0 1 255 0 51", "2 0 nan 0 1 2 3", "3 0 0 1e300 1 2 3", "4 0 0 1 1 inf 3", "5 0 1 0 0 0 0")
+    (tmp_path / "points3D.txt").write_text("\n".join(rows))
+    points, colours = read_points(tmp_path / "points3D.txt")
+    assert [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]] == points.tolist()
+    np.testing.assert_allclose([[1.0, 0.0, 0.2], [0.0, 0.0, 0.0]], colours)
+    (tmp_path / "points3D.txt").write_text("")
+    assert 0 == len(read_points(tmp_path / "points3D.txt")[0])
+
+
 def test_refuses_text_lines_that_are_none(tmp_path):
     for text in ("1 2 3\n", "1 a b c d e f g 7 name\n", "1 0 0 0 0 0 0 0 7 name\n", "1 1 0 0 0 0 0 0 x name\n"):
         (tmp_path / "images.txt").write_text(text)

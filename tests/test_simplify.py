@@ -307,6 +307,7 @@ def test_several_targets_and_options_out_of_range_are_refused(source):
     for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):
             SimplifyOptions(**wrong)
+    assert SimplifyOptions(view_size=(1, 1)).view_size == (1, 1)
 
 
 def test_an_empty_scene_is_refused(source):

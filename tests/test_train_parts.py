@@ -120,14 +120,29 @@ def test_densification_clones_small_splits_large_and_prunes(parameters):
     assert np.allclose(scales[[1, -1]], np.log(0.5 / 1.6))
 
 
+def test_halves_of_a_needle_lie_along_it(parameters):
+    parameters.values["logits"][:] = 1.0
+    parameters.values["scales"][:] = np.log((0.5, 1e-6, 1e-6))
+    parameters.values["quats"][:] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # x to y
+    screen = ScreenGradients.none(40)
+    screen.add(np.ones(40, np.float32), np.ones(40, bool))
+    means = parameters.values["means"].copy()
+    assert 40 == densify(parameters, screen, 1.0, 1e-3, 100, 0.005, np.random.default_rng(0))
+    moved = parameters.values["means"] - np.concatenate([means, means])
+    assert np.abs(moved[:, 1]).mean() > 0.1
+    assert np.abs(moved[:, [0, 2]]).max() < 1e-4
+
+
 def test_densification_keeps_to_the_cap(parameters):
     parameters.values["logits"][:] = 1.0
     screen = ScreenGradients.none(40)
     screen.add(np.ones(40, np.float32), np.ones(40, bool))
     densify(parameters, screen, 1.0, 1e-3, 50, 0.005, np.random.default_rng(0))
     assert 50 == len(parameters)
+    parameters.values["logits"][0] = -9.0
     reset_opacities(parameters)
-    assert parameters.alphas.max() <= 0.0101
+    np.testing.assert_allclose(0.01, parameters.alphas[1:], rtol=1e-3)
+    assert np.float32(-9.0) == parameters.values["logits"][0]
 
 
 def checkpoint_of(parameters: Parameters) -> Checkpoint:
