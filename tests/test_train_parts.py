@@ -120,17 +120,20 @@ def test_densification_clones_small_splits_large_and_prunes(parameters):
     assert np.allclose(scales[[1, -1]], np.log(0.5 / 1.6))
 
 
-def test_halves_of_a_needle_lie_along_it(parameters):
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_halves_of_a_needle_lie_along_it(parameters, axis):
+    w, u, along = 0.4, np.array([0.2, -0.6, np.sqrt(0.44)]), np.eye(3)[axis]
+    direction = along + 2.0 * w * np.cross(u, along) + 2.0 * np.cross(u, np.cross(u, along))
     parameters.values["logits"][:] = 1.0
-    parameters.values["scales"][:] = np.log((0.5, 1e-6, 1e-6))
-    parameters.values["quats"][:] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # x to y
+    parameters.values["scales"][:] = np.log(np.where(along > 0.0, 0.5, 1e-6))
+    parameters.values["quats"][:] = (w, *u)
     screen = ScreenGradients.none(40)
     screen.add(np.ones(40, np.float32), np.ones(40, bool))
     means = parameters.values["means"].copy()
     assert 40 == densify(parameters, screen, 1.0, 1e-3, 100, 0.005, np.random.default_rng(0))
     moved = parameters.values["means"] - np.concatenate([means, means])
-    assert np.abs(moved[:, 1]).mean() > 0.1
-    assert np.abs(moved[:, [0, 2]]).max() < 1e-4
+    assert np.abs(moved @ direction).mean() > 0.1
+    np.testing.assert_allclose(moved, np.outer(moved @ direction, direction), atol=1e-4)
 
 
 def test_densification_keeps_to_the_cap(parameters):
