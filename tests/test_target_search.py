@@ -294,6 +294,13 @@ def test_a_codebook_grows_until_the_goal_is_reached(keep_all):
     assert found.report.chosen["codebook_size"] >= 1024
 
 
+def test_a_codebook_grows_to_an_entry_for_four_splats():
+    """Of smaller ones no precision reaches it."""
+    scene, options = replace(PLAIN, splats=6000, book_psnr=29.0), EncodeOptions(sh_coding="codebook")
+    found = search(scene, psnr=38.0, keep_all=True, options=options)
+    assert 2048 == found.report.chosen["codebook_size"]  # 1500, as a power of two
+
+
 def test_grades_are_chosen_where_they_make_files_smaller():
     cheaper = replace(PLAIN, grading=0.9)
     graded, dearer, unknown = (
