@@ -1,6 +1,7 @@
 """Readers of data sets, on tiny ones made here and on the shared ones."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +29,10 @@ from posed_sets import (  # noqa: E402
     write_picture,
     write_transforms,
 )
+from tables import failures  # noqa: E402
 
 from csplat_trainer.data import load  # noqa: E402
-from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
+from csplat_trainer.data.colmap_files import read_cameras, read_images, read_points  # noqa: E402
 from csplat_trainer.data.dataset import Lens  # noqa: E402
 from csplat_trainer.data.pixels import _distort, undistorted_lens  # noqa: E402
 
@@ -458,6 +460,24 @@ def test_every_prefix_of_colmap_files_is_refused(tmp_path):
         (tmp_path / name).write_bytes(b"\xff" * 8 + data[8:])
         with pytest.raises(InputError, match="ends at byte"):
             read(tmp_path / name)
+
+
+def test_every_camera_model_of_colmap_is_read_or_named(tmp_path):
+    unsupported = {5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE"}
+    unsupported |= {9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE"}
+    file = tmp_path / "cameras.bin"
+
+    def check(model):
+        parameters = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)[model]
+        camera = struct.pack(f"<iiQQ{parameters}d", 1, model, 40, 30, *[0.1] * parameters)
+        file.write_bytes(struct.pack("<Q", 1) + camera)
+        if model in unsupported:
+            with pytest.raises(InputError, match=f"the lens {unsupported[model]} "):
+                read_cameras(file)
+        else:
+            assert [1] == [*read_cameras(file)]
+
+    assert [] == failures({str(model): model for model in range(11)}, check)
 
 
 def test_points_with_a_number_that_is_none_are_left_out(tmp_path):
