@@ -71,6 +71,7 @@ def damaged(count):
         yield bytes(coded)
 
 
+@pytest.mark.slow
 def test_the_slow_inflate_reads_what_zlib_reads_and_refuses_the_rest():
     verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(1500)]
 

@@ -171,6 +171,7 @@ def test_costly_bytes_make_small_files(source, views):
     assert sizes[0] > sizes[1] > sizes[2]
 
 
+@pytest.mark.slow
 def test_what_does_not_get_better_stays_as_it_was(fine):
     frozen, views = fine
     tuned = tune(frozen, views, replace(FEW.scaled(5.0), byte_cost=0.0))
@@ -609,6 +610,7 @@ def test_settings_of_the_encoder_reach_it(capture, tmp_path):
     ].items()
 
 
+@pytest.mark.slow
 def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path):
     words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--set", "sh-coding=none")
     call(*words, "-o", tmp_path / "with.csplat", "--set", "shape-codebook-size=40")

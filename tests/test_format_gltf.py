@@ -260,6 +260,7 @@ def test_values_that_are_not_finite_are_refused(name):
         read(*document(TWO | {name: array}))
 
 
+@pytest.mark.slow
 def test_damage_is_refused_or_read(monkeypatch):
     whole = glb(*document(TWO))
 

@@ -74,6 +74,7 @@ def documented(tmp_path_factory, sample_path):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools])
 def test_what_the_documentation_shows_is_so(package, documented, monkeypatch):
     monkeypatch.chdir(documented)

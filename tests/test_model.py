@@ -149,6 +149,7 @@ def test_zero_huge_and_denormal_quats_are_normalised():
     assert np.array_equal(normalise_quats(quats), np.array(expected, np.float32))
 
 
+@pytest.mark.slow
 def test_checking_a_million_splats_takes_a_fraction_of_a_second():
     count = 1_000_000
     fields = {

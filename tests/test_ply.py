@@ -394,6 +394,7 @@ def test_alpha_0_and_1_become_finite_logits_that_lead_back():
     assert [0.0, 1.0] == other_way.tolist()
 
 
+@pytest.mark.slow
 @given(st.floats(0, 1, width=32))
 def test_alpha_survives_its_logit(alpha):
     array = np.array([alpha], np.float32)
@@ -562,6 +563,7 @@ def test_a_million_splats_are_read_in_under_a_second_of_cpu(many):
     assert min(times) < 0.4 * 0.8
 
 
+@pytest.mark.slow
 def test_reading_allocates_little_more_than_the_arrays(many):
     tracemalloc.start()
     model = read_ply(many)

@@ -62,6 +62,7 @@ def store(data, monkeypatch):
 # what is read
 
 
+@pytest.mark.slow
 def test_a_part_is_that_of_a_whole_decode_and_less_is_read(data, box, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(data)
     with csplat.open(tmp_path / "scene.csplat") as file:

@@ -104,6 +104,7 @@ def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(sou
         find_views(source, views_of(own[:1]), 0.3)
 
 
+@pytest.mark.slow
 def test_views_are_added_until_others_agree(source):
     views = find_view_set(source, count=100, size=(24, 18))
     many = find_views(source, views, 0.3, size=(24, 18))

@@ -283,6 +283,7 @@ def reads(stream) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_codes_of_distances_are_allowed_where_zlib_reads_them(spec):
     for lengths in lengths_of_codes(4):
         distances = dict(enumerate(lengths))
@@ -290,6 +291,7 @@ def test_codes_of_distances_are_allowed_where_zlib_reads_them(spec):
         assert spec.is_allowed(lengths, "distance") == reads(stream), lengths
 
 
+@pytest.mark.slow
 def test_codes_of_literals_are_allowed_where_zlib_reads_them(spec):
     for lengths in lengths_of_codes(4):
         literals = dict(zip((7, 8, 255, 256), lengths, strict=True))

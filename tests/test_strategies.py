@@ -176,6 +176,7 @@ def test_the_gauge_keeps_the_shapes(source):
     assert (np.diff(found.scales, axis=1) <= 0).all()
 
 
+@pytest.mark.slow
 def test_clusters_do_not_depend_on_threads(make_model):
     model = make_model(3000, 1)
     one, two = (cluster_attributes(model, parse_kmeans("100"), threads=count).model for count in (1, 2))

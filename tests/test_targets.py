@@ -251,6 +251,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 def test_the_command_refuses_what_says_nothing(tmp_path, ply):
     out, wrong = tmp_path / "scene.csplat", {}
     for words, status, message in REFUSED:

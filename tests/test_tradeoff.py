@@ -453,6 +453,7 @@ def test_the_command_of_a_row_makes_its_bytes(swept, tmp_path, monkeypatch, name
     assert point["sha256"] == hashlib.sha256(made.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_commands_quote_what_a_shell_would_read(setting):
     told = replace(
         setting, path="my scenes/it's.ply", cameras="$HOME/cams.json", background=(0.1, 0.0, 1.0),
@@ -541,6 +542,7 @@ def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
         assert "#123457" not in text
 
 
+@pytest.mark.slow
 def test_json_alone_is_on_standard_output_and_what_it_does_on_standard_error(capture):
     result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json")
     assert ["attributes 36 dB", "attributes 40 dB"] == [one["name"] for one in json.loads(result.stdout)["points"]]

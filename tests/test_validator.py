@@ -99,6 +99,7 @@ def test_invalid_vectors_break_their_clause_at_their_byte(broken):
     assert [] == failures(INVALID, check)
 
 
+@pytest.mark.slow
 def test_one_defect_is_few_violations(broken):
     # What follows from a defect is named too, but a file with one defect must not drown it.
     assert {} == {name: len(violations) for name, violations in broken.items() if len(violations) > 9}
