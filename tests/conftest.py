@@ -50,7 +50,7 @@ LONGEST = (
 
 
 AREA = r'area\(name="(\w+)"\)'
-#: What a file says whose tests are all of one area.
+#: The marker of a file whose tests all belong to one area.
 OF_AN_AREA = re.compile(r"^pytestmark = (?:\[[^\]]*)?[^\n]*?" + AREA, re.MULTILINE)
 
 

@@ -45,7 +45,7 @@ def ply(tmp_path, make_model):
 
 @pytest.fixture(scope="module")
 def encoded_once():
-    """What became of the scene of `ply`, by file name; filled by the first test that wants it."""
+    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
     return {}
 
 

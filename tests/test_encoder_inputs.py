@@ -103,7 +103,7 @@ def test_inputs_show_what_lint_knows(tmp_path):
 @pytest.mark.area(name="suite")
 def test_different_splats_keep_their_distance():
     def check(one):
-        means = np.unique(one.source().means.astype(np.float64), axis=0)  # in the order of x
+        means = np.unique(one.source().means.astype(np.float64), axis=0)  # sorted by x
         least = one.apart * (1 - 1e-5)  # the lattice of float32
         for step in range(1, len(means)):
             away = means[step:] - means[:-step]

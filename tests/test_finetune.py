@@ -688,7 +688,7 @@ SMALL = ("--preset", "small", "--iterations", 10, "--set", "sh-coding=scalar,sha
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
-    """What the report says of a file without a target."""
+    """Return the report on a file that was tuned without a target."""
     words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL)
     return json.loads(call(*words, "-o", tmp_path_factory.mktemp("whole") / "w.csplat", "--json").stdout)
 

@@ -134,9 +134,9 @@ def test_every_mutant_has_its_fate_and_the_test_that_notices_it(shop):
     test = "tests/test_prices.py::test_"
 
     expected = {
-        "(price // count)": ("caught", f"{test}the_basket_costs_6"),  # computed for another test
+        "(price // count)": ("caught", f"{test}the_basket_costs_6"),  # another test computed it
         "(double(price) - TAX)": ("caught", f"{test}taxes_are_added"),
-        "(x - x)": ("caught", f"{test}taxes_are_added"),  # in a kernel
+        "(x - x)": ("caught", f"{test}taxes_are_added"),  # inside a compiled kernel
         "(19 + 1)": ("caught", "of another run"),
         "(19 - 1)": ("caught", f"{test}taxes_are_added"),  # at module level
         "(price < gift)": ("survived", ""),

@@ -312,7 +312,7 @@ def test_so_few_splats_are_fitted_as_are_asked_for(scene):
 
 
 def test_two_fits_say_how_fast_errors_grow():
-    """Where the second one errs hardly more than the first, fewer splats do than by the second alone."""
+    """If the second fit errs hardly more than the first, fewer splats suffice than the second alone suggests."""
     alone, together = (analytic_removal(AnalyticScene()) for _ in range(2))
     together.next_at_psnr(6000, 37.0, 35.0, 0.05)
     (first, _), (second, _) = (removal.next_at_psnr(5800, 36.95, 35.0, 0.05) for removal in (alone, together))
