@@ -127,3 +127,22 @@ def write_colmap_set(folder, text=False, up=(0, 0, 1)):
     for i, camera in enumerate(shots):
         write_picture(folder / "images" / f"im {i:03}.png", camera)
     write_colmap(folder / "sparse" / "0", shots, text=text)
+
+
+def rename_in_images_txt(folder, name):
+    """Write the model as text again, with other names of the images."""
+    write_colmap(folder / "sparse" / "0", cameras(9), text=True)
+    for file in (folder / "sparse" / "0").glob("*.bin"):
+        file.unlink()
+    file = folder / "sparse" / "0" / "images.txt"
+    text = file.read_text()
+    for i in range(9):
+        text = text.replace(f"im {i:03}.png", f"<{i}>")
+    for i in range(9):
+        text = text.replace(f"<{i}>", name(i))
+    file.write_text(text)
+
+
+def change_transforms(folder, **changes):
+    file = folder / "transforms.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))

@@ -22,6 +22,8 @@ from posed_sets import (  # noqa: E402
     W,
     assert_dots_are_where_points_fall,
     cameras,
+    change_transforms,
+    rename_in_images_txt,
     to_opengl,
     write_blender,
     write_colmap,
@@ -83,14 +85,14 @@ def test_validation_pictures_are_those_that_are_there(blender):
     (blender / "transforms_val.json").write_text(json.dumps(document))
     data = load(blender)
     assert (5, 3, 0) == (len(data.train), len(data.test), len(data.val))
-    assert any("transforms_val.json: 3 of 3 pictures are missing" in line for line in data.report)
+    assert any("transforms_val.json: 3 of 3 images are missing" in line for line in data.report)
 
 
 def test_transforms_json_reports_missing_pictures_and_splits_every_eighth(ngp):
     data = load(ngp)
     assert (7, 2) == (len(data.train), len(data.test))
     assert ["images/0000.png", "images/0009.png"] == [picture.camera.image for picture in data.test]
-    assert any("1 of 10 pictures are missing" in line and "images/0004.png" in line for line in data.report)
+    assert any("1 of 10 images are missing" in line and "images/0004.png" in line for line in data.report)
     assert_dots_are_where_points_fall([*data.train, *data.test])
     assert len(load(ngp / "transforms.json", test_every=0).train) == 9
 
@@ -132,6 +134,146 @@ def test_test_txt_names_the_test_pictures(colmap):
     data = load(colmap)
     assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in data.test]
     assert data.trained_on(data.background).test_every is None
+    (colmap / "sparse" / "0" / "test.txt").write_text("im 002\n")
+    assert ["im 002.png"] == [picture.camera.image for picture in load(colmap).test]
+
+
+def test_a_list_of_test_images_that_are_not_there_is_reported(colmap_set):
+    (colmap_set / "test.txt").write_text("im 002.png\nother.png\n")
+    data = load(colmap_set)
+    assert ["im 002.png"] == [picture.camera.image for picture in data.test]
+    assert "test.txt names 2 test images, 1 of them is there; missing: other.png" in data.report
+    (colmap_set / "test.txt").write_text("other.png\n")
+    data = load(colmap_set)
+    assert (9, 0) == (len(data.train), len(data.test))
+    assert "test.txt names 1 test image, none of them is there; missing: other.png" in data.report
+
+
+def test_images_of_one_name_in_two_folders_are_told_apart(colmap_set):
+    for number in range(4):
+        for camera in "ab":
+            file = colmap_set / "images" / camera / f"{number}.png"
+            file.parent.mkdir(exist_ok=True)
+            (colmap_set / "images" / f"im 00{number + 4 * (camera == 'b')}.png").rename(file)
+    rename_in_images_txt(colmap_set, lambda i: f"{'ab'[i // 4]}/{i % 4}.png" if i < 8 else "im 008.png")
+    (colmap_set / "test.txt").write_text("b/1.png\n")
+    data = load(colmap_set)
+    assert (8, ["b/1.png"]) == (len(data.train), [picture.camera.image for picture in data.test])
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+    (colmap_set / "test.txt").write_text("1.png\n")
+    with pytest.raises(InputError, match=r"test\.txt: 1\.png fits 2 names: a/1\.png, b/1\.png"):
+        load(colmap_set)
+
+
+@pytest.mark.parametrize(
+    ("lists", "split", "says"),
+    [
+        ({"train": range(6), "val": (6, 7)}, (5, 2, 0), "transforms.json: 2 images on no list, left out"),
+        ({"val": (6, 7)}, (7, 2, 0), "transforms.json names 2 validation images"),
+        ({"test": (6, 7), "val": (7, 8)}, (6, 1, 2), "on more than one list, no validation images: images/0007.png"),
+        ({"train": range(10), "val": (2,), "test": (3,)}, (7, 1, 1), "no training images: images/0002.png"),
+        ({"train": range(6), "test": (4,)}, (5, 0, 0), "names 1 test image, none of them is there"),
+    ],
+)
+def test_transforms_json_may_list_its_split(ngp, lists, split, says):
+    change_transforms(
+        ngp, **{f"{role}_filenames": [f"images/{i:04}.png" for i in part] for role, part in lists.items()}
+    )
+    data = load(ngp)
+    assert split == (len(data.train), len(data.val), len(data.test))
+    assert any(says in line for line in data.report)
+    assert data.test_every is None
+
+
+def test_points_are_those_of_ply_file_path(ngp):
+    rows = "".join(f"{x} {y} {z} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(POINTS, COLOURS, strict=True))
+    columns = "".join(f"property float {name}\n" for name in "xyz")
+    columns += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    (ngp / "cloud.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{columns}end_header\n{rows}")
+    change_transforms(ngp, ply_file_path="cloud.ply")
+    data = load(ngp)
+    assert np.allclose(POINTS, data.points)
+    assert (COLOURS / 255.0 == data.points_rgb).all()
+    assert "points from cloud.ply" in data.report
+    change_transforms(ngp, ply_file_path="absent.ply")
+    assert any("ply_file_path names absent.ply, which is not there" in line for line in load(ngp).report)
+    (ngp / "absent.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float y\nend_header\n1\n")
+    with pytest.raises(InputError, match=r"absent\.ply has columns y, expected x, y, z"):
+        load(ngp)
+
+
+def test_points_of_colmap_may_be_a_ply(colmap_set):
+    model = colmap_set / "sparse" / "0"
+    (model / "points3D.bin").unlink()
+    assert load(colmap_set).points is None
+    columns = "".join(f"property double {name}\n" for name in "xyz")
+    (model / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n1 2 3\n")
+    data = load(colmap_set)
+    assert [[1.0, 2.0, 3.0]] == data.points.tolist()
+    assert [[0.5, 0.5, 0.5]] == data.points_rgb.tolist()
+
+
+def test_images_txt_may_leave_out_the_lines_of_keypoints(tmp_path):
+    write_colmap_set(tmp_path, text=True)
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    poses = [line for line in lines if "png" in line]
+    for name, text in {
+        "no lines of keypoints": poses,
+        "without empty lines": [line for line in lines if line.strip()],
+        "Windows": [f"{line}\r" for line in lines],
+    }.items():
+        file.write_text("\n".join(text), newline="")
+        data = load(tmp_path)
+        assert (7, 2) == (len(data.train), len(data.test)), name
+        assert ("without a line of keypoints" in " ".join(data.report)) == (name != "Windows")
+    file.write_text("\n".join([poses[0], "1 2 3", "4 5 6", *poses[1:]]))
+    with pytest.raises(InputError, match="line 3: these are keypoints"):
+        load(tmp_path)
+
+
+def test_the_model_of_most_images_is_read(colmap_set):
+    shots = cameras(9)
+    (colmap_set / "sparse" / "0").rename(colmap_set / "sparse" / "10")
+    write_colmap(colmap_set / "sparse" / "0", shots[:3])
+    write_colmap(colmap_set / "sparse" / "2", shots[:4], text=True)
+    data = load(colmap_set)
+    assert (7, 2) == (len(data.train), len(data.test))
+    assert "there are 3 models: sparse/10 is read, with 9 images; sparse/0 has 3, sparse/2 has 4" in data.report
+
+
+def test_an_image_that_is_twice_in_a_model_is_refused(colmap_set):
+    rename_in_images_txt(colmap_set, lambda i: f"im 00{max(i, 1)}.png")
+    with pytest.raises(InputError, match=r"im 001\.png is there twice"):
+        load(colmap_set)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+def test_text_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
+    write_colmap_set(tmp_path, text=True)
+    for name in ("cameras", "images", "points3D"):
+        file = tmp_path / "sparse" / "0" / f"{name}.txt"
+        file.write_text(file.read_text(), encoding)
+    (tmp_path / "test.txt").write_text("im 002.png\r\nim 005.png\r\n", encoding)
+    data = load(tmp_path)
+    assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in data.test]
+    assert 3 == len(data.points)
+    write_transforms(tmp_path)
+    document = tmp_path / "transforms.json"
+    document.write_text(document.read_text(), encoding)
+    assert 10 == len(load(document, test_every=0).train)
+
+
+def test_text_in_another_encoding_is_refused_in_a_line(colmap_set):
+    for name, data, says in (
+        ("cp1252", "im 002.png\nK\xf6ln.png".encode("cp1252"), r"byte 12 is 0xf6"),
+        ("UTF-16 without a mark", "im 002.png".encode("utf-16-le"), "byte 1 is 0"),
+        ("binary", bytes(range(256)), "is not a text file in UTF-8"),
+    ):
+        (colmap_set / "test.txt").write_bytes(data)
+        with pytest.raises(InputError, match=says):
+            load(colmap_set)
+        assert name
 
 
 def test_the_smallest_sufficient_folder_of_pictures_is_read(tmp_path):
@@ -148,7 +290,7 @@ def test_the_smallest_sufficient_folder_of_pictures_is_read(tmp_path):
         ((12, 8), "images_4", (12, 8)),
     ):
         data = load(tmp_path, size)
-        assert f"pictures from {folder}" in data.report
+        assert f"images from {folder}" in data.report
         camera = data.train[0].camera
         assert wanted == (camera.W, camera.H)
         assert np.allclose(np.diag([wanted[0] / 96, wanted[1] / 64, 1]) @ shots[0].K, camera.K)
@@ -308,7 +450,7 @@ def test_refuses_poses_that_are_none(ngp, matrix):
 def test_refuses_a_set_without_pictures(ngp):
     for path in (ngp / "images").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="none of its 10 pictures"):
+    with pytest.raises(InputError, match="none of its 10 images"):
         load(ngp)
 
 
@@ -384,7 +526,7 @@ def test_a_mask_says_which_pixels_count(request, kind, size, sides):
     else:
         _hide(folder / "masks" / "im 001.png.png", sides)
     data = load(folder, size)
-    assert "masks hide parts of 1 picture: they do not count" in data.report
+    assert "masks hide parts of 1 image: they do not count" in data.report
     first, *others = data.train
     width, height = size or (W, H)
     assert (width // 3) * height == (~first.mask).sum()
@@ -396,7 +538,7 @@ def test_a_mask_that_is_not_there_or_hides_all_is_refused(ngp):
     document = json.loads((ngp / "transforms.json").read_text())
     document["frames"][1]["mask_path"] = "masks/one.png"
     (ngp / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"frame 1: there is no mask 'masks/one\.png'"):
+    with pytest.raises(InputError, match=r"no mask 'masks/one\.png'.* images/0001\.png"):
         load(ngp)
     (ngp / "masks").mkdir()
     Image.fromarray(np.zeros((H, W), np.uint8)).save(ngp / "masks" / "one.png")
@@ -510,7 +652,7 @@ def test_shared_lego(data_dir):
 def test_shared_fox(data_dir):
     data = load(data_dir / "images" / "fox", (270, 480))
     assert (43, 7) == (len(data.train), len(data.test))
-    assert any("17 of 67 pictures are missing" in line for line in data.report)
+    assert any("17 of 67 images are missing" in line for line in data.report)
     wanted = json.loads((data_dir / "ply" / "fox120k.cameras.json").read_text())
     for picture, camera in zip(data.test, wanted, strict=True):
         assert camera["image"].endswith(picture.camera.image)

@@ -556,7 +556,7 @@ def no_fits(monkeypatch):
 @pytest.mark.slow
 def test_the_command_tunes_and_reports(tuned_file):
     facts, data = json.loads(tuned_file.report.read_text()), tuned_file.path.read_bytes()
-    assert "14 training and 2 test pictures" in tuned_file.messages
+    assert "14 training and 2 test images" in tuned_file.messages
     source, decoded = csplat.read_ply(tuned_file.source.ply), decode(data)
     assert (len(source), len(decoded)) == (facts["source_splats"], facts["splats"])
     assert facts["unseen"] == len(source) - len(decoded)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import shutil
 import threading
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import File
 
-__all__ = ["BinaryWriter", "atomic_writer", "check_room", "local_file", "opened_for_writing", "read_array"]
+__all__ = ["BinaryWriter", "atomic_writer", "check_room", "local_file", "opened_for_writing", "read_array", "read_text"]
 
 _PART_SIZE = 1 << 20
 _MB = 1e6
@@ -31,6 +32,45 @@ class BinaryWriter(Protocol):
     def write(self, data: bytes | memoryview, /) -> object:
         """Take some bytes."""
         ...
+
+
+#: Byte order marks, and the encoding that each stands for; UTF-32's begin with UTF-16's.
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Read a text file in UTF-8, or in the encoding that its byte order mark states.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its text without the mark, with line feeds as line ends.
+
+    Raises:
+        InputError: the file cannot be read, or is text in another encoding, or no text.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{os.fspath(path)}: {error.strerror or error}") from error
+    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "utf-8")
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError as error:
+        found = f"byte {error.start} is 0x{data[error.start]:02x}, which is not {encoding.removesuffix('-sig').upper()}"
+        raise InputError(f"{os.fspath(path)} is not a text file in UTF-8 ({found}): save it as UTF-8") from None
+    if "\0" in text:
+        raise InputError(
+            f"{os.fspath(path)} is not a text file in UTF-8 (byte {text.index(chr(0))} is 0): save it as UTF-8"
+        )
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def check_room(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:

@@ -68,7 +68,7 @@ def train(
     ] = None,
     byte_cost: ByteCost = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
-    images: Annotated[str | None, typer.Option(metavar="NAME", help="COLMAP: folder of pictures, images_4.")] = None,
+    images: Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, such as images_4.")] = None,
     test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth picture; 0: none.")] = 8,
     background: Annotated[
         str, typer.Option(metavar="|".join(BACKGROUNDS), help="auto: white behind RGBA, else black.")

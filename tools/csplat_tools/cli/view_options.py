@@ -100,7 +100,7 @@ class Views(Group):
     ] = None
     images: Annotated[
         str | None,
-        typer.Option(metavar="NAME", rich_help_panel=_DATA, hidden=True, help="COLMAP: folder of pictures, images_4."),
+        typer.Option(metavar="NAME", rich_help_panel=_DATA, hidden=True, help="Folder of images, such as images_4."),
     ] = None
     test_every: Annotated[
         int | None,

@@ -1,34 +1,58 @@
-"""COLMAP sets as people have them: a sparse model beside folders of pictures.
+"""COLMAP sets as people have them: a sparse model next to folders of images.
 
-    images/ images_2/ images_4/ images_8/     the same pictures, smaller and smaller
+    images/ images_2/ images_4/ images_8/     the same images, smaller and smaller
     sparse/0/{cameras,images,points3D}.{bin,txt}
 
-A `test.txt` beside the model, one name a line, names the test pictures. A folder `masks` holds masks, black where a
-picture does not count, called like it, with or without `.png` at the end.
+A `test.txt` next to the model, one name a line, lists the test images. A folder `masks` holds masks, black where an
+image does not count, called like it, with or without `.png` at the end.
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from csplat.errors import InputError
-from csplat_trainer.data.colmap_files import read_cameras, read_images, read_points
-from csplat_trainer.data.dataset import Found, Shot, split_every
-from csplat_trainer.data.pixels import find_image, image_size
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError, counted
+from csplat.files import read_text
+from csplat_trainer.data.colmap_files import count_images, read_cameras, read_images, read_points
+from csplat_trainer.data.dataset import Found, Shot
+from csplat_trainer.data.image_files import find_images, find_masks, missing_images
+from csplat_trainer.data.point_cloud import read_point_cloud
+from csplat_trainer.data.splits import split_every, split_listed
 
 __all__ = ["find_model", "read_colmap"]
 
-_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", ".")
-_NAMED_MISSING = 5
+F32 = NDArray[np.float32]
+
+_MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")  # with models in numbered folders, or one in itself
+_IMAGE_FOLDERS = ("images", "input", ".")
+_UNDISTORTED_FIRST = "distorted"  # convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder of the sparse model inside a set's folder; `None` where there is none."""
-    for inside in _MODEL_FOLDERS:
-        if _file(folder / inside, "cameras") and _file(folder / inside, "images"):
-            return folder / inside
-    return None
+def find_model(folder: Path) -> tuple[Path, list[str]] | None:
+    """Find the sparse model of a set: the one of most images, where there are several.
+
+    Args:
+        folder: the set's.
+
+    Returns:
+        The model's folder, and a line that names the others if there are any; `None` where there is no model.
+
+    Raises:
+        InputError: one of several models is damaged.
+    """
+    for name in _MODEL_FOLDERS:
+        inside = folder / name
+        if not inside.is_dir():
+            continue
+        models = [path for path in sorted(inside.iterdir(), key=_number) if _is_model(path)]
+        if models:
+            return _largest(models, folder)
+        if _is_model(inside):
+            return inside, []
+    return (folder, []) if _is_model(folder) else None
 
 
 def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> Found:
@@ -37,80 +61,106 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
     Args:
         folder: the set's.
         model: the sparse model's.
-        size: of the pictures that are wanted; chooses among the folders of pictures.
-        images: the folder of pictures, by name; `None`: the smallest that is large enough.
+        size: of the images that are wanted; chooses among the folders of images.
+        images: the folder of images, by name; `None`: the smallest that is large enough.
         test_every: see `split_every`; used where there is no test.txt.
 
     Raises:
-        InputError: a file is damaged, or no picture is there.
+        InputError: a file is damaged, or no image is there.
     """
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
-    cameras, registered = read_cameras(cameras_path), read_images(images_path)
+    cameras, (registered, report) = read_cameras(cameras_path), read_images(images_path)
     if not registered:
-        raise InputError(f"{images_path} holds no pictures")
-    pictures = _picture_folder(folder, [image.name for image in registered], size, images)
-    report = [f"pictures from {pictures.name}"]
-    shots, missing = [], []
+        raise InputError(f"{images_path} holds no images")
     for image in registered:
         if image.camera not in cameras:
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
-        path = find_image(pictures / image.name)
-        if path is None:
-            missing.append(image.name)
-        else:
-            mask = find_image(folder / "masks" / image.name)
-            shots.append(Shot(image.name, path, cameras[image.camera], image.viewmat, mask))
-    if missing:
-        shown = ", ".join(missing[:_NAMED_MISSING]) + (", …" if len(missing) > _NAMED_MISSING else "")
-        report.append(f"{len(missing)} of {len(registered)} pictures are missing and left out: {shown}")
-    if not shots:
-        raise InputError(f"{pictures}: none of the {len(registered)} pictures is there ({missing[0]}, …)")
-    points_path = _file(model, "points3D")
-    points, colours = read_points(points_path) if points_path is not None else (None, None)
-    named = _named(shots, model, folder, report)
-    if named is not None:
-        return Found("COLMAP set", *named, points, colours, report)
-    train, test = split_every(shots, test_every)
-    if test:
-        report.append(f"no split is named: every {test_every}th picture is a test picture")
+    names = list(dict.fromkeys(image.name for image in registered))
+    if len(names) < len(registered):
+        twice = next(name for name in names if sum(image.name == name for image in registered) > 1)
+        raise InputError(f"{images_path}: {twice} is there twice, expected each image once")
+    found = find_images(folder, names, images_path.name, _folders(folder, model, images), size)
+    report.append("images from " + ("the folder itself" if found.folder == folder else _relative(found.folder, folder)))
+    report += found.notes
+    report += missing_images([name for name in names if name not in found.files], len(names), images_path.name)
+    masks = _masks(folder, list(found.files), report)
+    shots = [
+        Shot(image.name, found.files[image.name], cameras[image.camera], image.viewmat, masks.get(image.name))
+        for image in registered
+        if image.name in found.files
+    ]
+    points, colours = _points(model, report)
+    for path in (model / "test.txt", folder / "test.txt"):
+        if path.is_file():
+            listed = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+            train, val, test = split_listed(shots, {"test": listed}, path.name, report)
+            return Found("COLMAP set", train, test, points, colours, report, val=val)
+    train, test = split_every(shots, test_every, report)
     return Found("COLMAP set", train, test, points, colours, report, test_every)
 
 
+def _is_model(folder: Path) -> bool:
+    return _file(folder, "cameras") is not None and _file(folder, "images") is not None
+
+
 def _file(model: Path, name: str) -> Path | None:
-    """A file of the model, binary before text."""
+    """Find a file of the model, binary before text."""
     return next((path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()), None)
 
 
-def _named(shots: list[Shot], model: Path, folder: Path, report: list[str]) -> tuple[list[Shot], list[Shot]] | None:
-    """The split that a test.txt names; `None` where there is none."""
-    for path in (model / "test.txt", folder / "test.txt"):
-        if path.is_file():
-            held = {line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()}
-            held |= {Path(name).stem for name in held}
-            test = [shot for shot in shots if shot.name in held or Path(shot.name).stem in held]
-            report.append(f"{path.name} names the test pictures")
-            return [shot for shot in shots if shot not in test], test
-    return None
+def _number(path: Path) -> tuple[bool, int, str]:
+    """Sort numbered folders by number, before others."""
+    return not path.name.isdecimal(), int(path.name) if path.name.isdecimal() else 0, path.name
 
 
-def _picture_folder(folder: Path, names: list[str], size: tuple[int, int] | None, images: str | None) -> Path:
-    """Where to read pictures from: the folder that was named, or the cheapest that is large enough."""
+def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
+    if len(models) == 1:
+        return models[0], []
+    counts = [count_images(path) for model in models if (path := _file(model, "images")) is not None]
+    best = max(range(len(models)), key=counts.__getitem__)  # of equal ones the first
+    others = ", ".join(f"{_relative(models[i], folder)} has {counts[i]}" for i in range(len(models)) if i != best)
+    chosen = _relative(models[best], folder)
+    return models[best], [
+        f"there are {len(models)} models: {chosen} is read, with {counted(counts[best], 'image')}; {others}"
+    ]
+
+
+def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
+    """Name the folders to look for images in."""
     if images is not None:
         if not (folder / images).is_dir():
             raise InputError(f"{folder} has no folder {images}")
-        return folder / images
-    present = [path for path in sorted(folder.iterdir()) if path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name)]
-    present = [path for path in present if any(find_image(path / name) for name in names)]
-    if not present:
-        raise InputError(f"{folder} has no folder of pictures: wanted images, images_2, images_4 or images_8")
-    largest_first = sorted(present, key=lambda path: int(path.name.partition("_")[2] or 1))
-    chosen = largest_first[0]
-    if size is not None:
-        for path in largest_first[1:]:
-            first = next(file for name in names if (file := find_image(path / name)) is not None)
-            width, height = image_size(first)
-            if width >= size[0] and height >= size[1]:
-                chosen = path
-    return chosen
+        return (images,)
+    first, second, *others = _IMAGE_FOLDERS
+    return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, folder).split("/") else _IMAGE_FOLDERS
+
+
+def _masks(folder: Path, names: list[str], report: list[str]) -> dict[str, Path]:
+    """Find the masks of images; a folder of masks that fit none, or not all, is reported."""
+    if not (folder / "masks").is_dir():
+        return {}
+    masks = find_masks(folder / "masks", names)
+    report += masks.notes
+    without = [name for name in names if name not in masks.files]
+    if without:
+        report.append(
+            f"masks/ has none for {len(without)} of {counted(len(names), 'image')}: all pixels of {without[0]} count"
+        )
+    return masks.files
+
+
+def _points(model: Path, report: list[str]) -> tuple[F32, F32] | tuple[None, None]:
+    """Read the points of a model; 3DGS keeps them as a PLY, too."""
+    path = _file(model, "points3D")
+    if path is not None:
+        return read_points(path)
+    if (model / "points3D.ply").is_file():
+        report.append("points from points3D.ply")
+        return read_point_cloud(model / "points3D.ply")
+    return None, None
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
+from csplat.files import read_text
 from csplat_trainer.data.dataset import Lens
+from csplat_trainer.data.point_cloud import finite_points
 
-__all__ = ["ColmapImage", "read_cameras", "read_images", "read_points"]
+__all__ = ["ColmapImage", "count_images", "read_cameras", "read_images", "read_points"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -37,10 +40,10 @@ _MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A registered picture.
+    """A registered image.
 
     Attributes:
-        name: path below the folder of pictures.
+        name: path below the folder of images.
         camera: id of its camera.
         viewmat: [4, 4] float64, world to camera; COLMAP's axes are OpenCV's.
     """
@@ -79,17 +82,25 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     return cameras
 
 
-def read_images(path: Path) -> list[ColmapImage]:
-    """Read images.bin or images.txt; the matches of each picture are skipped."""
+def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
+    """Read images.bin or images.txt; the keypoints of each image are skipped.
+
+    Returns:
+        The images, and a line if the text file has not the layout that COLMAP writes.
+
+    Raises:
+        InputError: the file is damaged.
+    """
     images = []
     if path.suffix == ".txt":
-        # Two lines each, of which the second may be empty.
-        for words, where in _lines(path, every=2):
+        lines, notes = _image_lines(path)
+        for line, where in lines:
+            words = line.split(None, 9)
             if len(words) < 10:
-                raise InputError(f"{where}: wanted id, rotation, translation, camera and name")
+                raise InputError(f"{where}: expected id, rotation, translation, camera and name")
             pose = _numbers(words[1:8], where)
-            images.append(ColmapImage(" ".join(words[9:]), _integer(words[8], where), _viewmat(pose, where)))
-        return images
+            images.append(ColmapImage(words[9].rstrip(), _integer(words[8], where), _viewmat(pose, where)))
+        return images, notes
     data = _Bytes(path)
     for _ in range(data.count(73)):
         number, *pose, camera = data.unpack("<i7di")
@@ -98,7 +109,12 @@ def read_images(path: Path) -> list[ColmapImage]:
         data.skip(24 * matches)
         images.append(ColmapImage(name, camera, _viewmat(pose, f"{path}, image {number}")))
     data.end()
-    return images
+    return images, []
+
+
+def count_images(path: Path) -> int:
+    """Count the images of images.bin or images.txt."""
+    return len(_image_lines(path)[0]) if path.suffix == ".txt" else _Bytes(path).count(73)
 
 
 def read_points(path: Path) -> tuple[F32, F32]:
@@ -122,10 +138,7 @@ def read_points(path: Path) -> tuple[F32, F32]:
             points.append((x, y, z, red, green, blue))
         data.end()
     table = np.array(points, np.float64).reshape(-1, 6)
-    with np.errstate(over="ignore"):
-        points32 = table[:, :3].astype(np.float32)
-    good = np.isfinite(points32).all(axis=1) & np.isfinite(table).all(axis=1)
-    return points32[good], (np.clip(table[good, 3:], 0.0, 255.0) / 255.0).astype(np.float32)
+    return finite_points(table[:, :3], table[:, 3:])
 
 
 class _Bytes:
@@ -156,9 +169,12 @@ class _Bytes:
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise InputError(f"{self._path} ends within a name at byte {self._at}")
-        text = self._data[self._at : end].decode("utf-8", "replace")
+        name = self._data[self._at : end]
         self._at = end + 1
-        return text
+        try:
+            return name.decode("utf-8")
+        except UnicodeDecodeError:
+            return name.decode("cp1252", "replace")  # COLMAP on Windows writes the bytes of the system's code page
 
     def skip(self, size: int) -> None:
         self._need(size)
@@ -173,20 +189,52 @@ class _Bytes:
             raise InputError(f"{self._path} ends at byte {len(self._data)}, wanted {size} more from byte {self._at}")
 
 
-def _lines(path: Path, every: int = 1) -> Iterator[tuple[list[str], str]]:
-    """Words of the lines that are no comments, and where they stand."""
-    try:
-        text = path.read_text("utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file") from error
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
-    while lines and not lines[0][1].strip():
-        lines.pop(0)
-    for i, (number, line) in enumerate(lines):
-        if i % every == 0 and line.strip():
+def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
+    """Give the words of each line that is neither empty nor a comment, and where it stands."""
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        if line.strip() and not line.startswith("#"):
             yield line.split(), f"{path}, line {number}"
+
+
+def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Tell the lines of poses in images.txt from the lines of keypoints that follow them.
+
+    COLMAP writes two lines for each image, of which the second, empty or three numbers for each keypoint, is often
+    left out by people who write known poses.
+
+    Returns:
+        The lines of poses, each with where it stands; and a line for the report if any has no second one.
+    """
+    poses: list[tuple[str, str]] = []
+    single = 0
+    expected = False  # whether a line of keypoints may follow
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        where = f"{path}, line {number}"
+        if line.startswith("#"):
+            continue
+        if not _is_keypoints(line.split()):
+            single += expected
+            poses.append((line, where))
+            expected = True
+        elif line.strip() and not expected:
+            raise InputError(
+                f"{where}: these are keypoints, expected an image: id, rotation, translation, camera, name"
+            )
+        else:
+            expected = False
+    if not single:
+        return poses, []
+    return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which may be left out"]
+
+
+def _is_keypoints(words: list[str]) -> bool:
+    """Report whether a line holds x, y and the id of a point, any number of times."""
+    if len(words) % 3:
+        return False
+    try:
+        return all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def _numbers(words: list[str], where: str) -> list[float]:

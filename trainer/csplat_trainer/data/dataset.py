@@ -1,4 +1,4 @@
-"""`DataSet`, and what all readers share: shots that are not read yet, their split, the near plane."""
+"""`DataSet`, and what all readers share: shots that are not read yet, the near plane."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
 from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
 from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR
 from csplat_trainer.pictures import Picture
 
-__all__ = ["DataSet", "Found", "Lens", "Shot", "near_plane", "split_every"]
+__all__ = ["DataSet", "Found", "Lens", "Shot", "near_plane"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -157,24 +156,6 @@ class Found:
     test_every: int | None = None
     coordinate_system: str = UNSPECIFIED
     val: list[Shot] = field(default_factory=list)
-
-
-def split_every(shots: Sequence[Shot], every: int) -> tuple[list[Shot], list[Shot]]:
-    """Hold out the first and then every so-manieth shot, in the order of their names.
-
-    Args:
-        shots: all that were found.
-        every: 8 is the custom; 0 holds out none.
-
-    Returns:
-        Shots to train on, shots to test on.
-    """
-    if every < 0 or every == 1:
-        raise InputError(f"a test picture every {every} pictures, wanted 2 or more, or 0 for none")
-    ordered = sorted(shots, key=lambda shot: shot.name)
-    if every == 0 or len(ordered) < 2:
-        return ordered, []
-    return [s for i, s in enumerate(ordered) if i % every], ordered[::every]
 
 
 def near_plane(shots: Sequence[Shot]) -> float:

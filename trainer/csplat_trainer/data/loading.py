@@ -42,8 +42,8 @@ def load(
     Args:
         path: its folder, or the `transforms.json`.
         size: width and height to bring all pictures to, each axis by itself; `None`: as they are.
-        images: COLMAP sets: which folder of pictures, `images_4`; `None`: `images`, or with `size`
-            the smallest that is large enough.
+        images: the folder of images, `images_4`; `None`: as the set says, of COLMAP sets with `size` the smallest
+            that is large enough.
         test_every: which share is held out where the set names no test pictures; 0: none.
         near: near plane of the cameras, scene units; `None`: one that suits the set.
 
@@ -58,7 +58,7 @@ def load(
         raise InputError(f"pictures of {size[0]}×{size[1]} pixels, wanted 1 to {MAX_IMAGE_SIZE} each way")
     found = _find(path, size, images, test_every)
     if not found.train:
-        raise InputError(f"{path} leaves no pictures to train on")
+        raise InputError(f"{path} leaves no images to train on")
     shots = [*found.train, *found.test]
     near = near_plane(shots) if near is None else near
     train, test, val = (
@@ -68,15 +68,15 @@ def load(
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
     points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
-    counts = f"{len(found.train)} training and {counted(len(found.test), 'test picture')}"
-    counts += f", {len(found.val)} to decide by" if found.val else ""
+    counts = f"{len(found.train)} training and {counted(len(found.test), 'test image')}"
+    counts += f", {len(found.val)} for validation," if found.val else ""
     report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
-        report.append(f"masks hide parts of {counted(masked, 'picture')}: they do not count")
+        report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
     if any(shot.lens.distorts for shot in shots):
         zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
-        report.append(f"lens distortion is undone, the pictures are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
+        report.append(f"lens distortion is undone, the images are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
     axes, up, said = _upright(found.coordinate_system, shots)
     return DataSet(
         name,
@@ -113,22 +113,23 @@ def _upright(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None,
 
 
 def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> Found:
-    if path.is_file() and path.suffix == ".json":
+    if path.is_file() and path.suffix.lower() == ".json":
         if path.name == "transforms_train.json":
-            return read_blender(path.parent)
-        return read_transforms(path, test_every)
+            return read_blender(path.parent, images)
+        return read_transforms(path, test_every, images)
     if not path.is_dir():
         raise InputError(f"{path} is neither a folder nor a transforms.json")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
-        found = read_blender(path)
+        found = read_blender(path, images)
     elif (path / "transforms.json").is_file():
-        found = read_transforms(path / "transforms.json", test_every)
+        found = read_transforms(path / "transforms.json", test_every, images)
     elif model is not None:
-        return read_colmap(path, model, size, images, test_every)
+        found = read_colmap(path, model[0], size, images, test_every)
+        return replace(found, report=[*model[1], *found.report])
     else:
         raise InputError(
-            f"{path} is no data set: wanted transforms_train.json (Blender), transforms.json (instant-ngp) "
+            f"{path} is no data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
             "or sparse/0/cameras.bin (COLMAP)"
         )
     if model is not None:

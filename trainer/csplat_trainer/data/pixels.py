@@ -17,13 +17,12 @@ from csplat_render.camera import Camera
 from csplat_trainer.data.dataset import Lens, Shot
 from csplat_trainer.pictures import Picture, UnreadMask, UnreadPixels
 
-__all__ = ["find_image", "image_size", "picture_of", "undistorted_lens"]
+__all__ = ["image_size", "picture_of", "undistorted_lens"]
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 _ZOOM_STEP = 0.005
 _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
@@ -60,15 +59,6 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file; its pixels are not read."""
     with _opened(path) as image:
         return image.size
-
-
-def find_image(path: Path) -> Path | None:
-    """The file itself, or one with another ending in its place; `None` where there is none."""
-    if path.is_file():
-        return path
-    candidates = [path.with_name(path.name + ending) for ending in _ENDINGS]
-    candidates += [path.with_suffix(ending) for ending in _ENDINGS]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def undistorted_lens(lens: Lens) -> Lens:

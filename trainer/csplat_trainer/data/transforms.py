@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,117 +15,173 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat_trainer.data.dataset import Found, Lens, Shot, split_every
-from csplat_trainer.data.pixels import find_image, image_size
+from csplat.files import read_text
+from csplat_trainer.data.dataset import Found, Lens, Shot
+from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain
+from csplat_trainer.data.pixels import image_size
+from csplat_trainer.data.point_cloud import read_point_cloud
+from csplat_trainer.data.splits import split_every, split_listed
 
 __all__ = ["read_blender", "read_transforms"]
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
-_NAMED_MISSING = 5  # files that a message names, at most
 _SCALE_TOLERANCE = 1e-3
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
-def read_blender(folder: Path) -> Found:
-    """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` beside it.
+def read_blender(folder: Path, images: str | None = None) -> Found:
+    """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` next to it.
 
     Args:
-        folder: where they lie. Nobody learns from the pictures of `transforms_val.json`, or is judged by them.
+        folder: where they lie. The images of `transforms_val.json` are for validation.
+        images: the folder of images, by name; `None`: as the files say.
 
     Raises:
-        InputError: a file is not what it is called, or no picture is there.
+        InputError: a file is not what it is called, or no image is there.
     """
     report: list[str] = []
-    train = _shots(folder / "transforms_train.json", report)
+    train = _shots(folder / "transforms_train.json", images, report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        test = _shots(test_path, report)
+        test = _shots(test_path, images, report)
     else:
         test = []
-        report.append("there is no transforms_test.json: no test pictures")
+        report.append("there is no transforms_test.json: no test images")
     val_path = folder / "transforms_val.json"
-    val = _shots(val_path, report, needed=False) if val_path.is_file() else []
+    val = _shots(val_path, images, report, needed=False) if val_path.is_file() else []
     return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES, val=val)
 
 
-def read_transforms(path: Path, test_every: int) -> Found:
-    """Read instant-ngp's `transforms.json`, or nerfstudio's, which may name a split.
+def read_transforms(path: Path, test_every: int, images: str | None = None) -> Found:
+    """Read instant-ngp's `transforms.json`, or nerfstudio's, which may list a split and name a point cloud.
 
     Args:
         path: the file.
-        test_every: see `split_every`; used where the file names no test pictures.
+        test_every: see `split_every`; used where the file lists neither training, validation nor test images.
+        images: the folder of images, by name; `None`: as the file says.
 
     Raises:
-        InputError: the file is not what it is called, or no picture is there.
+        InputError: the file is not what it is called, or no image is there.
     """
-    report: list[str] = []
-    shots = _shots(path, report)
-    named = _load(path).get("test_filenames")
-    if isinstance(named, list) and named:
-        held = {_plain(str(name), path.parent / str(name)) for name in named}
-        train, test = [s for s in shots if s.name not in held], [s for s in shots if s.name in held]
-        report.append(f"the file names {len(held)} test pictures, {len(test)} of them are there")
-        return Found("transforms.json set", train, test, report=report)
-    train, test = split_every(shots, test_every)
-    if test:
-        report.append(f"no split is named: every {test_every}th picture is a test picture")
-    return Found("transforms.json set", train, test, report=report, test_every=test_every)
+    document, report = _load(path), list[str]()
+    shots = _shots(path, images, report)
+    points, colours = _points(document, path, report)
+    lists = {
+        role: names for role in ("train", "val", "test") if (names := _listed(document, f"{role}_filenames", path))
+    }
+    if lists:
+        train, val, test = split_listed(shots, lists, path.name, report)
+        return Found("transforms.json set", train, test, points, colours, report, val=val)
+    train, test = split_every(shots, test_every, report)
+    return Found("transforms.json set", train, test, points, colours, report, test_every)
 
 
-def _shots(path: Path, report: list[str], *, needed: bool = True) -> list[Shot]:
-    """The shots of one file whose pictures are there; those that are not are reported. If needed, one at least."""
-    document = _load(path)
+def _shots(path: Path, images: str | None, report: list[str], *, needed: bool = True) -> list[Shot]:
+    """Read the frames of one file, but for those whose images are missing; if needed, one at least is there."""
+    document, folder = _load(path), path.parent
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames")
-    shots, missing = [], []
     for number, frame in enumerate(frames):
-        where = f"{path}, frame {number}"
         if not isinstance(frame, Mapping) or not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{where} has no file_path")
-        name = frame["file_path"]
-        image = find_image(path.parent / name)
-        if image is None:
-            missing.append(name)
-            continue
-        lens = _lens({**document, **frame}, image, where)
-        viewmat = _viewmat(frame.get("transform_matrix"), where)
-        shots.append(Shot(_plain(name, image), image, lens, viewmat, _mask(frame, path.parent, where)))
-    if missing:
-        shown = ", ".join(missing[:_NAMED_MISSING]) + (", …" if len(missing) > _NAMED_MISSING else "")
-        report.append(f"{path.name}: {len(missing)} of {len(frames)} pictures are missing and left out: {shown}")
-    if needed and not shots:
-        raise InputError(f"{path}: none of its {len(frames)} pictures is there ({missing[0]}, …)")
+            raise InputError(f"{path}, frame {number} has no file_path")
+    names = list(dict.fromkeys(frame["file_path"] for frame in frames))
+    try:
+        found = find_images(folder, names, path.name, _folders(names, images))
+    except NoImagesError:
+        if needed:
+            raise
+        found = FoundImages(folder, {})
+    if found.folder != folder:
+        report.append(f"images from {found.folder.relative_to(folder).as_posix()}")
+    report += found.notes
+    report += missing_images([name for name in names if name not in found.files], len(names), path.name)
+    masks = _masks(frames, path, report)
+    shots = []
+    for number, frame in enumerate(frames):
+        where, name = f"{path}, frame {number}", frame["file_path"]
+        if name in found.files:
+            image = found.files[name]
+            lens = _lens({**document, **frame}, image, where)
+            viewmat = _viewmat(frame.get("transform_matrix"), where)
+            shots.append(Shot(_plain(name, image), image, lens, viewmat, masks.get(name)))
     return shots
 
 
-def _mask(frame: Mapping[str, Any], folder: Path, where: str) -> Path | None:
-    """The mask of a frame, as nerfstudio names it: black where the picture does not count."""
-    name = frame.get("mask_path")
+def _folders(names: Sequence[str], images: str | None) -> list[str]:
+    """Name the folders to look for images in: as the file says, then what is left of that without leading folders."""
+    if images is not None:
+        return [images]
+    own = PurePosixPath(plain(names[0])).parent
+    return [".", *([] if own.is_absolute() else [str(own)]), own.name or ".", "images", "input"]
+
+
+def _masks(frames: Sequence[Mapping[str, Any]], path: Path, report: list[str]) -> dict[str, Path]:
+    """Find the masks of frames, as nerfstudio names them: black where the image does not count."""
+    named: dict[str, str] = {}
+    for number, frame in enumerate(frames):
+        mask = frame.get("mask_path")
+        if mask is not None:
+            if not isinstance(mask, str):
+                raise InputError(f"{path}, frame {number}: mask_path is {mask!r}, expected a name")
+            named[frame["file_path"]] = mask
+    if not named:
+        if (path.parent / "masks").is_dir():
+            report.append(f"there is a folder masks, which {path.name} does not mention (mask_path): it is not read")
+        return {}
+    try:
+        found = find_images(
+            path.parent, list(dict.fromkeys(named.values())), path.name, _folders([*named.values()], None)
+        )
+    except NoImagesError:
+        found = FoundImages(path.parent, {})
+    report += found.notes
+    missing = next(((name, mask) for name, mask in named.items() if mask not in found.files), None)
+    if missing is not None:
+        raise InputError(f"{path}: there is no mask {missing[1]!r}, which the frame of {missing[0]} names")
+    return {name: found.files[mask] for name, mask in named.items()}
+
+
+def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple[F32 | None, F32 | None]:
+    """Read the point cloud that nerfstudio's `ply_file_path` names, which has the coordinates of the cameras."""
+    name = document.get("ply_file_path")
     if name is None:
-        return None
-    mask = find_image(folder / name) if isinstance(name, str) else None
-    if mask is None:
-        raise InputError(f"{where}: there is no mask {name!r}")
-    return mask
+        return None, None
+    if not isinstance(name, str):
+        raise InputError(f"{path}: ply_file_path is {name!r}, expected a name")
+    candidates = (path.parent / name, path.parent / plain(name), path.parent / PurePosixPath(plain(name)).name)
+    cloud = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if cloud is None:
+        report.append(f"{path.name}: ply_file_path names {name}, which is not there: no points")
+        return None, None
+    report.append(f"points from {cloud.name}")
+    return read_point_cloud(cloud)
+
+
+def _listed(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
+    names = document.get(key)
+    if names is None:
+        return []
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{path}: {key} is {str(names)[:80]}, expected a list of names")
+    return names
 
 
 def _plain(name: str, image: Path) -> str:
-    """A name as the file has it: without `./`, with its ending (Blender's sets leave it out)."""
-    return PurePosixPath(name).with_name(image.name).as_posix()
+    """Return a name as the file has it: without `./`, with its ending (Blender's sets leave it out)."""
+    return PurePosixPath(plain(name)).with_name(image.name).as_posix()
 
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:
+        document = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a JSON file: {error}") from error
     if not isinstance(document, dict):
-        raise InputError(f"{path} is not a set of posed pictures: wanted an object with frames")
+        raise InputError(f"{path} is not a set of posed images: expected an object with frames")
     return document
 
 

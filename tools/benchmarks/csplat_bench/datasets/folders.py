@@ -201,7 +201,7 @@ def _pictures(folder: SceneFolder, factor: int) -> tuple[str | None, Found]:
         raise InputError(f"{folder.path} has neither images nor images_{factor}")
     model = find_model(folder.path)
     assert model is not None
-    return images, read_colmap(folder.path, model, None, images, TEST_EVERY)
+    return images, read_colmap(folder.path, model[0], None, images, TEST_EVERY)
 
 
 def _scaled(size: tuple[int, int], divisor: float) -> tuple[int, int]:

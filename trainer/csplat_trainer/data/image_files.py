@@ -1,0 +1,279 @@
+r"""Find the image files that a data set names.
+
+Programs that write poses often run on another machine than the one that keeps the images: names differ in separators,
+endings, case and folders. A name is looked for exactly as it is written. Only if that fails it is read more loosely, by
+one rule after the other, and every rule that was needed is reported:
+
+1. as written;
+2. `\` as `/`, without a drive letter;
+3. with another ending of images, or with one if there is none (Blender's names);
+4. in another case or Unicode form, perhaps with another ending;
+5. without its leading folders, if rules 1 to 4 find nothing at all;
+6. in a folder below, if rule 5 finds nothing either.
+
+A name that fits two files is an error, and so are two names that fit one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from csplat.errors import InputError, counted
+from csplat_trainer.data.pixels import image_size
+
+__all__ = [
+    "FoundImages",
+    "NoImagesError",
+    "find_images",
+    "find_masks",
+    "match_names",
+    "missing_images",
+    "plain",
+    "shown",
+]
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_SHOWN = 5  # names in a message, at most
+
+_FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 5 and 6
+
+_Key = Callable[[str], str]
+
+
+class NoImagesError(InputError):
+    """A set names images, and none of them is there."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundImages:
+    """Image files of a data set.
+
+    Attributes:
+        folder: that the names are relative to.
+        files: by the name as the set writes it, without those that are missing.
+        notes: a line for each rule that was needed.
+    """
+
+    folder: Path
+    files: dict[str, Path]
+    notes: list[str] = field(default_factory=list)
+
+
+def plain(name: str) -> str:
+    """Return a path with `/` between its parts, without `.`, empty parts and a drive letter."""
+    return PurePosixPath(re.sub(r"^[A-Za-z]:(?=[\\/])", "", name).replace("\\", "/")).as_posix()
+
+
+def missing_images(missing: Sequence[str], count: int, where: str) -> list[str]:
+    """Report images that are not there: a line, or none if all are."""
+    if not missing:
+        return []
+    return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and left out: {shown(missing)}"]
+
+
+def find_images(
+    root: Path, names: Sequence[str], where: str, folders: Sequence[str], size: tuple[int, int] | None = None
+) -> FoundImages:
+    """Find the images that a set names, in the first of some folders that holds any of them.
+
+    Args:
+        root: the folder of the set.
+        names: as the set writes them, at least one.
+        where: the file that names them, for messages.
+        folders: to try, relative to `root`, in this order; `.` is `root` itself, and comes last where leading folders
+            of the names are left out. Each stands for smaller images next to it, too: `images` for `images_2`,
+            `images_4`, …
+        size: wanted width and height: the smallest of such folders that is large enough is taken; `None`: the first.
+
+    Raises:
+        NoImagesError: none of the images is there.
+        InputError: as `match_names`.
+    """
+    groups = {folder: _sizes(root, folder) for folder in dict.fromkeys(folders)}
+    for loose in (False, True):
+        for folder in sorted(groups, key=lambda one: loose and one == "."):
+            found = [one for path in groups[folder] if (one := _found(path, names, where, loose=loose)).files]
+            if found:
+                large = [one for one in found[1:] if size is not None and _is_large(one, size)]
+                return large[-1] if large else found[0]
+    tried = ", ".join(f"{root}/{folder}" if folder != "." else f"{root} itself" for folder in groups)
+    others = next((name for paths in groups.values() for path in paths for name in _below(path)), None)
+    hint = f"; there are other images, such as {others}" if others else ""
+    raise NoImagesError(
+        f"{where}: none of its {len(names)} images is there ({shown(names[:1])}, …): looked in {tried}{hint}"
+    )
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> FoundImages:
+    """Find masks, called like their images with or without `.png` at the end.
+
+    Args:
+        folder: of the masks.
+        names: of the images, as the set writes them.
+
+    Raises:
+        InputError: as `match_names`.
+    """
+    known, where = list(_below(folder)), f"{folder.name}/"
+    longer = {f"{name}.png": name for name in names}
+    exact = {longer[name]: name for name in longer if name in set(known)}
+    matched, notes = match_names([name for name in names if name not in exact], known, where)
+    return FoundImages(folder, {name: folder / to for name, to in (exact | matched).items()}, notes)
+
+
+def match_names(
+    names: Iterable[str], known: Iterable[str], where: str, *, folders: bool = True
+) -> tuple[dict[str, str], list[str]]:
+    """Match names that a file lists with names that are there, by the rules of this module.
+
+    Args:
+        names: as they are listed.
+        known: as they are there, with `/`.
+        where: what lists them, for messages.
+        folders: use rules 5 and 6.
+
+    Returns:
+        Known names by listed ones, without those that are missing; and a line for each rule that was needed.
+
+    Raises:
+        InputError: a name fits two known ones, or two names fit one.
+    """
+    left, free = dict.fromkeys(names), dict.fromkeys(known)
+    matched: dict[str, str] = {}
+    notes: list[str] = []
+    for words, rules in _rules(left, folders=folders):
+        if not left or (matched and words in _FOLDER_WORDS):
+            break
+        loose: dict[str, str] = {}
+        for listed_key, known_key in rules:
+            found = _matched(left, free, listed_key, known_key, where)
+            for name, to in found.items():
+                del left[name], free[to]
+            matched |= found
+            loose |= {name: to for name, to in found.items() if words and not _only_lacks_ending(name, to)}
+        if loose:
+            name, to = next(iter(loose.items()))
+            more = ", …" if len(loose) > 1 else ""
+            notes.append(f"{counted(len(loose), 'name')} of {where} found {words}: {name} is {to}{more}")
+    return matched, notes
+
+
+def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
+    """Give the rules in their order: words, and keys of listed and of known names that are equal where names match."""
+
+    def folded(name: str) -> str:
+        return unicodedata.normalize("NFC", plain(name)).casefold()
+
+    def unended(name: str) -> str:
+        path = PurePosixPath(plain(name))
+        return str(path.with_suffix("") if path.suffix.lower() in _ENDINGS else path)
+
+    def parts(name: str) -> list[str]:
+        return plain(name).strip("/").split("/")
+
+    def in_any_case(listed: _Key, known: _Key) -> list[tuple[_Key, _Key]]:
+        """Compare names in any case; then with any ending, too."""
+        return [
+            (lambda name: folded(listed(name)), lambda name: folded(known(name))),
+            (lambda name: folded(unended(listed(name))), lambda name: folded(unended(known(name)))),
+        ]
+
+    def without_first(count: int) -> _Key:
+        return lambda name: "/".join(parts(name)[count:])
+
+    def last(count: int) -> _Key:
+        return lambda name: "/".join(parts(name)[-count:])
+
+    yield "", [(_as_written, _as_written)]
+    yield "with / for \\", [(plain, plain)]
+    yield "with another ending", [(unended, unended)]
+    yield "in another case", in_any_case(plain, plain)
+    if not folders:
+        return
+    depths = {len(parts(name)) for name in names}
+    for count in range(1, max(depths, default=0)):
+        yield _FOLDER_WORDS[0], in_any_case(without_first(count), plain)
+    for count in sorted(depths):
+        yield _FOLDER_WORDS[1], in_any_case(plain, last(count))
+
+
+def _as_written(name: str) -> str:
+    return PurePosixPath(name).as_posix()
+
+
+def _matched(
+    names: Iterable[str],
+    known: Iterable[str],
+    listed_key: _Key,
+    known_key: _Key,
+    where: str,
+) -> dict[str, str]:
+    index: dict[str, list[str]] = {}
+    for name in known:
+        index.setdefault(known_key(name), []).append(name)
+    found: dict[str, str] = {}
+    taken: dict[str, str] = {}
+    for name in names:
+        fitting = index.get(listed_key(name), [])
+        if len(fitting) > 1:
+            raise InputError(f"{where}: {name} fits {len(fitting)} names: {shown(sorted(fitting))}")
+        if fitting:
+            other = taken.setdefault(fitting[0], name)
+            if other != name:
+                raise InputError(f"{where}: {other} and {name} both fit {fitting[0]}")
+            found[name] = fitting[0]
+    return found
+
+
+def _only_lacks_ending(name: str, known: str) -> bool:
+    return known.startswith(_as_written(name) + ".")
+
+
+def shown(names: Sequence[str]) -> str:
+    """Return names for a message, the first few of them."""
+    return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
+
+
+def _sizes(root: Path, folder: str) -> list[Path]:
+    """Find a folder and those of smaller images next to it, the largest images first; in another case if need be."""
+    path = root / folder
+    if folder == "." or not path.parent.is_dir():
+        return [path] if path.is_dir() else []
+    names = sorted(one.name for one in path.parent.iterdir() if one.is_dir())
+    for flags in (0, re.IGNORECASE):
+        matches = [
+            match for name in names if (match := re.fullmatch(f"{re.escape(path.name)}(?:_([0-9]+))?", name, flags))
+        ]
+        if matches:
+            return [path.parent / match[0] for match in sorted(matches, key=lambda match: int(match[1] or 1))]
+    return []
+
+
+def _found(folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
+    files = {name: path for name in names if (path := folder / name).is_file()}
+    left = [name for name in names if name not in files]
+    if not left or (loose and files):
+        return FoundImages(folder, files)
+    taken = set(files.values())
+    known = [name for name in _below(folder) if folder / name not in taken]
+    matched, notes = match_names(left, known, where, folders=loose)
+    return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
+
+
+def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
+    width, height = image_size(next(iter(found.files.values())))
+    return width >= size[0] and height >= size[1]
+
+
+def _below(folder: Path) -> Iterator[str]:
+    """Give the images below a folder, sorted, relative to it; hidden ones and those of macOS' archives are left out."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
+        for name in sorted(files):
+            if name.lower().endswith(_ENDINGS) and not name.startswith("."):
+                yield Path(place, name).relative_to(folder).as_posix()
