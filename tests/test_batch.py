@@ -90,10 +90,14 @@ def test_encode_leaves_its_own_files_out_and_decode_takes_no_others(scenes):
         ),
         ("list.csv", "path,output,options\na.ply,,--preset fast\nsub/b.spz,x/y.csplat\n"),
         ("list.txt", "# two\na.ply, , --preset fast\nsub/b.spz, x/y.csplat\n"),
+        ("list.csv", "path;output;options\r\na.ply;;--preset fast\r\nsub/b.spz;x/y.csplat;\r\n"),
+        ("list.csv", "sep=;\na.ply;;--preset fast\nsub\\b.spz;x\\y.csplat\n"),
+        ("list.txt", "path\toutput\toptions\na.ply\t\t--preset fast\nsub/b.spz\tx/y.csplat\n"),
     ],
 )
-def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text):
-    (scenes / name).write_text(text)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text, encoding):
+    (scenes / name).write_text(text, encoding)
     tasks = find_tasks(str(scenes / name), "encode", ".csplat")
     assert ["a.csplat", "x/y.csplat"] == names(tasks)
     assert [("--preset", "fast"), ()] == [one.options for one in tasks]
@@ -115,6 +119,12 @@ def test_a_manifest_that_says_nothing_is_refused(tmp_path, text, says):
     (tmp_path / "list.jsonl").write_text(text)
     with pytest.raises(InputError, match=says):
         find_tasks(str(tmp_path / "list.jsonl"), "encode", ".csplat")
+
+
+def test_a_manifest_in_another_encoding_is_refused_in_a_line(tmp_path):
+    (tmp_path / "list.csv").write_bytes("K\xf6ln.ply;;".encode("cp1252"))
+    with pytest.raises(InputError, match=r"list\.csv is not a text file in UTF-8 \(byte 1 is 0xf6"):
+        find_tasks(str(tmp_path / "list.csv"), "encode", ".csplat")
 
 
 # what is done, and not done again

@@ -12,6 +12,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from csplat.errors import InputError
+from csplat.files import read_text
 from csplat.formats import formats
 from csplat.remote import is_url
 from csplat.system import split_words
@@ -55,7 +56,8 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
 
     Args:
         scenes: a folder, searched with all that are in it for names that `csplat formats` lists; or a manifest: lines
-            of JSON (.jsonl), or of path, output and options with commas between them (.csv, .txt).
+            of JSON (.jsonl), or of path, output and options with commas between them, or as spreadsheets write it
+            semicolons or tabs (.csv, .txt).
         command: what is done with them: `encode` leaves .csplat files out, `decode` takes no others.
         ending: of outputs that have no name.
         match: which names of a folder, as shells have it.
@@ -108,7 +110,7 @@ def _is_part(name: str, names: Sequence[str]) -> bool:
 
 def _listed(manifest: Path) -> Iterator[_Found]:
     """The lines of a manifest. Paths are relative to its folder."""
-    text = manifest.read_text(encoding="utf-8-sig")
+    text = read_text(manifest)
     lines = _json_lines(manifest, text) if manifest.suffix.lower() == ".jsonl" else _table_lines(text)
     for number, fields in lines:
         where = f"{manifest.name}, line {number}"
@@ -121,6 +123,8 @@ def _listed(manifest: Path) -> Iterator[_Found]:
             words = split_words(options) if isinstance(options, str) else [str(word) for word in options]
         except (ValueError, TypeError):
             raise InputError(f"{where}: the options are {options!r}, wanted words as of a command line") from None
+        if "\\" in source and not is_url(source) and not (manifest.parent / source).exists():
+            source, output = source.replace("\\", "/"), output.replace("\\", "/")  # written on Windows
         placed = source if is_url(source) else str(manifest.parent / source)
         yield _Found(Task(placed, output, tuple(words)), _within(source))
 
@@ -139,11 +143,21 @@ def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]
 
 
 def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    rows = csv.reader(text.splitlines(), skipinitialspace=True)
+    rows = csv.reader(text.splitlines(), skipinitialspace=True, delimiter=_separator(text))
     for row in rows:
         cells = [cell.strip() for cell in row]
-        if any(cells) and not cells[0].startswith("#") and tuple(cells) != _COLUMNS[: len(cells)]:
+        if any(cells) and not cells[0].startswith(("#", "sep=")) and tuple(cells) != _COLUMNS[: len(cells)]:
             yield rows.line_num, dict(zip(_COLUMNS, cells, strict=False))
+
+
+def _separator(text: str) -> str:
+    """Tell what separates the cells of a table: a comma, or what spreadsheets write instead in many countries.
+
+    The first line decides, if it has one of them: the names of the columns, Excel's `sep=;`, or a scene.
+    """
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    first = next(lines, "").casefold().removeprefix("sep=")
+    return next((one for one in ";\t" if one in first and "," not in first), ",")
 
 
 def _within(source: str) -> str:
