@@ -17,6 +17,7 @@ from posed_sets import (  # it needs what is looked for above
     change_transforms,
     rename_in_images_txt,
     to_opengl,
+    write_blender,
     write_colmap,
     write_colmap_set,
     write_picture,
@@ -181,6 +182,16 @@ def test_frames_without_images_do_not_take_those_of_others(tmp_path):
     data = load(tmp_path, test_every=0)
     assert 9 == len(data.train)
     assert "transforms.json: 1 of 10 images are missing and left out: images/0003.png" in data.report
+
+
+def test_training_and_test_images_of_blender_are_not_the_same_files(tmp_path):
+    write_blender(tmp_path)
+    move(tmp_path / "train", tmp_path)
+    move(tmp_path / "test", tmp_path / "away")
+    with pytest.raises(InputError, match=r"train/r_0\.png and test/r_0\.png are both found as r_0\.png"):
+        load(tmp_path)
+    (tmp_path / "transforms_test.json").unlink()
+    assert 5 == len(load(tmp_path).train)
 
 
 def test_images_of_transforms_json_may_be_taken_from_a_folder_that_is_named(transforms):

@@ -52,6 +52,7 @@ def read_blender(folder: Path, images: str | None = None) -> Found:
         report.append("there is no transforms_test.json: no test images")
     val_path = folder / "transforms_val.json"
     val = _shots(val_path, images, report, needed=False) if val_path.is_file() else []
+    _check_distinct([*train, *test, *val], folder)
     return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES, val=val)
 
 
@@ -77,6 +78,15 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> F
         return Found("transforms.json set", train, test, points, colours, report, val=val)
     train, test = split_every(shots, test_every, report)
     return Found("transforms.json set", train, test, points, colours, report, test_every)
+
+
+def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
+    """Refuse files that are found for several names, as test/r_0 and train/r_0 if only r_0.png is there."""
+    names: dict[Path, str] = {}
+    for shot in shots:
+        other = names.setdefault(shot.path, shot.name)
+        if other != shot.name:
+            raise InputError(f"{folder}: {other} and {shot.name} are both found as {shot.path.relative_to(folder)}")
 
 
 def _shots(path: Path, images: str | None, report: list[str], *, needed: bool = True) -> list[Shot]:
