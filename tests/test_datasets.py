@@ -244,8 +244,89 @@ def test_the_model_of_most_images_is_read(colmap_set):
 
 def test_an_image_that_is_twice_in_a_model_is_refused(colmap_set):
     rename_in_images_txt(colmap_set, lambda i: f"im 00{max(i, 1)}.png")
-    with pytest.raises(InputError, match=r"im 001\.png is there twice"):
+    with pytest.raises(InputError, match=r"im 001\.png is there twice, with different poses"):
         load(colmap_set)
+    file = colmap_set / "sparse" / "0" / "images.txt"
+    rename_in_images_txt(colmap_set, "im {:03}.png".format)
+    file.write_text(file.read_text() + next(line for line in file.read_text().splitlines() if "im 003" in line))
+    data = load(colmap_set)
+    assert (7, 2) == (len(data.train), len(data.test))
+    assert "images.txt: 1 image twice: read once" in data.report
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "count"),
+    [
+        ({"is_bad": True}, "1 frame marked as bad, left out: images/0003.png", 9),
+        ({"transform_matrix": None}, "1 frame without a finite pose, left out: images/0003.png", 9),
+        ({"transform_matrix": [[-np.inf] * 4] * 4}, "1 frame without a finite pose, left out: images/0003.png", 9),
+        ({"transform_matrix": [[np.nan] * 4] * 3}, "1 frame without a finite pose, left out: images/0003.png", 9),
+        ({"mask_path": ""}, "", 10),
+    ],
+)
+def test_frames_that_are_no_use_are_left_out(tmp_path, change, words, count):
+    write_transforms(tmp_path)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames[3] |= change
+    change_transforms(tmp_path, frames=frames)
+    data = load(tmp_path, test_every=0)
+    assert count == len(data.train)
+    assert not words or f"transforms.json: {words}" in data.report
+
+
+def test_a_frame_that_is_there_twice_is_read_once(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    change_transforms(ngp, frames=[*frames, {**frames[3], "file_path": "./images//0003.png"}])
+    data = load(ngp, test_every=0)
+    assert 9 == len(data.train)
+    assert "transforms.json: 1 frame there twice, read once: ./images//0003.png" in data.report
+    change_transforms(ngp, frames=[*frames, {**frames[2], "file_path": "./images/0003.png"}])
+    with pytest.raises(InputError, match=r"frame 10: \./images/0003\.png is there twice, with different poses"):
+        load(ngp)
+
+
+def test_frames_for_test_may_be_a_list_of_their_own(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    change_transforms(ngp, frames=frames[:8], test_frames=frames[8:])
+    data = load(ngp)
+    assert (7, ["images/0008.png", "images/0009.png"]) == (len(data.train), [one.camera.image for one in data.test])
+    change_transforms(ngp, test_frames=[])
+    assert 0 == len(load(ngp).test)
+
+
+def test_a_blender_set_may_have_no_test_frames(blender):
+    (blender / "transforms_test.json").write_text('{"frames": []}')
+    assert (5, 0) == (len(load(blender).train), len(load(blender).test))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "split"),
+    [
+        ("test.txt", "\"0003.png\"\n'0005.png'\n", (7, 0, 2)),
+        ("test.txt", "# held out\nimages/0003.png, images/0005.png,\n", (7, 0, 2)),
+        ("test_list.txt", "images\\0003.png\n", (8, 0, 1)),
+        ("val.txt", "images/0003\n", (8, 1, 0)),
+        ("train.txt", "images/0003.png\nimages/0005.png\n", (2, 0, 0)),
+        ("train.txt", "other.png\n", (9, 0, 0)),
+    ],
+)
+def test_lists_of_images_may_lie_next_to_transforms_json(ngp, name, text, split):
+    (ngp / name).write_text(text)
+    data = load(ngp)
+    assert split == (len(data.train), len(data.val), len(data.test))
+
+
+def test_cameras_that_contradict_their_text_are_reported(colmap_set):
+    for text, says in (("PINHOLE 48 32 51.47 51.47 24 16", False), ("PINHOLE 48 32 99 99 24 16", True)):
+        (colmap_set / "sparse" / "0" / "cameras.txt").write_text(f"  # comment\n7 {text}\n")
+        report = load(colmap_set).report
+        assert says == ("cameras.txt holds other cameras than cameras.bin, which is read" in report), report
+
+
+def test_an_empty_file_of_a_model_gives_way_to_its_text(colmap_set):
+    write_colmap(colmap_set / "sparse" / "0", cameras(9), text=True)
+    (colmap_set / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+    assert 7 == len(load(colmap_set).train)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
@@ -414,6 +495,24 @@ def test_refuses_what_is_no_data_set(tmp_path):
         load(tmp_path)
     with pytest.raises(InputError, match="neither a folder"):
         load(tmp_path / "absent")
+    (tmp_path / "set.zip").write_bytes(b"PK")
+    with pytest.raises(InputError, match="unpack it"):
+        load(tmp_path / "set.zip")
+    (tmp_path / "database.db").write_bytes(b"")
+    with pytest.raises(InputError, match="run `colmap mapper`"):
+        load(tmp_path)
+    write_transforms(tmp_path / "download" / "garden")
+    with pytest.raises(InputError, match="download/garden in it may be what you want"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("model", ["sparse", "sparse/model", "colmap/sparse/0", "distorted/sparse/0", "."])
+def test_models_lie_in_several_folders(colmap_set, model):
+    target = colmap_set / model
+    for file in sorted((colmap_set / "sparse" / "0").iterdir()):
+        target.mkdir(parents=True, exist_ok=True)
+        file.rename(target / file.name)
+    assert 7 == len(load(colmap_set).train)
 
 
 @pytest.mark.parametrize(
@@ -437,7 +536,7 @@ def test_refuses_broken_transforms(ngp, change, says):
 
 
 @pytest.mark.parametrize(
-    "matrix", [None, [[1]], np.zeros((4, 4)).tolist(), np.diag([1.0, 1, -1, 1]).tolist(), [["x"] * 4] * 4]
+    "matrix", [[], [[1]], np.zeros((4, 4)).tolist(), np.diag([1.0, 1, -1, 1]).tolist(), [["x"] * 4] * 4]
 )
 def test_refuses_poses_that_are_none(ngp, matrix):
     document = json.loads((ngp / "transforms.json").read_text())

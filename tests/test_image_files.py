@@ -50,6 +50,9 @@ NAMES = {
         unicodedata.normalize("NFC", "Köln.png"),
         "in another case",
     ),
+    "a URL": ("a/my%20file.png", ["a/my file.png"], "a/my file.png", "as a URL"),
+    "a percent sign": ("100%25.png", ["100%25.png", "100%.png"], "100%25.png", None),
+    "a file URL": ("file:///home/x/a/1.png", ["a/1.png"], "a/1.png", "without leading folders"),
     "a drive": ("C:\\scans\\a\\1.png", ["a/1.png"], "a/1.png", "without leading folders"),
     "an absolute path": ("/home/x/a/1.png", ["a/1.png", "1.png"], "a/1.png", "without leading folders"),
     "a folder more": ("photos/1.png", ["1.png"], "1.png", "without leading folders"),
@@ -224,6 +227,26 @@ def test_masks_that_fit_no_image_are_reported(colmap_set):
     report = load(colmap_set).report
     assert any("masks/ has none for 8 of 9 images: all pixels of im 000.png count" in line for line in report)
     assert any("1 name of masks/ found in another case: im 003.png is IM 003.png" in line for line in report)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "masks/im 003.png",
+        "masks/im 003.png.png",
+        "masks/im 003.jpg",
+        "Masks/im 003.png",
+        "mask/im 003_mask.png",
+        "masks/mask_im 003.jpg",
+        "masks/im 003.mask.png",
+    ],
+)
+def test_masks_have_names_of_several_programs(colmap_set, name):
+    (colmap_set / name).parent.mkdir()
+    write_picture(colmap_set / name, cameras(9)[3])
+    data = load(colmap_set)
+    assert "masks hide parts of 1 image: they do not count" in data.report
+    assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
 
 
 def test_hidden_files_are_no_candidates(tmp_path):

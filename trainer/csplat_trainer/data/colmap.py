@@ -3,8 +3,8 @@
     images/ images_2/ images_4/ images_8/     the same images, smaller and smaller
     sparse/0/{cameras,images,points3D}.{bin,txt}
 
-A `test.txt` next to the model, one name a line, lists the test images. A folder `masks` holds masks, black where an
-image does not count, called like it, with or without `.png` at the end.
+A `test.txt` next to the model, one name a line, lists the test images, `val.txt` and `train.txt` the others. A folder
+`masks` holds masks, black where an image does not count.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat.files import read_text
-from csplat_trainer.data.colmap_files import count_images, read_cameras, read_images, read_points
-from csplat_trainer.data.dataset import Found, Shot
+from csplat_trainer.data.colmap_files import ColmapImage, count_images, read_cameras, read_images, read_points
+from csplat_trainer.data.dataset import Found, Lens, Shot
 from csplat_trainer.data.image_files import find_images, find_masks, missing_images
 from csplat_trainer.data.point_cloud import read_point_cloud
-from csplat_trainer.data.splits import split_every, split_listed
+from csplat_trainer.data.splits import lists_next_to, split_every, split_listed
 
 __all__ = ["find_model", "read_colmap"]
 
@@ -72,15 +71,16 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
     assert cameras_path is not None
     assert images_path is not None
     cameras, (registered, report) = read_cameras(cameras_path), read_images(images_path)
+    other = cameras_path.with_suffix(".txt")
+    if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other)):
+        report.append(f"{other.name} holds other cameras than {cameras_path.name}, which is read")
     if not registered:
         raise InputError(f"{images_path} holds no images")
     for image in registered:
         if image.camera not in cameras:
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
-    names = list(dict.fromkeys(image.name for image in registered))
-    if len(names) < len(registered):
-        twice = next(name for name in names if sum(image.name == name for image in registered) > 1)
-        raise InputError(f"{images_path}: {twice} is there twice, expected each image once")
+    registered = _each_once(registered, images_path, report)
+    names = [image.name for image in registered]
     found = find_images(folder, names, images_path.name, _folders(folder, model, images), size)
     report.append("images from " + ("the folder itself" if found.folder == folder else _relative(found.folder, folder)))
     report += found.notes
@@ -92,13 +92,30 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
         if image.name in found.files
     ]
     points, colours = _points(model, report)
-    for path in (model / "test.txt", folder / "test.txt"):
-        if path.is_file():
-            listed = [line.strip() for line in read_text(path).splitlines() if line.strip()]
-            train, val, test = split_listed(shots, {"test": listed}, path.name, report)
-            return Found("COLMAP set", train, test, points, colours, report, val=val)
+    lists, files = lists_next_to((model, folder))
+    if lists:
+        train, val, test = split_listed(shots, lists, files, report)
+        return Found("COLMAP set", train, test, points, colours, report, val=val)
     train, test = split_every(shots, test_every, report)
     return Found("COLMAP set", train, test, points, colours, report, test_every)
+
+
+def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
+    """Leave out images that are there again with the same pose and camera.
+
+    Raises:
+        InputError: an image has two poses or cameras.
+    """
+    first: dict[str, ColmapImage] = {}
+    for image in registered:
+        other = first.setdefault(image.name, image)
+        if other.camera != image.camera or (other.viewmat != image.viewmat).any():
+            raise InputError(
+                f"{path}: {image.name} is there twice, with different poses or cameras; expected each once"
+            )
+    if len(first) < len(registered):
+        report.append(f"{path.name}: {counted(len(registered) - len(first), 'image')} twice: read once")
+    return list(first.values())
 
 
 def _is_model(folder: Path) -> bool:
@@ -106,8 +123,9 @@ def _is_model(folder: Path) -> bool:
 
 
 def _file(model: Path, name: str) -> Path | None:
-    """Find a file of the model, binary before text."""
-    return next((path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()), None)
+    """Find a file of the model, binary before text; an empty one does not count if there is another."""
+    there = [path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()]
+    return next((path for path in there if path.stat().st_size), there[0] if there else None)
 
 
 def _number(path: Path) -> tuple[bool, int, str]:
@@ -137,17 +155,25 @@ def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
     return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, folder).split("/") else _IMAGE_FOLDERS
 
 
+def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
+    """Report whether cameras are the same, but for the digits that text leaves out."""
+
+    def numbers(some: dict[int, Lens]) -> list[tuple[float, ...]]:
+        return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(some.items())]
+
+    return len(cameras) == len(others) and np.allclose(numbers(cameras), numbers(others), rtol=1e-4)
+
+
 def _masks(folder: Path, names: list[str], report: list[str]) -> dict[str, Path]:
     """Find the masks of images; a folder of masks that fit none, or not all, is reported."""
-    if not (folder / "masks").is_dir():
+    masks = find_masks(folder, names)
+    if masks is None:
         return {}
-    masks = find_masks(folder / "masks", names)
     report += masks.notes
     without = [name for name in names if name not in masks.files]
     if without:
-        report.append(
-            f"masks/ has none for {len(without)} of {counted(len(names), 'image')}: all pixels of {without[0]} count"
-        )
+        share = f"{len(without)} of {counted(len(names), 'image')}"
+        report.append(f"{masks.folder.name}/ has none for {share}: all pixels of {without[0]} count")
     return masks.files
 
 

@@ -192,7 +192,7 @@ class _Bytes:
 def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
     """Give the words of each line that is neither empty nor a comment, and where it stands."""
     for number, line in enumerate(read_text(path).split("\n"), 1):
-        if line.strip() and not line.startswith("#"):
+        if line.strip() and not line.lstrip().startswith("#"):
             yield line.split(), f"{path}, line {number}"
 
 
@@ -210,7 +210,7 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     expected = False  # whether a line of keypoints may follow
     for number, line in enumerate(read_text(path).split("\n"), 1):
         where = f"{path}, line {number}"
-        if line.startswith("#"):
+        if line.lstrip().startswith("#"):
             continue
         if not _is_keypoints(line.split()):
             single += expected

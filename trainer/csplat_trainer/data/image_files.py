@@ -6,10 +6,13 @@ one rule after the other, and every rule that was needed is reported:
 
 1. as written;
 2. `\` as `/`, without a drive letter;
-3. with another ending of images, or with one if there is none (Blender's names);
-4. in another case or Unicode form, perhaps with another ending;
-5. without its leading folders, if rules 1 to 4 find nothing at all;
-6. in a folder below, if rule 5 finds nothing either.
+3. as a URL: without `file:`, `%20` as a space;
+4. with another ending of images, or with one if there is none (Blender's names);
+5. in another case or Unicode form, perhaps with another ending;
+6. without its leading folders, if rules 1 to 5 find nothing at all;
+7. in a folder below, if rule 6 finds nothing either.
+
+Rules 4 to 7 read names as rules 2 and 3 do.
 
 A name that fits two files is an error, and so are two names that fit one.
 """
@@ -22,6 +25,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 from csplat.errors import InputError, counted
 from csplat_trainer.data.pixels import image_size
@@ -40,7 +44,7 @@ __all__ = [
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _SHOWN = 5  # names in a message, at most
 
-_FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 5 and 6
+_FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
 
 _Key = Callable[[str], str]
 
@@ -109,21 +113,38 @@ def find_images(
     )
 
 
-def find_masks(folder: Path, names: Sequence[str]) -> FoundImages:
-    """Find masks, called like their images with or without `.png` at the end.
+def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
+    """Find the masks of images in a folder `masks` or `mask`: `1.png`, `1.jpg.png`, `1_mask.png` or `mask_1.png`.
 
     Args:
-        folder: of the masks.
+        root: the folder of the set.
         names: of the images, as the set writes them.
+
+    Returns:
+        The masks by names of images; `None` where there is no such folder.
 
     Raises:
         InputError: as `match_names`.
     """
+    folder = next((folder for name in ("masks", "mask") for folder in _sizes(root, name)[:1]), None)
+    if folder is None:
+        return None
     known, where = list(_below(folder)), f"{folder.name}/"
     longer = {f"{name}.png": name for name in names}
-    exact = {longer[name]: name for name in longer if name in set(known)}
-    matched, notes = match_names([name for name in names if name not in exact], known, where)
-    return FoundImages(folder, {name: folder / to for name, to in (exact | matched).items()}, notes)
+    files = {longer[name]: folder / name for name in known if name in longer}
+    left = [name for name in names if name not in files]
+    matched, notes = match_names(left, known, where)
+    if not matched:
+        shorter = {_without_affix(name): name for name in known}
+        matched, notes = match_names(left, shorter, where)
+        matched = {name: shorter[to] for name, to in matched.items()}
+    return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
+
+
+def _without_affix(name: str) -> str:
+    path = PurePosixPath(name)
+    stem = re.sub(r"^mask[_.-]|[_.-]mask$", "", path.stem, flags=re.IGNORECASE)
+    return path.with_name(stem + path.suffix).as_posix() if stem else name
 
 
 def match_names(
@@ -135,7 +156,7 @@ def match_names(
         names: as they are listed.
         known: as they are there, with `/`.
         where: what lists them, for messages.
-        folders: use rules 5 and 6.
+        folders: use rules 6 and 7.
 
     Returns:
         Known names by listed ones, without those that are missing; and a line for each rule that was needed.
@@ -166,15 +187,18 @@ def match_names(
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
     """Give the rules in their order: words, and keys of listed and of known names that are equal where names match."""
 
+    def decoded(name: str) -> str:
+        return plain(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
+
     def folded(name: str) -> str:
-        return unicodedata.normalize("NFC", plain(name)).casefold()
+        return unicodedata.normalize("NFC", decoded(name)).casefold()
 
     def unended(name: str) -> str:
-        path = PurePosixPath(plain(name))
+        path = PurePosixPath(decoded(name))
         return str(path.with_suffix("") if path.suffix.lower() in _ENDINGS else path)
 
     def parts(name: str) -> list[str]:
-        return plain(name).strip("/").split("/")
+        return decoded(name).strip("/").split("/")
 
     def in_any_case(listed: _Key, known: _Key) -> list[tuple[_Key, _Key]]:
         """Compare names in any case; then with any ending, too."""
@@ -191,6 +215,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
 
     yield "", [(_as_written, _as_written)]
     yield "with / for \\", [(plain, plain)]
+    yield "as a URL", [(decoded, plain)]
     yield "with another ending", [(unended, unended)]
     yield "in another case", in_any_case(plain, plain)
     if not folders:

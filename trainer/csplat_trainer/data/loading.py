@@ -20,6 +20,7 @@ from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["load"]
 
+_NAMED = 3  # folders in a message, at most
 _AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with its cameras
 
 
@@ -118,7 +119,9 @@ def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
             return read_blender(path.parent, images)
         return read_transforms(path, test_every, images)
     if not path.is_dir():
-        raise InputError(f"{path} is neither a folder nor a transforms.json")
+        zipped = path.suffix.lower() == ".zip" and path.is_file()
+        remedy = ": unpack it, and name the folder" if zipped else ""
+        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy}")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
         found = read_blender(path, images)
@@ -130,8 +133,22 @@ def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
     else:
         raise InputError(
             f"{path} is no data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            "or sparse/0/cameras.bin (COLMAP)"
+            f"or sparse/0/cameras.bin (COLMAP){_hint(path)}"
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
     return found
+
+
+def _hint(path: Path) -> str:
+    """Say where a data set is instead, as far as that is to be seen."""
+    folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
+    names = ("transforms_train.json", "transforms.json")
+    sets = [one for one in folders if any((one / name).is_file() for name in names) or find_model(one)]
+    if sets:
+        return (
+            "; " + ", ".join(one.relative_to(path).as_posix() for one in sets[:_NAMED]) + " in it may be what you want"
+        )
+    if (path / "database.db").is_file():
+        return "; it holds a database of COLMAP, but no model yet: run `colmap mapper`"
+    return ""

@@ -3,12 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from csplat.errors import InputError, counted
+from csplat.files import read_text
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_files import match_names, shown
 
-__all__ = ["split_every", "split_listed"]
+__all__ = ["ROLES", "lists_next_to", "split_every", "split_listed"]
+
+#: Names of lists, and what each is for.
+ROLES = {"train": "training", "val": "validation", "test": "test"}
+
+
+def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
+    """Read the text files that list images, a name a line: `test.txt` or `test_list.txt`, and for `val` and `train`.
+
+    Args:
+        folders: to look in; the first that has any counts.
+
+    Returns:
+        Names by `train`, `val` and `test`, without quotes, and the files' names.
+
+    Raises:
+        InputError: a file is not UTF-8 text.
+    """
+    for folder in folders:
+        files = {role: path for role in ROLES for path in _files(folder, role)[:1]}
+        if files:
+            lists = {role: _names(read_text(path)) for role, path in files.items()}
+            return lists, ", ".join(path.name for path in files.values())
+    return {}, ""
+
+
+def _files(folder: Path, role: str) -> list[Path]:
+    return [path for form in ("{}.txt", "{}_list.txt") if (path := folder / form.format(role)).is_file()]
+
+
+def _names(text: str) -> list[str]:
+    """Return the names of a list: one a line, or with commas between them; in quotes, perhaps."""
+    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    return [name for line in lines for cell in line.split(",") if (name := cell.strip().strip("\"'").strip())]
 
 
 def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[list[Shot], list[Shot]]:
@@ -39,8 +74,9 @@ def split_listed(
 ) -> tuple[list[Shot], list[Shot], list[Shot]]:
     """Split images by lists of names.
 
-    An image on two lists is for test rather than validation, and for validation rather than training. An image on none
-    is for training; but not if training images are listed: then it is left out.
+    A list that names none of the images decides nothing. An image on two lists is for test rather than validation, and
+    for validation rather than training. An image on none is for training, unless training images are listed: then it
+    is left out.
 
     Args:
         shots: all images.
@@ -56,7 +92,8 @@ def split_listed(
     """
     by_name = {shot.name: shot for shot in shots}
     roles: dict[str, str] = {}
-    for role, word in (("test", "test"), ("val", "validation"), ("train", "training")):
+    heeded = []
+    for role, word in reversed(ROLES.items()):
         if role not in lists:
             continue
         names = list(dict.fromkeys(lists[role]))
@@ -66,6 +103,7 @@ def split_listed(
         line = f"{where} names {counted(len(names), f'{word} image')}"
         there = {0: "none of them is there", 1: "1 of them is there"}.get(len(found), f"{len(found)} of them are there")
         report.append(f"{line}, {there}; missing: {shown(missing)}" if missing else line)
+        heeded += [role] if found else []
         twice = [name for name in found.values() if name in roles]
         if twice:
             report.append(
@@ -73,7 +111,7 @@ def split_listed(
             )
         roles = {**dict.fromkeys(found.values(), role), **roles}
     unlisted = [shot.name for shot in shots if shot.name not in roles]
-    if "train" not in lists:
+    if "train" not in heeded:
         roles |= dict.fromkeys(unlisted, "train")
     elif unlisted:
         report.append(f"{where}: {counted(len(unlisted), 'image')} on no list, left out: {shown(unlisted)}")

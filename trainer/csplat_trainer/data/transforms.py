@@ -8,19 +8,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.files import read_text
 from csplat_trainer.data.dataset import Found, Lens, Shot
-from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain
+from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain, shown
 from csplat_trainer.data.pixels import image_size
 from csplat_trainer.data.point_cloud import read_point_cloud
-from csplat_trainer.data.splits import split_every, split_listed
+from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_listed
 
 __all__ = ["read_blender", "read_transforms"]
 
@@ -46,7 +47,7 @@ def read_blender(folder: Path, images: str | None = None) -> Found:
     train = _shots(folder / "transforms_train.json", images, report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        test = _shots(test_path, images, report)
+        test = _shots(test_path, images, report, needed=False)
     else:
         test = []
         report.append("there is no transforms_test.json: no test images")
@@ -70,11 +71,15 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> F
     document, report = _load(path), list[str]()
     shots = _shots(path, images, report)
     points, colours = _points(document, path, report)
-    lists = {
-        role: names for role in ("train", "val", "test") if (names := _listed(document, f"{role}_filenames", path))
-    }
+    if "test_frames" in document:  # ScanNet++
+        test = _shots(path, images, report, key="test_frames", needed=False)
+        return Found("transforms.json set", shots, test, points, colours, report)
+    lists = {role: names for role in ROLES if (names := _listed(document, f"{role}_filenames", path))}
+    files = path.name
+    if not lists:
+        lists, files = lists_next_to((path.parent,))
     if lists:
-        train, val, test = split_listed(shots, lists, path.name, report)
+        train, val, test = split_listed(shots, lists, files, report)
         return Found("transforms.json set", train, test, points, colours, report, val=val)
     train, test = split_every(shots, test_every, report)
     return Found("transforms.json set", train, test, points, colours, report, test_every)
@@ -89,18 +94,30 @@ def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
             raise InputError(f"{folder}: {other} and {shot.name} are both found as {shot.path.relative_to(folder)}")
 
 
-def _shots(path: Path, images: str | None, report: list[str], *, needed: bool = True) -> list[Shot]:
-    """Read the frames of one file, but for those whose images are missing; if needed, one at least is there."""
+@dataclass(frozen=True)
+class _Frame:
+    """An image as a list of frames has it.
+
+    Attributes:
+        name: its file_path.
+        number: where it is in the list.
+        values: all that the list says of it.
+    """
+
+    name: str
+    number: int
+    values: Mapping[str, Any]
+
+
+def _shots(
+    path: Path, images: str | None, report: list[str], *, key: str = "frames", needed: bool = True
+) -> list[Shot]:
+    """Read the frames of one file, but for those without an image or a pose; if needed, one at least is there."""
     document, folder = _load(path), path.parent
-    frames = document.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path} lists no frames")
-    for number, frame in enumerate(frames):
-        if not isinstance(frame, Mapping) or not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{path}, frame {number} has no file_path")
-    names = list(dict.fromkeys(frame["file_path"] for frame in frames))
+    frames = _frames(document, key, path, report, needed=needed)
+    names = [frame.name for frame in frames]
     try:
-        found = find_images(folder, names, path.name, _folders(names, images))
+        found = find_images(folder, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
     except NoImagesError:
         if needed:
             raise
@@ -111,14 +128,56 @@ def _shots(path: Path, images: str | None, report: list[str], *, needed: bool = 
     report += missing_images([name for name in names if name not in found.files], len(names), path.name)
     masks = _masks(frames, path, report)
     shots = []
-    for number, frame in enumerate(frames):
-        where, name = f"{path}, frame {number}", frame["file_path"]
-        if name in found.files:
-            image = found.files[name]
-            lens = _lens({**document, **frame}, image, where)
-            viewmat = _viewmat(frame.get("transform_matrix"), where)
-            shots.append(Shot(_plain(name, image), image, lens, viewmat, masks.get(name)))
+    for frame in frames:
+        if frame.name in found.files:
+            image, where = found.files[frame.name], f"{path}, frame {frame.number}"
+            lens = _lens({**document, **frame.values}, image, where)
+            viewmat = _viewmat(frame.values.get("transform_matrix"), where)
+            shots.append(Shot(_plain(frame.name, image), image, lens, viewmat, masks.get(frame.name)))
     return shots
+
+
+def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[str], *, needed: bool) -> list[_Frame]:
+    """Check frames, and leave out those that are marked as bad, have no pose, or are there again."""
+    frames = document.get(field)
+    if not isinstance(frames, list) or (needed and not frames):
+        raise InputError(f"{path} lists no {field}")
+    good: dict[str, _Frame] = {}
+    bad, lost, twice = [], [], []
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, Mapping) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{path}, frame {number} has no file_path")
+        name = frame["file_path"]
+        key = PurePosixPath(name).as_posix()
+        if frame.get("is_bad") is True:
+            bad.append(name)
+        elif _is_lost(frame):
+            lost.append(name)
+        elif key not in good:
+            good[key] = _Frame(name, number, frame)
+        elif good[key].values.get("transform_matrix") == frame.get("transform_matrix"):
+            twice.append(name)
+        else:
+            raise InputError(f"{path}, frame {number}: {name} is there twice, with different poses; expected each once")
+    for words, names in (("marked as bad", bad), ("without a finite pose", lost)):
+        if names:
+            report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, left out: {shown(names)}")
+    if twice:
+        report.append(f"{path.name}: {counted(len(twice), 'frame')} there twice, read once: {shown(twice)}")
+    if needed and not good:
+        raise InputError(f"{path}: none of its {len(frames)} frames has a pose")
+    return list(good.values())
+
+
+def _is_lost(frame: Mapping[str, Any]) -> bool:
+    """Report whether a frame's pose is null, or holds a number that is not finite, as where tracking was lost."""
+    if "transform_matrix" not in frame:
+        return False
+    matrix = frame["transform_matrix"]
+    try:
+        return matrix is None or not np.isfinite(np.array(matrix, np.float64)).all()
+    except (TypeError, ValueError):
+        return False  # what it is instead is said later
 
 
 def _folders(names: Sequence[str], images: str | None) -> list[str]:
@@ -129,23 +188,22 @@ def _folders(names: Sequence[str], images: str | None) -> list[str]:
     return [".", *([] if own.is_absolute() else [str(own)]), own.name or ".", "images", "input"]
 
 
-def _masks(frames: Sequence[Mapping[str, Any]], path: Path, report: list[str]) -> dict[str, Path]:
+def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
     """Find the masks of frames, as nerfstudio names them: black where the image does not count."""
     named: dict[str, str] = {}
-    for number, frame in enumerate(frames):
-        mask = frame.get("mask_path")
-        if mask is not None:
+    for frame in frames:
+        mask = frame.values.get("mask_path")
+        if mask not in (None, ""):
             if not isinstance(mask, str):
-                raise InputError(f"{path}, frame {number}: mask_path is {mask!r}, expected a name")
-            named[frame["file_path"]] = mask
+                raise InputError(f"{path}, frame {frame.number}: mask_path is {mask!r}, expected a name")
+            named[frame.name] = mask
     if not named:
         if (path.parent / "masks").is_dir():
             report.append(f"there is a folder masks, which {path.name} does not mention (mask_path): it is not read")
         return {}
     try:
-        found = find_images(
-            path.parent, list(dict.fromkeys(named.values())), path.name, _folders([*named.values()], None)
-        )
+        masks = list(dict.fromkeys(named.values()))
+        found = find_images(path.parent, masks, path.name, _folders(masks, None))
     except NoImagesError:
         found = FoundImages(path.parent, {})
     report += found.notes
