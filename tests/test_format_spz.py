@@ -110,7 +110,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 @pytest.mark.parametrize(
     ("data", "says"),
     [
-        (spz(4, splats(4, degree=3), degree=4), "SH degree 4, wanted at most 3"),
+        (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
         (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
         (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, wanted 1 to 4"),
         (gzip.compress(b"NGSX" + bytes(40), mtime=0), "begins with b'NGSX'"),

@@ -172,14 +172,14 @@ def test_two_scales_are_discs(path):
     np.testing.assert_allclose(model.scales[:, 2], smallest + np.log(0.01), rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [1, 8, 10, 12, 44, 46, 72])
+@pytest.mark.parametrize("count", [1, 8, 10, 12, 15, 44, 46])
 def test_sh_columns_of_no_degree_are_refused(path, count):
     names = without(*(name for name in NAMES if name.startswith("f_rest")))
     names += [f"f_rest_{i}" for i in range(count)]
     rows = good_rows(names=names)
     path.write_bytes(header(rows) + rows.tobytes())
     assert count == found(path)["sh-columns"].count
-    with pytest.raises(InputError, match=f"{count} f_rest columns are no SH degree"):
+    with pytest.raises(InputError, match=f"{count} f_rest columns are no SH degree, expected 0, 9, 24 or 45"):
         read_ply(path)
 
 
@@ -195,7 +195,7 @@ def test_degree_4_is_named(path):
     names = without(*(name for name in NAMES if name.startswith("f_rest")))
     rows = good_rows(names=[*names, *(f"f_rest_{i}" for i in range(72))])
     path.write_bytes(header(rows) + rows.tobytes())
-    with pytest.raises(InputError, match="degree 4 is not supported"):
+    with pytest.raises(InputError, match="SH degree 4, expected at most 3: --sh-degree 3"):
         read_ply(path)
 
 

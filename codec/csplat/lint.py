@@ -7,7 +7,9 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | id | what | kind |
 |---|---|---|
 | `missing-columns` | a column without which there is no splat | error |
-| `sh-columns` | f_rest columns that are no SH degree, or not numbered from 0 | error |
+| `sh-columns` | f_rest columns that are no SH degree, or of a higher one than 3, or not numbered from 0 | error |
+| `ambiguous-columns` | two columns that other programs would both call the same | error |
+| `colour-columns` | red, green and blue that are neither bytes nor 0 to 1 | error |
 | `truncated` | fewer splats than the header declares | error |
 | `malformed` | a row that is no row | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
@@ -22,6 +24,15 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
 | `shuffled-columns` | columns in another order than usual | note |
+| `alias-columns` | columns that another program named in its own way: `scalar_opacity` of CloudCompare | note |
+| `second-columns` | columns that are there once more under the usual name, which is read | note |
+| `rgb-colours` | red, green and blue in place of f_dc, read as colours of SH degree 0 | note |
+| `filter-3d` | the 3D filter of Mip-Splatting: fused into scales and opacities | note |
+| `sh-bands` | SH bands above those that were asked for: left out | note |
+| `vertical-axis` | a comment that names the axis that is up | note |
+| `opacities-are-alphas` | opacities that all lie in 0 to 1, as after the sigmoid; read as logits | note |
+| `scales-are-linear` | scales that are all above 0, as after the exponential; read as logarithms | note |
+| `colours-are-rgb` | f_dc that are all in 0 to 1 or in 0 to 255, as colours are; read as SH coefficients | note |
 | `double-means` | positions in double precision: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
 | `empty` | no splats at all | note |
@@ -29,6 +40,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,8 +49,9 @@ from typing import Any, Literal
 import numpy as np
 
 from csplat.errors import InputError, counted
+from csplat.model import MAX_SH_DEGREE
 
-__all__ = ["Columns", "Finding", "find_columns", "refuse"]
+__all__ = ["Columns", "Finding", "dropped_columns", "find_columns", "refuse", "too_many_bands"]
 
 Kind = Literal["note", "repair", "error"]
 
@@ -48,9 +61,25 @@ _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _OPACITY = "opacity"
+_FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
-_REST_COUNTS = (0, 9, 24, 45)
-_REST_COUNT_DEGREE_4 = 72
+
+#: What CloudCompare puts before the names of scalar fields (PlyFilter.cpp), and 3dgsconverter, which prepares files for
+#: it, before that.
+_PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
+#: Colours in place of f_dc, as ns-export of nerfstudio writes them; the other names are those that three.js'
+#: PLYLoader and Brush take for the same.
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+#: By the type of a colour, the value that is 1.
+_COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
+#: Beginnings of the names of columns that change what is seen, of scenes that are more than splats.
+_MEANINGS = {
+    ("motion_", "trbf_", "omega_"): "splats that move, of which one moment is kept",
+    ("f_anchor_feat", "f_offset"): "anchors of Scaffold-GS, of which a network makes the splats",
+    ("sg_axis", "sg_sharpness", "sg_color"): "colours by spherical Gaussians, which are lost",
+}
+_NAMED = 6  # columns that a message names
+_ADVICE = "csplat train makes splats of its images"
 
 
 @dataclass(frozen=True)
@@ -91,6 +120,8 @@ class Columns:
         normals: three names, or none.
         extra: everything else.
         double: whether positions have more than float32 holds.
+        colour_range: where `sh0` are red, green and blue, the value that is 1; 0 where they are coefficients.
+        filter_3d: name of the column of standard deviations of Mip-Splatting's 3D filter, or "".
     """
 
     means: tuple[str, ...]
@@ -102,62 +133,198 @@ class Columns:
     normals: tuple[str, ...]
     extra: tuple[str, ...]
     double: bool
+    colour_range: float = 0.0
+    filter_3d: str = ""
 
 
-def find_columns(dtype: np.dtype[Any], *, keep_extra: bool = False) -> tuple[Columns | None, list[Finding]]:
-    """Tell the columns of a PLY apart, whatever their order.
+def find_columns(
+    dtype: np.dtype[Any], *, keep_extra: bool = False, sh_degree: int | None = None, elements: Sequence[str] = ()
+) -> tuple[Columns | None, list[Finding]]:
+    """Tell the columns of a PLY apart, whatever their order, by their usual names or those of other programs.
 
     Args:
         dtype: structured, one field per scalar property, in the order of the file.
         keep_extra: extra columns will be kept: they are no finding then.
+        sh_degree: highest SH band wanted; `None`: all, of at most degree 3.
+        elements: names of the other elements of the file, for messages.
 
     Returns:
         The columns, `None` where the findings hold an error; and the findings.
     """
-    names = dtype.names or ()
+    names = _Names(dtype.names or ())
     findings: list[Finding] = []
-    flat = set(_SCALES) - set(names) == {_SCALES[2]}
-    scales = _SCALES[:2] if flat else _SCALES
+    means, quats = names.find(_MEANS), names.find(_QUATS)
+    scales, sh0, opacity = names.find(_SCALES), names.find(_SH0), names.find((_OPACITY,))
+    flat = [name for name, found in zip(_SCALES, scales, strict=True) if not found] == [_SCALES[2]]
     if flat:
+        scales = scales[:2]
         findings.append(Finding("flat-scales", 1, "scale_2 is absent: the splats are discs (2DGS)", "note"))
-    missing = [name for name in (*_MEANS, *_SH0, _OPACITY, *scales, *_QUATS) if name not in names]
+    colour_range = 0.0
+    if not any(sh0):
+        colours = next((one for one in _COLOURS if names.has(one)), None)
+        if colours is not None:
+            sh0 = names.find(colours)
+            colour_range, finding = _colour_range(dtype, sh0)
+            findings.append(finding)
+    wanted = (*_MEANS, *_SH0, _OPACITY, *(_SCALES[:2] if flat else _SCALES), *_QUATS)
+    missing = [name for name, found in zip(wanted, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not found]
     if missing:
-        text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
-        findings.append(Finding("missing-columns", len(missing), text, "error"))
-    rest, problem = _find_rest(names)
+        findings.append(Finding("missing-columns", len(missing), _absence(names, missing, elements), "error"))
+    every, rest, problem = _find_rest(names, sh_degree)
     if problem is not None:
         findings.append(problem)
+    normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
+    filter_3d = "" if flat else names.find((_FILTER,))[0]
+    findings += names.findings()
     if not all(finding.repairable for finding in findings):
         return None, findings
 
-    normals = _NORMALS if set(_NORMALS) <= set(names) else ()
-    usual = (*_MEANS, *normals, *_SH0, *rest, _OPACITY, *scales, *_QUATS)
+    usual = (*means, *normals, *sh0, *every, *opacity, *scales, *quats)
     known = set(usual)
-    extra = tuple(name for name in names if name not in known)
+    extra = tuple(name for name in names.all if name not in known and name != filter_3d)
     if extra and not keep_extra:
-        text = f"columns {', '.join(extra)} are no property of splats: dropped"
-        findings.append(Finding("extra-columns", len(extra), text, "repair"))
-    in_file = tuple(name for name in names if name in known)
+        findings.append(dropped_columns(extra))
+    in_file = tuple(name for name in names.all if name in known)
     if in_file != usual:
         moved = sum(have != want for have, want in zip(in_file, usual, strict=True))
         text = f"{counted(moved, 'column')} in another place than usual: read by name"
         findings.append(Finding("shuffled-columns", moved, text, "note"))
-    double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in _MEANS)
-    columns = Columns(_MEANS, scales, _QUATS, _SH0, rest, _OPACITY, normals, extra, double)
+    double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in means)
+    columns = Columns(
+        means, scales, quats, sh0, rest, opacity[0], normals, extra, double, colour_range, filter_3d
+    )  # fmt: skip
     return columns, findings
 
 
-def _find_rest(names: Sequence[str]) -> tuple[tuple[str, ...], Finding | None]:
-    numbers = sorted(int(match[1]) for name in names if (match := _REST.fullmatch(name)))
+def dropped_columns(names: Sequence[str]) -> Finding:
+    """Say which columns are dropped that splats do not have, and what a scene that has them may be."""
+    meaning = _meaning(names)
+    text = f"columns {', '.join(names)} are no property of splats: dropped"
+    text += "" if meaning is None else f"; the file holds {meaning}"
+    return Finding("extra-columns", len(names), text, "repair")
+
+
+class _Names:
+    """The names of a file's columns, to be found by what they usually are."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.all = tuple(names)
+        self.plain: dict[str, list[str]] = {}
+        for name in names:
+            self.plain.setdefault(_PREFIXES.sub("", name.lower(), count=1), []).append(name)
+        self._renamed: dict[str, str] = {}
+        self._second: list[str] = []
+        self._ambiguous: list[str] = []
+
+    def has(self, wanted: Sequence[str]) -> bool:
+        """Return whether there is a column for each name, however it is called."""
+        return all(name in self.plain for name in wanted)
+
+    def find(self, wanted: Sequence[str]) -> tuple[str, ...]:
+        """Find the column that has each name; else the only one that another program would call so; else ""."""
+        return tuple(self._find(name) for name in wanted)
+
+    def _find(self, name: str) -> str:
+        found = self.plain.get(name.lower(), [])
+        if name in found:
+            self._second += [other for other in found if other != name]
+            return name
+        if len(found) > 1:
+            self._ambiguous.append(f"{' and '.join(found)} would both be {name}")
+        elif found:
+            self._renamed[found[0]] = name
+        return found[0] if found else ""
+
+    def findings(self) -> list[Finding]:
+        """What was found under other names."""
+        found = []
+        if self._ambiguous:
+            text = f"{'; '.join(self._ambiguous[:_NAMED])}: rename one of them"
+            found.append(Finding("ambiguous-columns", len(self._ambiguous), text, "error"))
+        if self._renamed:
+            pairs = _some([f"{name} as {self._renamed[name]}" for name in self.all if name in self._renamed])
+            text = f"{counted(len(self._renamed), 'column')} named by another program: {pairs}"
+            found.append(Finding("alias-columns", len(self._renamed), text, "note"))
+        if self._second:
+            text = f"{_some(self._second)}: there once more under the usual name, which is read"
+            found.append(Finding("second-columns", len(self._second), text, "note"))
+        return found
+
+
+def _some(words: Sequence[str]) -> str:
+    more = len(words) - _NAMED
+    return ", ".join(words[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, Finding]:
+    """The value of a colour that is 1, and what to say of it."""
+    named = f"{', '.join(colours[:2])} and {colours[2]}"
+    kinds = {dtype[name].str[1:] for name in colours}
+    largest = _COLOUR_RANGES.get(kinds.pop(), 0.0) if len(kinds) == 1 else 0.0
+    if not largest:
+        shown = ", ".join(dtype[name].name for name in colours)
+        text = f"{named} are of type {shown}, expected uint8, uint16 or float: export the scene with f_dc columns"
+        return 0.0, Finding("colour-columns", 3, text, "error")
+    steps = "" if largest == 1.0 else f", in steps of 1/{largest:.0f}"
+    return largest, Finding("rgb-colours", 3, f"{named} are read as the colours of SH degree 0{steps}", "note")
+
+
+def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> str:
+    """Say which columns are missing, and what the file seems to be."""
+    text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
+    shown = f"it has {_some(names.all)}" if names.all else "it has no columns"
+    if (meaning := _meaning(names.all)) is not None:
+        return f"{text}, but {meaning}: export plain splats"
+    if {*_SCALES, *_QUATS, _OPACITY} <= set(missing):
+        if "face" in elements:
+            return f"{text}, but a mesh ({shown}; and faces): {_ADVICE}"
+        return f"{text}, but a point cloud ({shown}): {_ADVICE}"
+    return f"{text}; {shown}"
+
+
+def _meaning(names: Sequence[str]) -> str | None:
+    plain = [_PREFIXES.sub("", name.lower(), count=1) for name in names]
+    for beginnings, meaning in _MEANINGS.items():
+        if any(name.startswith(beginnings) for name in plain):
+            return meaning
+    return None
+
+
+def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
+    """The columns of all bands, those of the bands that are wanted, and what is to be said of them."""
+    numbers = sorted(int(match[1]) for name in names.plain if (match := _REST.fullmatch(name)))
     count = len(numbers)
     if numbers != list(range(count)):
         text = f"the {count} f_rest columns are not numbered from 0 to {count - 1}"
-        return (), Finding("sh-columns", count, text, "error")
-    if count not in _REST_COUNTS:
-        degree_4 = ": SH degree 4 is not supported" if count == _REST_COUNT_DEGREE_4 else ""
-        text = f"{count} f_rest columns are no SH degree, wanted 0, 9, 24 or 45{degree_4}"
-        return (), Finding("sh-columns", count, text, "error")
-    return tuple(f"f_rest_{number}" for number in numbers), None
+        return (), (), Finding("sh-columns", count, text, "error")
+    bands = count // 3
+    degree = math.isqrt(bands + 1) - 1
+    if count % 3 or (degree + 1) ** 2 - 1 != bands:
+        wanted = ", ".join(str(3 * (one * one - 1)) for one in range(1, MAX_SH_DEGREE + 1))
+        last = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
+        text = f"{count} f_rest columns are no SH degree, expected {wanted} or {last}"
+        return (), (), Finding("sh-columns", count, text, "error")
+    found = names.find([f"f_rest_{number}" for number in numbers])
+    kept = degree if sh_degree is None else min(degree, sh_degree)
+    if kept > MAX_SH_DEGREE:
+        return found, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
+    if kept == degree:
+        return found, found, None
+    wanted_bands = (kept + 1) ** 2 - 1
+    rest = tuple(found[channel * bands + band] for channel in range(3) for band in range(wanted_bands))
+    if degree <= MAX_SH_DEGREE:
+        return found, rest, None
+    text = f"SH degree {degree}: bands above {kept} are left out, as asked"
+    return found, rest, Finding("sh-bands", count - len(rest), text, "note")
+
+
+def too_many_bands(degree: int) -> str:
+    """Say of a file that it has more SH bands than a model, and how to read it without them."""
+    bands = f"band {degree}" if degree == MAX_SH_DEGREE + 1 else f"bands {MAX_SH_DEGREE + 1} to {degree}"
+    return (
+        f"SH degree {degree}, expected at most {MAX_SH_DEGREE}: --sh-degree {MAX_SH_DEGREE} of csplat encode, convert,"
+        f" lint and render, or sh_degree={MAX_SH_DEGREE} of csplat.read, leaves {bands} out"
+    )
 
 
 def refuse(findings: Sequence[Finding], *, strict: bool) -> None:

@@ -25,6 +25,7 @@ __all__ = [
     "SplatModel",
     "check_axes",
     "check_model",
+    "check_sh_degree",
     "normalise_quats",
     "sh_degree_of",
 ]
@@ -179,6 +180,16 @@ def check_model(caller: str, model: object) -> None:
             f"{caller} takes a SplatModel, not a {type(model).__name__}: csplat.read_ply(file) makes one of a PLY,"
             " csplat.decode(file) of a .csplat file"
         )
+
+
+def check_sh_degree(sh_degree: int | None) -> None:
+    """Refuse a highest SH band that no model has.
+
+    Raises:
+        InputError: it is neither `None` nor 0 to `MAX_SH_DEGREE`.
+    """
+    if sh_degree is not None and not 0 <= sh_degree <= MAX_SH_DEGREE:
+        raise InputError(f"sh_degree is {sh_degree}, expected 0 to {MAX_SH_DEGREE}")
 
 
 def sh_degree_of(coefficient_count: int) -> int:

@@ -23,7 +23,7 @@ import numpy as np
 from csplat.files import local_file
 from csplat.inputs import File
 from csplat.lint import Columns, Finding, find_columns, refuse
-from csplat.model import F32, SplatModel
+from csplat.model import F32, SplatModel, check_sh_degree
 from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.ply_file import blocks_of, parse
@@ -41,9 +41,13 @@ def read_ply(
     *,
     strict: bool = False,
     keep_extra: bool = False,
+    sh_degree: int | None = None,
     report: list[Finding] | None = None,
 ) -> SplatModel:
     """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
+
+    Columns that another program names in its own way are found by a table (`csplat.lint`): those of CloudCompare,
+    red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused. Each is reported.
 
     Opacities go through the sigmoid in float64, rounded once; above a logit of 16 float32 alpha
     is too close to 1 to keep neighbours apart. Rotations become unit length. Positions in doubles
@@ -54,6 +58,7 @@ def read_ply(
         file: its path; an open binary file, or the bytes, of which a temporary copy is made.
         strict: refuse what would be repaired (`csplat.lint` lists it).
         keep_extra: keep columns that splats do not have in `SplatModel.extra`.
+        sh_degree: leave out the SH bands above, also of a file of a higher degree than 3; `None`: keep all.
         report: findings are appended to this list, repairs among them.
 
     Examples:
@@ -72,7 +77,7 @@ def read_ply(
     findings: list[Finding] = []
     try:
         with local_file(file) as path:
-            model = _load(path, findings, keep_extra=keep_extra, strict=strict)
+            model = _load(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
     finally:
         if report is not None:
             report.extend(findings)
@@ -81,11 +86,12 @@ def read_ply(
     return model
 
 
-def lint_ply(file: File) -> list[Finding]:
+def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
     """Find out what is wrong with a PLY of splats, without refusing it.
 
     Args:
         file: as of `read_ply`.
+        sh_degree: as of `read_ply`.
 
     Returns:
         Findings in the order of reading; the last one is an error where `read_ply` would refuse.
@@ -96,7 +102,7 @@ def lint_ply(file: File) -> list[Finding]:
     """
     findings: list[Finding] = []
     with local_file(file) as path:
-        opened = _opened(path, findings, keep_extra=False, strict=False)
+        opened = _opened(path, findings, keep_extra=False, strict=False, sh_degree=sh_degree)
         if opened is not None:
             survey = _surveyed(path, opened, findings)
             if len(opened.rows) == 0:
@@ -108,14 +114,14 @@ def lint_ply(file: File) -> list[Finding]:
 
 
 @contextmanager
-def open_ply(path: Path) -> Iterator[Scene]:
+def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     """Open a PLY as `csplat.formats` does; the rest as `read_ply`.
 
     What belongs to all splats (how many are kept, an origin for doubles, the thickness of discs) is found first, in a
     pass of its own.
     """
     findings: list[Finding] = []
-    opened = _opened(path, findings, keep_extra=True, strict=False)
+    opened = _opened(path, findings, keep_extra=True, strict=False, sh_degree=sh_degree)
     refuse(findings, strict=False)
     assert opened is not None, "without an error there are rows"
     survey = _surveyed(path, opened, findings)
@@ -190,23 +196,32 @@ class _Opened:
     facts: SceneFacts
 
 
-def _opened(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> _Opened | None:
+def _opened(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> _Opened | None:
     """Look at all but the rows, appending what is noticed to `findings`; `None` where that holds an error."""
+    check_sh_degree(sh_degree)
     content = parse(path, findings)
     if content is None:
         return None
-    rows, comments = content
-    columns, more = find_columns(rows.dtype, keep_extra=keep_extra)
+    rows = content.rows
+    columns, more = find_columns(
+        rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
+    )  # fmt: skip
     findings += more
     if columns is None:
         return None
     refuse(findings, strict=strict)  # before the work
-    return _Opened(rows, columns, parse_comments(comments))
+    facts = parse_comments(content.comments)
+    findings += facts.findings
+    return _Opened(rows, columns, facts)
 
 
-def _load(path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool) -> SplatModel | None:
+def _load(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> SplatModel | None:
     """Read a file, appending what is noticed to `findings`; `None` where that holds an error."""
-    opened = _opened(path, findings, keep_extra=keep_extra, strict=strict)
+    opened = _opened(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
     if opened is None:
         return None
     rows, columns, counts = opened.rows, opened.columns, Counts()

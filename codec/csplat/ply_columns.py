@@ -19,10 +19,13 @@ from csplat.errors import counted
 from csplat.lint import Columns, Finding
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
-__all__ = ["Arrays", "Counts", "alpha_of_logits", "findings_of", "gather", "logits_of_alpha"]
+__all__ = ["SH_C0", "Arrays", "Counts", "alpha_of_logits", "findings_of", "gather", "logits_of_alpha"]
 
 F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
+
+#: The basis function of SH degree 0.
+SH_C0 = np.float32(0.28209479177387814)
 
 #: float32 sigmoids of these are exactly 0 and 1, however they are written down.
 LOGIT_OF_0 = -110.0
@@ -35,6 +38,10 @@ _FLAT_SCALE_STEP = 4.605170
 _HUGE_LOG = 88.0  # standard deviations beyond leave float32
 _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # of rotations: they grow and shrink while a scene is trained
+_LARGEST_COLOUR = 16.0  # of red, green and blue as floats, where 1 is white: beyond they are counted to 255
+_FEW = 16  # splats: what holds for fewer may hold by chance
+_TINY = 1e-30  # above 0
+_BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
 
 
 @dataclass(eq=False)
@@ -53,6 +60,9 @@ class Arrays:
     extra: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
+_NOTHING = (math.inf, -math.inf)
+
+
 @dataclass
 class Counts:
     """What was noticed in rows, to be added to."""
@@ -64,6 +74,11 @@ class Counts:
     infinite_logits: int = 0
     normals: int = 0
     huge: int = 0
+    filtered: int = 0
+    opacities: tuple[float, float] = _NOTHING  # as the file has them: least and largest
+    scales: tuple[float, float] = _NOTHING
+    colours: tuple[float, float] = _NOTHING
+    colour_range: float = 0.0  # as of `Columns`
 
 
 def gather(
@@ -92,13 +107,15 @@ def gather(
     """
     out = _allocate(count, dtype, columns, keep_extra=keep_extra)
     counts = Counts() if counts is None else counts
+    counts.colour_range = columns.colour_range
     at = 0
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is found below
         for rows in blocks:
             part = _part(out, slice(at, at + len(rows)))
             _copy(rows, columns, part)
             counts.normals += _nonzero_rows(rows, columns.normals)
-            at += _repair(part, len(columns.scales), counts)
+            widths = rows[columns.filter_3d].astype(np.float64) if columns.filter_3d else None
+            at += _repair(part, columns, counts, widths)
     kept = _part(out, slice(0, at))
     if len(columns.scales) == 2 and at:
         kept.scales[:, 2] = min(kept.scales[:, :2].min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP)
@@ -117,9 +134,13 @@ def alpha_of_logits(logits: NDArray[Any]) -> F32:
     Returns:
         [N] float32 in [0, 1].
     """
+    return _alphas(logits).astype(np.float32)
+
+
+def _alphas(logits: NDArray[Any]) -> F64:
     with np.errstate(over="ignore"):
-        alpha: F64 = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
-    return alpha.astype(np.float32)
+        alphas: F64 = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+    return alphas
 
 
 def logits_of_alpha(alpha: F32) -> F32:
@@ -208,9 +229,18 @@ def _nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
     return int(np.count_nonzero(nonzero))
 
 
-def _repair(part: Arrays, scale_count: int, counts: Counts) -> int:
-    """Repair a block in place; its first rows are those that are kept. Returns how many."""
-    checked = (part.means, part.quats, part.scales[:, :scale_count], part.sh0, part.shN)
+def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) -> int:
+    """Repair a block in place; its first rows are those that are kept. Returns how many.
+
+    Args:
+        part: the block, as the file has it.
+        columns: which column is what.
+        counts: what is noticed is added to it.
+        widths: [n] standard deviations of the 3D filter, scene units; `None`: there is none.
+    """
+    scale_count = len(columns.scales)
+    checked = [part.means, part.quats, part.scales[:, :scale_count], part.sh0, part.shN]
+    checked += [] if widths is None else [widths]
     sums = [float(array.sum()) for array in (*checked, part.opacities)]
     if not np.isfinite(sum(sums)):  # a NaN or an infinity, or large values: look closer
         good = ~np.isnan(part.opacities)
@@ -223,11 +253,45 @@ def _repair(part: Arrays, scale_count: int, counts: Counts) -> int:
             if isinstance(array, np.ndarray):
                 array[:kept] = array[good]
         part = _part(part, slice(0, kept))
+        widths = None if widths is None else widths[good]
         counts.infinite_logits += int(np.count_nonzero(np.isinf(part.opacities)))
-    part.opacities[:] = alpha_of_logits(part.opacities)
+    counts.opacities = _wider(counts.opacities, part.opacities)
+    counts.scales = _wider(counts.scales, part.scales[:, :scale_count])
+    counts.colours = _wider(counts.colours, part.sh0)
+    alphas = _alphas(part.opacities)
+    if widths is not None:
+        counts.filtered += int(np.count_nonzero(widths))
+        _fuse_filter(part.scales, alphas, widths)
+    part.opacities[:] = alphas
+    if columns.colour_range:
+        part.sh0[:] = (part.sh0 / np.float32(columns.colour_range) - np.float32(0.5)) / SH_C0
     _repair_quats(part.quats, counts)
     counts.huge += _huge_rows(part, scale_count)
     return len(part.opacities)
+
+
+def _wider(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
+    """The least and the largest of what was seen before and of some values."""
+    return min(bounds[0], float(values.min(initial=math.inf))), max(bounds[1], float(values.max(initial=-math.inf)))
+
+
+def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
+    """Convolve splats with the 3D filter of Mip-Splatting, in place.
+
+    As `create_fused_ply.py` does: standard deviations become sqrt(s² + f²), and opacities are multiplied by
+    sqrt(Π s² / Π (s² + f²)), which keeps what a splat holds (Yu et al., Mip-Splatting, CVPR 2024, equation 9). Here of
+    logarithms, so that neither squares nor products leave float64; a filter of width 0 changes no bit.
+
+    Args:
+        scales: [n, 3] natural logarithms of standard deviations.
+        alphas: [n] opacities, 0 to 1.
+        widths: [n] standard deviations of the filter, finite; their sign means nothing.
+    """
+    rows = np.flatnonzero(widths)
+    before = scales[rows].astype(np.float64)
+    after = 0.5 * np.logaddexp(2.0 * before, 2.0 * np.log(np.abs(widths[rows, None])))
+    alphas[rows] *= np.exp((before - after).sum(axis=1))
+    scales[rows] = after
 
 
 def _huge_rows(part: Arrays, scale_count: int) -> int:
@@ -289,6 +353,12 @@ def findings_of(counts: Counts, count: int) -> list[Finding]:
             "note",
         ),
         Finding(
+            "filter-3d",
+            counts.filtered,
+            f"the 3D filter of Mip-Splatting: fused into scales and opacities of {counted(counts.filtered, 'splat')}",
+            "note",
+        ),
+        Finding(
             "huge-values",
             counts.huge,
             f"{counted(counts.huge, 'splat')} with log scales beyond ± {_HUGE_LOG:g}"
@@ -296,4 +366,33 @@ def findings_of(counts: Counts, count: int) -> list[Finding]:
             "note",
         ),
     ]
-    return [finding for finding in findings if finding.count]
+    return [finding for finding in findings if finding.count] + _suspicions(counts, count - counts.nonfinite)
+
+
+def _suspicions(counts: Counts, kept: int) -> list[Finding]:
+    """Say what holds for all splats, and for those of no trained scene: values after their activation."""
+    found = []
+    colours = counts.colours
+    if counts.colour_range == 1.0 and kept and colours[1] > _LARGEST_COLOUR:
+        text = f"red, green and blue are floats up to {colours[1]:g}, expected 0 to 1: store them as uchar"
+        found.append(Finding("colour-columns", kept, text, "error"))
+    if kept < _FEW:
+        return found
+    if _lie_in(counts.opacities, 0.0, 1.0):
+        text = f"all {kept} opacities lie in 0..1, as alphas do: read as logits; export them before the sigmoid"
+        found.append(Finding("opacities-are-alphas", kept, text, "note"))
+    if _lie_in(counts.scales, _TINY, _HUGE_LOG):
+        text = f"all scales of {kept} splats are above 0, as lengths are: read as logarithms; export them before exp"
+        found.append(Finding("scales-are-linear", kept, text, "note"))
+    if not counts.colour_range and (
+        _lie_in(colours, 0.0, 1.0) or (_lie_in(colours, 0.0, 255.0) and colours[1] > _BYTE_COLOUR)
+    ):
+        top = 1 if colours[1] <= 1.0 else 255
+        text = f"all f_dc of {kept} splats lie in 0..{top}, as colours do: read as SH coefficients"
+        text += "; name the columns red, green and blue if they are colours"
+        found.append(Finding("colours-are-rgb", kept, text, "note"))
+    return found
+
+
+def _lie_in(bounds: tuple[float, float], low: float, high: float) -> bool:
+    return low <= bounds[0] < bounds[1] <= high

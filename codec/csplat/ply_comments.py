@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from csplat.errors import InputError
+from csplat.lint import Finding
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.training import TRAINING, VIEW, TrainedOn
 from csplat.upright import UP, unit_up, up_of
@@ -17,6 +19,9 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
+#: ns-export of nerfstudio says which axis points up; Brush writes the same of every scene, whatever is up in it.
+_VERTICAL_AXIS = re.compile(r"vertical axis:\s*([+-]?)([xyz])", re.IGNORECASE)
+_SAYS_NOTHING = "exported from brush"
 #: How Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs), and Postshot the former, in lower case.
 _MODES: dict[tuple[str, ...], str] = {
     ("splatrendermode:", "default"): "",
@@ -36,6 +41,7 @@ class SceneFacts:
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
         metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`; `view`.
+        findings: what was understood of the words of other programs.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -45,6 +51,7 @@ class SceneFacts:
     antialiased: bool = False
     flat: bool = False
     metadata: dict[str, Any] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
 
     def fields(self) -> dict[str, Any]:
         """What a `SplatModel` takes of it as it is: all but the origin."""
@@ -61,6 +68,8 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
     """
     facts = SceneFacts()
     others: list[str] = []
+    vertical: list[str] = []
+    by_brush = any(comment.strip().lower() == _SAYS_NOTHING for comment in comments)
     for comment in comments:
         words = comment.split()
         mode = _MODES.get(tuple(comment.lower().split()))
@@ -71,11 +80,37 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
         elif mode is not None:
             facts.antialiased |= mode == "antialiased"
             facts.flat |= mode == "flat"
+        elif _VERTICAL_AXIS.fullmatch(comment.strip()) and not by_brush:
+            vertical.append(comment.strip())
         elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
             others.append(comment)
+    others += _set_vertical_axis(facts, vertical)
     if others:
         facts.metadata["comments"] = others
     return facts
+
+
+def _set_vertical_axis(facts: SceneFacts, comments: Sequence[str]) -> Sequence[str]:
+    """Take over which axis is up, where nothing else says it; return the comments that say nothing more."""
+    if not comments:
+        return ()
+    directions = set()
+    for comment in comments:
+        found = _VERTICAL_AXIS.fullmatch(comment)
+        assert found is not None, "it was matched before"
+        sign, axis = found.groups()
+        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == one) + 0.0 for one in "xyz"))
+    if len(directions) > 1:
+        text = f"the comments {' and '.join(map(repr, comments))} contradict each other: none is taken"
+        facts.findings.append(Finding("vertical-axis", len(comments), text, "note"))
+        return comments
+    said = up_of(facts.metadata, facts.coordinate_system)
+    if said is not None:
+        return () if said == directions.pop() else comments
+    facts.metadata[UP] = list(directions.pop())
+    text = f"the comment {comments[0]!r} says which axis is up"
+    facts.findings.append(Finding("vertical-axis", 1, text, "note"))
+    return ()
 
 
 def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:

@@ -10,8 +10,9 @@ import io
 import re
 import warnings
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import plyfile
@@ -21,7 +22,7 @@ from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_pack
 from csplat.lint import Finding
 from csplat.ply_columns import Rows
 
-__all__ = ["blocks_of", "parse"]
+__all__ = ["Content", "blocks_of", "parse"]
 
 _ELEMENT = "vertex"
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)")
@@ -29,7 +30,21 @@ _MAX_HEADER_SIZE = 1 << 20
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
 
 
-def parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
+class Content(NamedTuple):
+    """What a PLY of splats holds.
+
+    Attributes:
+        rows: scalar columns of the splats.
+        comments: lines of the header.
+        elements: names of the other elements, of which nothing is kept.
+    """
+
+    rows: Rows
+    comments: list[str]
+    elements: list[str]
+
+
+def parse(path: Path, findings: list[Finding]) -> Content | None:
     """Let plyfile parse a file.
 
     Args:
@@ -37,7 +52,7 @@ def parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
         findings: what is noticed is appended.
 
     Returns:
-        Rows of scalar columns, and the comments; `None` where the findings hold an error.
+        Its content; `None` where the findings hold an error.
 
     Raises:
         InputError: not a PLY of splats, or its header cannot be parsed.
@@ -56,7 +71,7 @@ def parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
                 warnings.simplefilter("ignore", UserWarning)
                 parsed = plyfile.PlyData.read(stream)
         except plyfile.PlyElementParseError as error:
-            findings.append(_row_finding(error))
+            findings.append(_row_finding(error, _has_comma(path, len(header), error.row or 0)))
             return None
         except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
             raise InputError(f"{path.name}: {error or type(error).__name__}") from None
@@ -76,7 +91,7 @@ def parse(path: Path, findings: list[Finding]) -> tuple[Rows, list[str]] | None:
     comments = [*parsed.comments, *parsed.obj_info]
     for element in parsed:
         comments += element.comments
-    return rows, comments
+    return Content(rows, comments, others)
 
 
 def _header(path: Path) -> bytes:
@@ -114,12 +129,21 @@ def _header_findings(header: bytes, size: int) -> list[Finding]:
     return findings
 
 
-def _row_finding(error: Any) -> Finding:
+def _has_comma(path: Path, header_size: int, row: int) -> bool:
+    """Return whether a row of an ASCII file has a comma, as numbers of some countries do."""
+    with path.open("rb") as stream:
+        stream.seek(header_size)
+        line = next(islice(stream, row, None), b"")
+    return b"," in line and line.isascii()
+
+
+def _row_finding(error: Any, comma: bool) -> Finding:
     present, declared = error.row or 0, error.element.count
     if error.message == "early end-of-file":
         text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
         return Finding("truncated", declared - present, text, "error")
-    return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}", "error")
+    remedy = "; it has a comma, expected a point in numbers and spaces between them" if comma else ""
+    return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}{remedy}", "error")
 
 
 def _trailing_findings(path: Path, header_size: int, end: int | None, row_count: int) -> list[Finding]:

@@ -17,7 +17,7 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 
-__all__ = ["BLOCK", "Scene", "joined", "scene_of", "watched"]
+__all__ = ["BLOCK", "Scene", "joined", "scene_of", "watched", "without_bands"]
 
 #: Splats of a block, at most.
 BLOCK = 65_536
@@ -82,6 +82,13 @@ def joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
         extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in facts.extra},
         means_double=None if doubles[0] is None else np.concatenate([one for one in doubles if one is not None]),
     )
+
+
+def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:
+    """Leave out the SH bands above a degree."""
+    if sh_degree >= model.sh_degree:
+        return model
+    return replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
 
 
 def watched(scene: Scene, stage: str, progress: Callable[[str, float], object]) -> Scene:

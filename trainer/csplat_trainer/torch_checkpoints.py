@@ -8,6 +8,7 @@ What they do not say, such as whether a scene was trained antialiased, stands in
 
 from __future__ import annotations
 
+import math
 import pickle
 import warnings
 import zipfile
@@ -22,7 +23,8 @@ import numpy as np
 from csplat.bridges import from_gsplat
 from csplat.errors import InputError, missing
 from csplat.formats import Format
-from csplat.model import SplatModel
+from csplat.lint import too_many_bands
+from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.scene import Scene, scene_of
 
 __all__ = ["FORMAT"]
@@ -40,11 +42,11 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
-    yield scene_of(_read(path))
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    yield scene_of(_read(path, sh_degree))
 
 
-def _read(path: Path) -> SplatModel:
+def _read(path: Path, sh_degree: int | None) -> SplatModel:
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -62,7 +64,7 @@ def _read(path: Path) -> SplatModel:
             reason = "is no whole checkpoint of torch: copy it again, or save its splats as PLY where it was trained"
         raise InputError(f"{path.name} {reason}") from None
     try:
-        return _model_of(said, path.stat().st_size)
+        return _model_of(said, path.stat().st_size, sh_degree)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -76,18 +78,18 @@ def _plain_numbers(torch: Any) -> Any:
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
 
 
-def _model_of(said: object, size: int) -> SplatModel:
+def _model_of(said: object, size: int, sh_degree: int | None) -> SplatModel:
     if not isinstance(said, Mapping):
         raise InputError(f"it holds a {type(said).__name__}, wanted a checkpoint of gsplat or splatfacto")
     if isinstance(said.get("splats"), Mapping):
-        return _bounded(said["splats"], size)
+        return _bounded(said["splats"], size, sh_degree)
     pipeline = said.get("pipeline")
     parts = pipeline.items() if isinstance(pipeline, Mapping) else ()
     found = {str(name).rpartition(_SPLATFACTO)[2]: value for name, value in parts if _SPLATFACTO in str(name)}
     if not found:
         names = ", ".join(map(str, list(said)[:5]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
-    model = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size)
+    model = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
     if model.sh_degree or "features_rest" not in found:
         return model
     # Without SH splatfacto trains logits of colours.
@@ -95,12 +97,19 @@ def _model_of(said: object, size: int) -> SplatModel:
     return replace(model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32))
 
 
-def _bounded(splats: Mapping[str, Any], size: int) -> SplatModel:
+def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> SplatModel:
     """A model of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)
         if name in splats and (numbers is None or numbers() > size):
             raise InputError(f"{name} is no tensor that the file can hold")
+    shN = splats.get("shN")
+    if shN is not None and shN.ndim == 3:  # others are refused below
+        degree = math.isqrt(shN.shape[1] + 1) - 1
+        if degree > MAX_SH_DEGREE and (degree + 1) ** 2 - 1 == shN.shape[1]:
+            if sh_degree is None:
+                raise InputError(f"shN is of {too_many_bands(degree)}")
+            splats = {**splats, "shN": shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]}
     return from_gsplat(splats)
 
 
@@ -121,5 +130,6 @@ FORMAT = Format(
     suffixes=(".pt", ".ckpt"),
     sniff=_is_checkpoint,
     open=_open,
+    open_bands=_open,
     exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
 )

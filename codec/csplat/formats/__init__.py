@@ -20,9 +20,9 @@ from csplat.foreign import HEAD_SIZE, unknown
 from csplat.formats.format import Format
 from csplat.inputs import File
 from csplat.lint import Finding, refuse
-from csplat.model import SplatModel, check_model
+from csplat.model import SplatModel, check_model, check_sh_degree
 from csplat.ply import lint_ply, read_ply
-from csplat.scene import Scene, scene_of
+from csplat.scene import Scene, scene_of, without_bands
 from csplat.turning import USUAL, in_axes
 
 __all__ = [
@@ -70,6 +70,7 @@ def read(
     *,
     strict: bool = False,
     keep_extra: bool = False,
+    sh_degree: int | None = None,
     report: list[Finding] | None = None,
 ) -> SplatModel:
     """Read a scene in any format.
@@ -79,6 +80,7 @@ def read(
         format: its name, one of `csplat formats`, where its content and its name do not say it.
         strict: refuse what would be repaired.
         keep_extra: keep columns that splats do not have.
+        sh_degree: leave out the SH bands above, 0 to 3, also of a file of a higher degree than 3; `None`: keep all.
         report: findings are appended to this list, repairs among them.
 
     Examples:
@@ -94,11 +96,11 @@ def read(
     with local_file(file) as path:
         found = _readable(path, format)
         if found.name == _PLY:
-            return read_ply(path, strict=strict, keep_extra=keep_extra, report=report)
+            return read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=report)
         if found.name == _OWN:
-            model = decode(path)
+            model = decode(path, sh_degree=sh_degree)
             return model if keep_extra or not model.extra else replace(model, extra={})
-        with _opened(found, path) as scene:
+        with _opened(found, path, sh_degree=sh_degree) as scene:
             model = scene.model()
             if report is not None:
                 report += scene.findings
@@ -107,13 +109,16 @@ def read(
 
 
 @contextmanager
-def open_scene(file: File, format: str | None = None, *, level: int = 0) -> Iterator[Scene]:
+def open_scene(
+    file: File, format: str | None = None, *, level: int = 0, sh_degree: int | None = None
+) -> Iterator[Scene]:
     """Open a scene in any format, to be read some splats at a time.
 
     Args:
         file: as of `read`.
         format: as of `read`.
         level: of a file that has the scene several times; 0 is the finest.
+        sh_degree: as of `read`.
 
     Yields:
         The scene; its blocks can be read as long as the context lasts.
@@ -122,12 +127,16 @@ def open_scene(file: File, format: str | None = None, *, level: int = 0) -> Iter
         InputError: the file is in no format that is read, or not whole. Blocks raise it, too.
         OSError: it cannot be read.
     """
-    with local_file(file) as path, _opened(_readable(path, format), path, level) as scene:
+    with local_file(file) as path, _opened(_readable(path, format), path, level, sh_degree) as scene:
         yield scene
 
 
-def lint(path: Path) -> list[Finding]:
+def lint(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
     """Find out what is wrong with a file of any format, without refusing it.
+
+    Args:
+        path: of it.
+        sh_degree: as of `read`.
 
     Returns:
         Findings in the order of reading; the last one is an error where `read` would refuse.
@@ -138,8 +147,8 @@ def lint(path: Path) -> list[Finding]:
     """
     found = _readable(path, None)
     if found.name == _PLY:
-        return lint_ply(path)
-    with _opened(found, path) as scene:
+        return lint_ply(path, sh_degree=sh_degree)
+    with _opened(found, path, sh_degree=sh_degree) as scene:
         try:
             for _ in scene.blocks():
                 pass
@@ -220,13 +229,30 @@ def _readable(path: Path, format: str | None) -> Format:
 
 
 @contextmanager
-def _opened(found: Format, path: Path, level: int = 0) -> Iterator[Scene]:
+def _opened(found: Format, path: Path, level: int = 0, sh_degree: int | None = None) -> Iterator[Scene]:
     assert found.open is not None
+    check_sh_degree(sh_degree)
     if level and found.open_level is None:
         raise InputError(f"{path.name} is {found.title}, which has no levels, and level {level} is wanted")
-    with found.open_level(path, level) if found.open_level is not None else found.open(path) as scene:
+    if found.open_level is not None:
+        opened = found.open_level(path, level)
+    elif found.open_bands is not None and sh_degree is not None:
+        opened = found.open_bands(path, sh_degree)
+    else:
+        opened = found.open(path)
+    with opened as scene:
+        if sh_degree is not None and sh_degree < scene.facts.sh_degree:
+            scene = _without_bands(scene, sh_degree)
         placed = in_axes(scene, USUAL) if found.axes else scene
         yield replace(placed, format=found.name)
+
+
+def _without_bands(scene: Scene, sh_degree: int) -> Scene:
+    return replace(
+        scene,
+        facts=without_bands(scene.facts, sh_degree),
+        blocks=lambda: (without_bands(model, sh_degree) for model in scene.blocks()),
+    )
 
 
 def named(name: str) -> Format:

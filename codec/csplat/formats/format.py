@@ -38,6 +38,14 @@ class LevelReader(Protocol):
         ...
 
 
+class BandReader(Protocol):
+    """Opens a file of which not all SH bands are wanted."""
+
+    def __call__(self, path: Path, sh_degree: int, /) -> AbstractContextManager[Scene]:
+        """As `Reader`, without the bands above a degree; the file may have more than models have."""
+        ...
+
+
 class Writer(Protocol):
     """Writes a file, or the files of a folder."""
 
@@ -62,6 +70,7 @@ class Format:
         sniff: whether a file is of this format, by its content: path, and the first bytes of it (none of a folder).
         open: reads it; `None`: it is not read.
         open_level: reads a level of it; `None`: scenes have one level.
+        open_bands: reads it without the SH bands above a degree; `None`: `open` reads all that there may be.
         write: writes it; `None`: it is not written.
         degree: highest SH degree that it holds.
         axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
@@ -78,6 +87,7 @@ class Format:
     sniff: Callable[[Path, bytes], bool]
     open: Reader | None = None
     open_level: LevelReader | None = None
+    open_bands: BandReader | None = None
     write: Writer | None = None
     degree: int = 3
     axes: str = ""
@@ -101,7 +111,7 @@ class Format:
             lost.append(f"SH band{'s' if len(bands) > 1 else ''} {' and '.join(map(str, bands))}")
         for name, (words, is_there) in _PARTS.items():
             if name not in self.carries and is_there(facts):
-                lost.append(words)
+                lost.append(f"{words} {', '.join(facts.extra)}" if name == "extra" else words)
         return tuple(lost)
 
 

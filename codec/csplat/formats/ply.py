@@ -21,6 +21,7 @@ FORMAT = Format(
     suffixes=(".ply",),
     sniff=_is_ply,
     open=open_ply,
+    open_bands=open_ply,
     write=write_scene_ply,
     splat_bytes=(68.0, 104.0, 164.0, 248.0),
     exact=frozenset(ARRAYS),

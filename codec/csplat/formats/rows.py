@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from csplat.lint import refuse
 from csplat.model import F32, SplatModel
-from csplat.ply_columns import Counts, findings_of
+from csplat.ply_columns import SH_C0, Counts, findings_of
 from csplat.scene import Scene
 
 __all__ = ["SH_C0", "colours_of_bytes", "finite_scene", "logs_of_scales"]
 
 Rows = NDArray[Any]
-
-#: The basis function of SH degree 0.
-SH_C0 = np.float32(0.28209479177387814)
 
 _SMALLEST = np.float32(1e-20)  # what a standard deviation of 0 becomes
 

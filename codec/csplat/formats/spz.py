@@ -41,14 +41,15 @@ _SH_STEP = 4  # of 256 levels
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
-    packed = read_packed(path)
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    packed = read_packed(path, any_degree=sh_degree is not None)
+    degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
     def blocks() -> Iterator[SplatModel]:
         for start in range(0, packed.count, BLOCK):
-            yield _decoded(packed, slice(start, start + BLOCK))
+            yield _decoded(packed, slice(start, start + BLOCK), degree)
 
-    yield Scene(packed.count, _decoded(packed, slice(0, 0)), blocks)
+    yield Scene(packed.count, _decoded(packed, slice(0, 0), degree), blocks)
 
 
 def write_spz(path: Path, scene: Scene, *, version: int) -> None:
@@ -63,9 +64,10 @@ def write_spz(path: Path, scene: Scene, *, version: int) -> None:
     write_packed(path, packed, room)
 
 
-def _decoded(packed: Packed, rows: slice) -> SplatModel:
+def _decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
     _, alphas, colours, scales, rotations, rest = (part[rows] for part in packed.parts)
-    shN = np.subtract(rest, 128, dtype=np.float32)
+    coefficients = (degree + 1) ** 2 - 1
+    shN = np.subtract(rest[:, : 3 * coefficients], 128, dtype=np.float32)
     shN *= np.float32(1 / 128)
     return SplatModel(
         means=_means(packed, rows),
@@ -73,7 +75,7 @@ def _decoded(packed: Packed, rows: slice) -> SplatModel:
         scales=np.divide(scales, 16, dtype=np.float32) - np.float32(10),
         opacities=np.divide(alphas[:, 0], 255, dtype=np.float32),
         sh0=(np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / _COLOUR,
-        shN=shN.reshape(len(rest), packed.widths[5] // 3, 3),
+        shN=shN.reshape(len(rest), coefficients, 3),
         coordinate_system=packed.axes,
         antialiased=bool(packed.flags & ANTIALIASED),
     )
@@ -157,6 +159,7 @@ FORMAT = Format(
     suffixes=(".spz",),
     sniff=is_spz,
     open=_open,
+    open_bands=_open,
     write=partial(write_spz, version=3),
     axes=AXES,
     splat_bytes=(16.5, 19.3, 23.9, 29.7),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.files import atomic_writer
+from csplat.lint import too_many_bands
 from csplat.model import MAX_SH_DEGREE
 
 __all__ = ["ANTIALIASED", "AXES", "MOST_BITS", "Packed", "is_spz", "read_packed", "write_packed"]
@@ -43,6 +44,7 @@ _COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 _SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # by number, three letters each; 0 is unspecified
 _EXTENSION_BYTES = 1 << 20  # at most
 _RATIO = 1032  # of deflate, at most; programs of the format refuse more of Zstandard, too
+_MAX_DEGREE = 4  # of SH, of the format since its version 4
 _GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
 _PIECE = 1 << 18
 
@@ -95,8 +97,12 @@ class Packed:
         return self.parts[0].view("<f2")
 
 
-def read_packed(path: Path) -> Packed:
+def read_packed(path: Path, *, any_degree: bool = False) -> Packed:
     """Check a file and unpack it.
+
+    Args:
+        path: of the file.
+        any_degree: its SH may be of a higher degree than that of models, up to 4.
 
     Raises:
         InputError: it is not whole, or none that csplat reads.
@@ -106,7 +112,7 @@ def read_packed(path: Path) -> Packed:
         zipped = stream.read(2) == _GZIP
     try:
         with cast(BinaryIO, gzip.open(path) if zipped else path.open("rb")) as stream:
-            packed = _header(path, stream)
+            packed = _header(path, stream, any_degree=any_degree)
             (_read_streams if packed.version == 4 else _read_arrays)(packed, path, stream)
     except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
         raise InputError(f"{path.name} is damaged: {str(error) or 'it ends too early'}") from None
@@ -115,14 +121,16 @@ def read_packed(path: Path) -> Packed:
     return packed
 
 
-def _header(path: Path, stream: BinaryIO) -> Packed:
+def _header(path: Path, stream: BinaryIO, *, any_degree: bool) -> Packed:
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_taken(path.name, stream, _HEADER.size))
     if magic != _MAGIC:
         raise InputError(f"{path.name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
     if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
         raise InputError(f"{path.name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
-    if degree > MAX_SH_DEGREE:
-        raise InputError(f"{path.name} has SH degree {degree}, wanted at most {MAX_SH_DEGREE}")
+    if degree > _MAX_DEGREE:
+        raise InputError(f"{path.name} has SH degree {degree}, wanted at most {_MAX_DEGREE}")
+    if degree > MAX_SH_DEGREE and not any_degree:
+        raise InputError(f"{path.name} has {too_many_bands(degree)}")
     if version > 1 and bits > MOST_BITS:
         raise InputError(f"{path.name} has {bits} fractional bits, wanted at most {MOST_BITS}")
     if flags & _LEVELS:

@@ -99,6 +99,8 @@ def compare(
             out.remark(
                 f"A and B do not fit {format_bytes(source.memory_bytes)} of memory: they are drawn by way of the disk"
             )
+        for name, one in ((a, source), (b, other)):
+            out.findings(one.findings, Path(name).name)
         model, every = source.sample(progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":

@@ -110,11 +110,16 @@ class Output(Group):
         if seconds > WORTH_SAYING:
             note(f"this takes about {format_about(seconds)} here; {sooner}")
 
-    def findings(self, findings: Sequence[Finding]) -> None:
-        """Tell what lint noticed in a PLY that is not usual; what was repaired is told in any case."""
+    def findings(self, findings: Sequence[Finding], name: str = "") -> None:
+        """Tell what was noticed in a file that is not usual; what was repaired is told in any case.
+
+        Args:
+            findings: of the file.
+            name: of the file, where a command reads several.
+        """
         for one in findings:
             if one.kind == "repair" or not (self.quiet or one.usual):
-                note(str(one))
+                note(f"{name}: {one}" if name else str(one))
 
     def bar(self) -> AbstractContextManager[Progress | None]:
         """The progress bar, see `progress_bar`."""

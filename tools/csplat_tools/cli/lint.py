@@ -11,7 +11,7 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
+from csplat_tools.cli.options import ShDegree, command
 from csplat_tools.files.console import format_table
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.scenes import without_extra
@@ -30,6 +30,7 @@ def lint(
     keep_extra: Annotated[
         bool, typer.Option("--keep-extra", help="Extra columns are no defect; --fix keeps them.")
     ] = False,
+    sh_degree: ShDegree = None,
 ) -> None:
     """Say what is wrong with a PLY: each defect with its count.
 
@@ -47,12 +48,12 @@ def lint(
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)
     with source_path(source) as path:
-        findings = formats.lint(path)
+        findings = formats.lint(path, sh_degree=sh_degree)
         if keep_extra:
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
-            with formats.open_scene(path) as scene:
+            with formats.open_scene(path, sh_degree=sh_degree) as scene:
                 write_model(fix, scene if keep_extra else without_extra(scene), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)

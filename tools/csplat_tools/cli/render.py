@@ -18,7 +18,7 @@ from csplat_tools.cli.parsing import parse_size
 from csplat_tools.cli.view_options import SplitWord, Upright, Views
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import load_model, without_bands
+from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import STANDARD_STREAM, check_name
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
@@ -104,9 +104,9 @@ def render(
     if not film:
         check_name(output, ".webp", "render", source)
     need_renderer()
-    model = upright.upright().applied(load_model(source).model)
-    if sh_degree is not None:
-        model = without_bands(model, sh_degree)
+    read = load_model(source, sh_degree=sh_degree)
+    out.findings(read.findings)
+    model = upright.upright().applied(read.model)
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split)
     if orbit is not None:
         upright.seeming(seeming_up(model), out)

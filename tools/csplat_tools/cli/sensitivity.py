@@ -57,7 +57,9 @@ def sensitivity(
     from csplat_tools.optimise.sensitivity import measure_scene
     from csplat_tools.views.timing import pictures_seconds
 
-    model = load_model(source).model
+    read = load_model(source)
+    out.findings(read.findings)
+    model = read.model
     looked_for = views.data is None and views.cameras is None  # virtual ones
     prepare_renderer(quiet=out.quiet, simplify=looked_for)
     count = {"count": 0} if views.cameras is not None else {}

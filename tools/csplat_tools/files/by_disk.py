@@ -10,15 +10,15 @@ from csplat.encoder import EncodeOptions, EncodeReport
 from csplat.errors import InputError
 from csplat.formats import format_of, open_scene
 from csplat.large import Needs, encode_scene, needs_of
-from csplat.lint import Finding, refuse
+from csplat.lint import Finding, dropped_columns, refuse
 from csplat.memory import default_bytes
-from csplat.model import SplatModel
+from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat_tools.files.console import Progress, note
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import STANDARD_STREAM
 
-__all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected"]
+__all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected", "read_degree"]
 
 _FOLDS = 4  # a scene in memory, in times of a PLY's bytes; of others it has to be looked at
 #: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of what
@@ -65,6 +65,14 @@ class ByDisk:
     findings: tuple[Finding, ...]
 
 
+def read_degree(options: EncodeOptions) -> int | None:
+    """Return the SH degree to read a scene with that is to be encoded: what is dropped of it is part of its errors.
+
+    A file of a higher degree than models have is readable only where bands are to be left out.
+    """
+    return None if options.sh_degree is None else MAX_SH_DEGREE
+
+
 def encode_by_disk(
     local: Path,
     target: str,
@@ -92,13 +100,16 @@ def encode_by_disk(
     """
     if progress is not None:
         progress("opening", 0.0)
-    with open_scene(local) as opened:
+    with open_scene(local, sh_degree=read_degree(options)) as opened:
         in_memory = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
             return None
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
-        refuse(opened.findings, strict=strict)
+        findings = [*opened.findings]
+        if opened.facts.extra and not options.keep_extra:
+            findings.append(dropped_columns(list(opened.facts.extra)))
+        refuse(findings, strict=strict)
         scene = (facts or SceneOverrides()).applied_to_all(opened)
         try:
             report = encode_scene(
@@ -111,7 +122,7 @@ def encode_by_disk(
             if folder.exists():
                 note(f"{folder} keeps what is done: --resume goes on with it")
             raise
-        return ByDisk(scene.facts, report, tuple(opened.findings))
+        return ByDisk(scene.facts, report, tuple(findings))
 
 
 @dataclass(frozen=True)
@@ -152,7 +163,7 @@ def expected(local: Path, options: EncodeOptions, scale: Scale) -> Expected:
         CsplatError: it cannot be read, or the memory is too little.
         OSError: it cannot be read.
     """
-    with open_scene(local) as opened:
+    with open_scene(local, sh_degree=read_degree(options)) as opened:
         needs = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
         count = opened.count
         degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)

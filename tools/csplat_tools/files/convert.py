@@ -15,7 +15,7 @@ from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
-from csplat_tools.files.by_disk import Scale, encode_by_disk
+from csplat_tools.files.by_disk import Scale, encode_by_disk, read_degree
 from csplat_tools.files.console import Progress
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
@@ -100,6 +100,7 @@ def read_source(
     *,
     strict: bool = False,
     keep_extra: bool = False,
+    sh_degree: int | None = None,
     progress: Progress | None = None,
 ) -> LoadedModel:
     """Read a scene in any format, repaired where that is safe.
@@ -109,6 +110,7 @@ def read_source(
         facts: what it does not say.
         strict: refuse what would be repaired.
         keep_extra: carry columns that splats do not have.
+        sh_degree: leave out the SH bands above, also of a file of a higher degree than 3; `None`: keep all.
         progress: is told the stage.
 
     Raises:
@@ -119,7 +121,7 @@ def read_source(
     report = progress or (lambda _stage, _done: None)
     report("reading", 0.0)
     with source_path(file) as local:
-        model = formats.read(local, strict=strict, keep_extra=keep_extra, report=findings)
+        model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
         size_bytes, name = size_of(local), local.name
     report("reading", 1.0)
     return LoadedModel((facts or SceneOverrides()).applied(model), size_bytes, name=name, findings=tuple(findings))
@@ -166,7 +168,10 @@ def encode_file(
             if done is not None:
                 seconds = time.perf_counter() - start
                 return Encoded(done.facts, done.report, None, done.findings, size_of(local), seconds)
-        read = read_source(local, facts, strict=strict, keep_extra=options.keep_extra, progress=progress)
+        read = read_source(
+            local, facts, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+            progress=progress,
+        )  # fmt: skip
     model = read.model
     if encoder is not None:
         made = encoder(model, options, progress)

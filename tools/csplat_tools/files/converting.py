@@ -102,7 +102,8 @@ def convert_file(
     writes = named_by(Path(target)) if write_as is None else named(write_as)
     if writes.write is None:
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
-    with local_path(source) as local, open_scene(local, read_as, level=level) as opened:
+    sh_degree = None if filters is None else filters.sh_degree
+    with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as opened:
         scene = (facts or SceneOverrides()).applied_to_all(opened)
         before = scene.facts.coordinate_system
         scene = (filters or Filters()).applied(scene)

@@ -15,10 +15,10 @@ from csplat import scene as scenes
 from csplat.decoder import Limits, SceneHeader, StatedErrors, decode_scene
 from csplat.errors import LimitError
 from csplat.inputs import File
-from csplat.lint import Finding
+from csplat.lint import Finding, dropped_columns
 from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
-from csplat.scene import Scene, joined
+from csplat.scene import Scene, joined, without_bands
 from csplat_tools.files.console import Progress
 from csplat_tools.files.streams import is_csplat, kept_path, local_path, mapped_csplat, naming
 
@@ -45,7 +45,7 @@ class LoadedModel:
         header: of a .csplat file; `None` for a PLY.
         stated_errors: of a .csplat file that states them.
         name: of the file.
-        findings: what lint noticed in a PLY that was read to be encoded.
+        findings: what was noticed while it was read.
     """
 
     model: SplatModel
@@ -119,6 +119,12 @@ class OpenedScene:
         return self.scene.count
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was noticed while it was read."""
+        extra = list(self.facts.extra)
+        return (*self.scene.findings, *([dropped_columns(extra)] if extra and self.scene.format == "ply" else []))
+
+    @property
     def facts(self) -> SplatModel:
         """What the scene says beside its splats."""
         return self.scene.facts
@@ -145,12 +151,13 @@ def _sizes(count: int, facts: SplatModel, size_bytes: int) -> dict[str, Any]:
 SceneLike = SplatModel | LoadedModel | File
 
 
-def load_model(scene: SceneLike) -> LoadedModel:
+def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel:
     """Read a scene in any format (`csplat formats`); which one its content tells.
 
     Args:
         scene: the file: a path, an open binary file, or bytes; as a path `-` is standard input. What is a model, or
             loaded already, stays as it is.
+        sh_degree: leave out the SH bands above of a file, also of one of a higher degree than 3; `None`: keep all.
 
     Examples:
         >>> import csplat_tools
@@ -168,17 +175,19 @@ def load_model(scene: SceneLike) -> LoadedModel:
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
-        return _loaded(local)
+        return _loaded(local, sh_degree)
 
 
-def _loaded(local: Path) -> LoadedModel:
+def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
     size_bytes, name, free = size_of(local), local.name, available_bytes()
     if not is_csplat(local):
         if size_bytes > free:
             raise LimitError("memory for all splats at once", size_bytes, free)
-        return LoadedModel(formats.read(local), size_bytes, name=name)
+        findings: list[Finding] = []
+        model = formats.read(local, sh_degree=sh_degree, report=findings)
+        return LoadedModel(model, size_bytes, name=name, findings=tuple(findings))
     with mapped_csplat(str(local)) as data:
-        decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)))
+        decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)), sh_degree=sh_degree)
     return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
 
 
@@ -260,13 +269,6 @@ def ply_splat_bytes(sh_degree: int) -> int:
     Position and normal, opacity, scale and rotation are 14; the rest are colours.
     """
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
-
-
-def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:
-    """Leave out the SH bands above a degree."""
-    if sh_degree >= model.sh_degree:
-        return model
-    return replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
 
 
 def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
