@@ -1,6 +1,7 @@
 """`csplat convert` and `csplat formats`: any format to any other, what is changed on the way, what is lost."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,29 @@ def test_what_is_lost_is_said_refused_and_foretold(tmp_path, ply):
     assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
     expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
     assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
+
+
+def test_columns_that_are_lost_are_named_by_every_command(tmp_path, make_model):
+    source = tmp_path / "a.ply"
+    write_ply(source, replace(make_model(40, 0), extra={"motion_0": np.ones(40, np.float32)}))
+    assert "lost on the way: extra columns motion_0" in call("convert", source, tmp_path / "a.spz").stderr
+    for words in (("encode", source, tmp_path / "a.csplat"), ("compare", source, source)):
+        assert "columns motion_0 are no property of splats" in call(*words).stderr
+    assert "columns motion_0 are no property of splats" in call("lint", source, status=1).stdout
+
+
+def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for(tmp_path, ply):
+    header, _, body = ply.read_bytes().partition(b"end_header\n")
+    width = len(body) // 200
+    more = b"".join(b"property float f_rest_%d\n" % index for index in range(24, 72))
+    rows = b"".join(body[start : start + width] + bytes(4 * 48) for start in range(0, len(body), width))
+    (tmp_path / "4.ply").write_bytes(header + more + b"end_header\n" + rows)
+    for words in (("convert", "4.ply", "a.ply"), ("encode", "4.ply", "a.csplat"), ("lint", "4.ply", "--fix", "b.ply")):
+        words = [tmp_path / word if "." in word else word for word in words]
+        assert "--sh-degree 3 of csplat encode, convert" in call(*words, status=1).output
+        call(*words, "--sh-degree", 3)
+    assert 3 == read_ply(tmp_path / "a.ply").sh_degree == read_ply(tmp_path / "b.ply").sh_degree
+    assert 3 == csplat.decode(tmp_path / "a.csplat").sh_degree
 
 
 @pytest.mark.parametrize(

@@ -179,6 +179,53 @@ def test_of_levels_the_finest_is_the_scene(tmp_path):
         csplat.read(path)
 
 
+def zipped_folder(path, folder, within="", more=()):
+    """A zip of all files of a folder, and of more."""
+    files = {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+    return zipped(path, {**{within + name: data for name, data in files.items()}, **dict(more)})
+
+
+@pytest.mark.parametrize("within", ["", "a/b/"])
+def test_levels_in_a_zip_are_those_of_the_folder(tmp_path, within):
+    folder = levels(tmp_path)
+    junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
+    path = zipped_folder(tmp_path / "a.zip", folder, within, junk)
+    for level in (0, 1):
+        with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
+            assert (expected.count, expected.levels) == (scene.count, scene.levels)
+            assert np.array_equal(expected.model().means, scene.model().means)
+
+
+def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
+    folder, other = levels(tmp_path), files_of(*splats())
+    two = {
+        **{f"one/{name}": data for name, data in other.items()},
+        **{f"two/{name}": data for name, data in other.items()},
+    }
+    more = {f"b/{name}": data for name, data in other.items()}
+    bundle = {"lod-meta.json": (folder / "lod-meta.json").read_bytes().replace(b"0_0/meta.json", b"0_0.sog")}
+    for path, says in (
+        (zipped(tmp_path / "b.zip", two), r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
+        (zipped_folder(tmp_path / "c.zip", folder, more=more), r"2 scenes, .*b/meta.json, lod-meta.json"),
+        (zipped_folder(tmp_path / "d.zip", folder, more=bundle), r"0_0/meta.json, lod-meta.json"),
+        (zipped(tmp_path / "e.sog", {"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}), "2 scenes"),
+    ):
+        with pytest.raises(InputError, match=says):
+            csplat.read(path)
+    foldered(folder, other)
+    with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
+        csplat.read(folder)
+    assert COUNT == len(csplat.read(folder / "meta.json"))
+    assert 13 == len(csplat.read(folder / "lod-meta.json"))
+
+
+def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
+    path = levels(tmp_path, filenames=["0_0.sog", "0_1/meta.json", "1_0/meta.json"])
+    (path / "0_0" / "meta.json").unlink()
+    with pytest.raises(InputError, match=r"0_0.sog is a zip inside of a zip: unpack a.zip"):
+        csplat.read(zipped_folder(tmp_path / "a.zip", path))
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -17,6 +17,9 @@ from filed import filed
 
 import csplat
 from csplat.errors import InputError
+from csplat.formats import open_scene
+from csplat.scene import scene_of
+from csplat.turning import in_axes
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
 AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4, 6)
@@ -102,6 +105,18 @@ def test_a_file_of_two_gzip_members_is_read():
 def test_a_file_without_splats_is_read():
     assert 0 == len(filed(spz(4, [b""] * 6, degree=3)))
     assert 0 == len(filed(spz(3, [b""] * 6, degree=3)))
+
+
+def test_bands_above_those_asked_for_are_left_out(tmp_path):
+    parts = splats(4, degree=4)
+    (tmp_path / "a.spz").write_bytes(spz(4, parts, degree=4))
+    for degree in (3, 1):
+        coefficients = (degree + 1) ** 2 - 1
+        expected = np.frombuffer(parts[5], np.uint8).reshape(2, 24, 3)[:, :coefficients] / 128.0 - 1.0
+        with open_scene(tmp_path / "a.spz", sh_degree=degree) as scene:
+            assert (2, degree) == (scene.count, scene.facts.sh_degree)
+        read = in_axes(scene_of(csplat.read(tmp_path / "a.spz", sh_degree=degree)), "RUB").model()
+        assert np.array_equal(expected, read.shN)
 
 
 MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])

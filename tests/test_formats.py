@@ -1,6 +1,7 @@
 """Any format in, any format out: what is told apart, read in blocks, written, refused."""
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -117,3 +118,24 @@ def test_a_scene_in_memory_is_read_in_blocks(large):
     assert [BLOCK, 1000] == [len(one) for one in scene.blocks()]
     same(large, scene.model())
     assert 0 == len(Scene(0, scene.facts, lambda: iter(())).model())
+
+
+def test_scenes_in_a_zip_are_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for name in ("a/scene.ply", "__MACOSX/a/._scene.ply", "b.spz", "readme.txt"):
+            archive.writestr(name, "x")
+    with pytest.raises(InputError, match=r"a.zip is a zip that holds a/scene.ply, b.spz: unzip it"):
+        csplat.read(tmp_path / "a.zip")
+    (tmp_path / "b.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-30])
+    with pytest.raises(InputError, match="b.zip is a zip, and damaged"):
+        csplat.read(tmp_path / "b.zip")
+
+
+def test_fewer_bands_are_read_of_any_format(tmp_path, make_model):
+    model = make_model(40, 2)
+    for name in ("a.ply", "a.compressed.ply", "a.spz", "a.v4.spz", "a.sog", "a.glb", "a.csplat"):
+        csplat.write(tmp_path / name, model)
+        whole, part = csplat.read(tmp_path / name), csplat.read(tmp_path / name, sh_degree=1)
+        assert (2, 1) == (whole.sh_degree, part.sh_degree)
+        assert np.array_equal(whole.shN[:, :3], part.shN)
+        assert 1 == csplat.read(tmp_path / name, sh_degree=1).sh_degree

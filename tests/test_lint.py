@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
+import csplat
 from csplat.errors import InputError
+from csplat.formats import open_scene
 from csplat.ply import lint_ply, read_ply
+from csplat.ply_columns import alpha_of_logits
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 NAMES += [f"f_rest_{i}" for i in range(9)]
@@ -21,7 +26,7 @@ def good_rows(count=5, names=NAMES):
 
 
 def header(rows, *, kind="binary_little_endian", before=(), after=(), name="vertex", count=None):
-    types = {"f4": "float", "f8": "double", "i4": "int"}
+    types = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort"}
     lines = ["ply", f"format {kind} 1.0", *before]
     lines.append(f"element {name} {len(rows) if count is None else count}")
     lines += [f"property {types[rows.dtype[one].str[1:]]} {one}" for one in rows.dtype.names]
@@ -191,11 +196,225 @@ def test_sh_columns_with_a_gap_are_refused(path):
         read_ply(path)
 
 
-def test_degree_4_is_named(path):
+def test_degree_4_is_read_where_fewer_bands_are_asked_for(path):
     names = without(*(name for name in NAMES if name.startswith("f_rest")))
     rows = good_rows(names=[*names, *(f"f_rest_{i}" for i in range(72))])
     path.write_bytes(header(rows) + rows.tobytes())
-    with pytest.raises(InputError, match="SH degree 4, expected at most 3: --sh-degree 3"):
+    for read in (read_ply, csplat.read):
+        with pytest.raises(InputError, match=r"SH degree 4, expected at most 3: --sh-degree 3 .* leaves band 4 out"):
+            read(path)
+        with pytest.raises(InputError, match="sh_degree is 4, expected 0 to 3"):
+            read(path, sh_degree=4)
+    for degree, kept in ((3, 15), (1, 3), (0, 0)):
+        report = []
+        model = read_ply(path, sh_degree=degree, strict=True, keep_extra=True, report=report)
+        assert ({}, ("sh-bands", 72 - 3 * kept)) == (model.extra, (report[0].id, report[0].count))
+        for channel in range(3):
+            expected = [rows[f"f_rest_{24 * channel + band}"] for band in range(kept)]
+            assert np.array_equal(model.shN[:, :, channel], np.reshape(expected, (kept, 5)).T)
+        with open_scene(path, sh_degree=degree) as scene:
+            assert np.array_equal(model.shN, scene.model().shN)
+    assert "sh-bands" in [one.id for one in lint_ply(path, sh_degree=3)]
+
+
+def test_bands_are_left_out_of_any_file(path):
+    path.write_bytes(header(good_rows()) + good_rows().tobytes())
+    report = []
+    assert 0 == read_ply(path, sh_degree=0, strict=True, report=report).sh_degree
+    assert [] == report
+    assert 1 == csplat.read(path, sh_degree=2).sh_degree
+
+
+def renamed(rows, name_of):
+    copy = rows.copy()
+    copy.dtype.names = tuple(map(name_of, rows.dtype.names))
+    return copy
+
+
+@pytest.mark.parametrize(
+    "name_of",
+    [
+        lambda name: name if len(name) < 3 else f"scalar_{name}",
+        lambda name: name if len(name) < 3 else f"scalar_scal_{name}",
+        lambda name: name if len(name) < 3 else f"scal_{name}",
+        str.upper,
+    ],
+    ids=["CloudCompare", "3dgsconverter 0.1", "its columns", "capitals"],
+)
+def test_columns_are_found_by_the_names_of_other_programs(path, name_of):
+    plain, rows = good_rows(), renamed(good_rows(), name_of)
+    path.write_bytes(header(plain) + plain.tobytes())
+    expected = read_ply(path)
+    path.write_bytes(header(rows) + rows.tobytes())
+    report = []
+    model = read_ply(path, strict=True, report=report)
+    assert all(np.array_equal(getattr(expected, one), getattr(model, one)) for one in ARRAYS)
+    count = sum(name != name_of(name) for name in NAMES)
+    assert [("alias-columns", count, "note")] == [(one.id, one.count, one.kind) for one in report]
+
+
+def test_the_usual_name_is_read_and_the_other_is_named(path):
+    rows = good_rows(names=[*NAMES, "scalar_opacity"])
+    rows["scalar_opacity"] = 9.0
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert "scalar_opacity: there once more" in found(path)["second-columns"].text
+    assert np.array_equal(alpha_of_logits(rows["opacity"]), read_ply(path).opacities)
+
+
+def test_two_other_names_of_one_column_are_refused(path):
+    rows = good_rows(names=[*without("opacity"), "scalar_opacity", "Opacity"])
+    path.write_bytes(header(rows) + rows.tobytes())
+    with pytest.raises(InputError, match="scalar_opacity and Opacity would both be opacity: rename one"):
+        read_ply(path)
+
+
+COLOURS = ("red", "green", "blue")
+
+
+def coloured(kind, values, names=COLOURS, count=3):
+    plain = [name for name in NAMES if not name.startswith("f_")]
+    kinds = [(name, "<f4") for name in plain[:6]] + [(name, kind) for name in names]
+    rows = np.zeros(count, [*kinds, *((name, "<f4") for name in plain[6:])])
+    for name in ("x", "rot_0"):
+        rows[name] = 1
+    for name, value in zip(names, values, strict=True):
+        rows[name] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("kind", "largest", "names"),
+    [
+        ("|u1", 255, COLOURS),
+        ("<u2", 65535, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("<f4", 1, COLOURS),
+        ("<f8", 1, ("r", "g", "b")),
+    ],
+)
+def test_red_green_and_blue_stand_for_f_dc(path, kind, largest, names):
+    rows = coloured(kind, (0, largest, largest // 5), names)
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert ["rgb-colours"] == list(found(path))
+    expected = (np.array([0, 1, (largest // 5) / largest]) - 0.5) / 0.28209479177387814
+    model = read_ply(path, strict=True)
+    np.testing.assert_allclose(model.sh0, [expected] * 3, rtol=1e-6)
+    with open_scene(path) as scene:
+        assert np.array_equal(model.sh0, scene.model().sh0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "says"),
+    [
+        ("<f4", (0, 17, 255), "floats up to 255, expected 0 to 1"),
+        ("<i4", (0, 17, 255), "of type int32, int32, int32, expected uint8, uint16 or float"),
+    ],
+)
+def test_colours_of_another_range_are_refused(path, kind, values, says):
+    rows = coloured(kind, values)
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert "error" == found(path)["colour-columns"].kind
+    with pytest.raises(InputError, match=says):
+        read_ply(path)
+
+
+def test_f_dc_comes_before_red_green_and_blue(path):
+    rows = good_rows(names=[*NAMES, *COLOURS])
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert np.array_equal(rows["f_dc_1"], read_ply(path).sh0[:, 1])
+    assert "red, green, blue are no property of splats" in found(path)["extra-columns"].text
+
+
+def test_the_filter_of_mip_splatting_is_fused(path):
+    rng = np.random.default_rng(1)
+    rows = good_rows(200, [*NAMES, "filter_3D"])
+    for name in ("f_dc_0", "opacity", "scale_0", "scale_1", "scale_2"):
+        rows[name] = rng.normal(-3, 2, 200)
+    rows["filter_3D"] = rng.uniform(0.001, 0.2, 200)
+    rows["filter_3D"][:20] = 0
+    rows["filter_3D"][20] = np.nan
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert {"filter-3d": 179, "nonfinite-rows": 1} == {one.id: one.count for one in found(path).values()}
+    # create_fused_ply.py: sqrt(s^2 + f^2), and opacity * sqrt(prod s^2 / prod (s^2 + f^2))
+    rows = rows[~np.isnan(rows["filter_3D"])]
+    squares = np.exp(np.stack([rows[f"scale_{axis}"] for axis in range(3)], 1).astype(float)) ** 2
+    fused = squares + rows["filter_3D"].astype(float)[:, None] ** 2
+    alphas = 1 / (1 + np.exp(-rows["opacity"].astype(float)))
+    model = read_ply(path, keep_extra=True)
+    np.testing.assert_allclose(model.scales, np.log(np.sqrt(fused)), atol=1e-6)
+    np.testing.assert_allclose(
+        model.opacities, alphas * np.sqrt(squares.prod(1) / fused.prod(1)), rtol=1e-6
+    )  # fmt: skip
+    assert np.array_equal(rows["scale_1"][:20], model.scales[:20, 1])
+    assert np.array_equal(alpha_of_logits(rows["opacity"][:20]), model.opacities[:20])
+    assert ({}, False) == (model.extra, model.antialiased)
+    with open_scene(path) as scene:
+        assert np.array_equal(model.opacities, scene.model().opacities)
+
+
+def test_extreme_filters_stay_finite(path):
+    rows = good_rows(4, [*NAMES, "filter_3D"])
+    for name in ("scale_0", "scale_1", "scale_2"):
+        rows[name] = [-80, 80, -80, 0]
+    rows["filter_3D"] = [1e38, 1e-45, -1e-30, -1]
+    path.write_bytes(header(rows) + rows.tobytes())
+    model = read_ply(path)
+    np.testing.assert_allclose(model.scales[:, 0], [np.log(1e38), 80, np.log(1e-30), np.log(2) / 2], rtol=1e-6)
+    assert (0, alpha_of_logits(rows["opacity"])[1]) == (model.opacities[0], model.opacities[1])
+    np.testing.assert_allclose(model.opacities[3], alpha_of_logits(rows["opacity"])[3] / 2**1.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "noted"),
+    [
+        ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
+        ({"opacity": (-0.1, 1)}, set()),
+        ({"scale_0": (1e-3, 0.1), "scale_1": (1e-3, 2), "scale_2": (1e-3, 0.1)}, {"scales-are-linear"}),
+        ({"f_dc_0": (0, 1), "f_dc_1": (0, 1), "f_dc_2": (0, 1)}, {"colours-are-rgb"}),
+        ({"f_dc_0": (0, 255), "f_dc_1": (0, 255), "f_dc_2": (0, 255)}, {"colours-are-rgb"}),
+    ],
+)
+def test_values_after_their_activation_are_noted(path, changes, noted):
+    for count in (40, 8):
+        rows = good_rows(count)
+        for name in NAMES:
+            if name.startswith(("f_dc", "scale", "opacity")):
+                rows[name] = np.linspace(-5, 3, count)
+        for name, (low, high) in changes.items():
+            rows[name] = np.linspace(low, high, count)
+        path.write_bytes(header(rows) + rows.tobytes())
+        assert (noted if count == 40 else set()) == set(found(path))
+        read_ply(path, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("names", "after", "says"),
+    [
+        (["x", "y", "z", *COLOURS], [], r"but a point cloud \(it has x, y, z, red, green, blue\): csplat train"),
+        (["x", "y", "z"], ["element face 0", "property list uchar int vertex_indices"], "but a mesh"),
+        (["x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity"], [], "but anchors of Scaffold-GS"),
+        ([*without("scale_0", "scale_1", "scale_2"), "scale_x"], [], "no column scale_0, scale_1, scale_2.* it has x"),
+    ],
+)
+def test_what_is_no_splats_is_named(path, names, after, says):
+    rows = good_rows(names=names)
+    path.write_bytes(header(rows, after=after) + rows.tobytes())
+    with pytest.raises(InputError, match=says):
+        read_ply(path)
+
+
+def test_columns_of_moving_splats_are_named(path):
+    rows = good_rows(names=[*NAMES, "motion_0", "trbf_center"])
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert "motion_0, trbf_center are no property of splats: dropped; the file holds splats that move" in (
+        found(path)["extra-columns"].text
+    )
+
+
+def test_commas_in_numbers_are_named(path):
+    rows = good_rows(2)
+    lines = [" ".join(map(str, row)).replace(".", ",") for row in rows.tolist()]
+    path.write_bytes(header(rows, kind="ascii") + "\n".join(lines).encode() + b"\n")
+    with pytest.raises(InputError, match="row 0 of vertex: malformed input; it has a comma, expected a point"):
         read_ply(path)
 
 

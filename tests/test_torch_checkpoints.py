@@ -128,6 +128,18 @@ def test_colours_that_splatfacto_trained_without_sh_are_logits(no_torch, make_mo
     assert (found[0].means == found[1].means).all()
 
 
+def test_bands_above_those_asked_for_are_left_out(no_torch, make_model):
+    splats = made_splats(make_model, 3)
+    many = tensor(np.concatenate([splats["shN"], np.ones((5, 9, 3), np.float32)], axis=1))
+    for said in ({"splats": {**splats, "shN": many}}, of_splatfacto({**splats, "shN": many})):
+        no_torch(lambda *_, said=said, **__: said)
+        with pytest.raises(InputError, match=r"shN is of SH degree 4, expected at most 3: --sh-degree 3 of csplat"):
+            csplat.read(STORED["gsplat.pt"])
+        for degree in (3, 1):
+            read = csplat.read(STORED["gsplat.pt"], sh_degree=degree)
+            assert np.array_equal(splats["shN"][:, : (degree + 1) ** 2 - 1], read.shN)
+
+
 def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model):
     splats = made_splats(make_model, 1)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)

@@ -18,13 +18,32 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["DAMAGED", "Archive", "read_archive"]
+__all__ = ["DAMAGED", "Archive", "read_archive", "zip_refusal"]
 
 #: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
 #: sizes that no array has, OSError for places outside the file and broken bz2.
 DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
             SyntaxError, OSError, struct.error, tokenize.TokenError, lzma.LZMAError, zlib.error,
             zipfile.BadZipFile)  # fmt: skip
+
+
+#: Endings of the files of scenes, which somebody may have put into a zip.
+_SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt")
+_NAMED = 5  # of them, that a message names
+
+
+def zip_refusal(path: Path) -> str:
+    """Say of a zip that is no scene itself which scenes lie in it."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if not name.startswith("__MACOSX/")]
+    except DAMAGED:
+        return f"{path.name} is a zip, and damaged: copy or download it again"
+    scenes = [name for name in names if name.lower().endswith(_SCENES)]
+    if not scenes:
+        return f"{path.name} is a zip that holds no scene: {textwrap.shorten(', '.join(names), 120) or 'nothing'}"
+    shown = ", ".join(scenes[:_NAMED]) + (f" and {len(scenes) - _NAMED} more" if len(scenes) > _NAMED else "")
+    return f"{path.name} is a zip that holds {shown}: unzip it, and name the scene"
 
 
 class Archive(dict[str, NDArray[Any]]):

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
+from csplat.archives import zip_refusal
 from csplat.errors import InputError
 
 __all__ = [
@@ -138,7 +139,9 @@ def _by_magic(path: Path, head: bytes) -> tuple[str, str] | None:
             return _BY_SUFFIX[".spz"]
         return ("gzip", "gunzip")
     if head[:4] == b"PK\x03\x04":
-        return _BY_SUFFIX[".sog"] if zip_holds_meta(path) else ("zip", "unzip")
+        if not zip_holds_meta(path):
+            raise InputError(zip_refusal(path))
+        return _BY_SUFFIX[".sog"]
     if head[:4] == b"glTF":
         return _BY_SUFFIX[".glb"]
     if path.name == "meta.json":

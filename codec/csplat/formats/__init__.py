@@ -240,14 +240,15 @@ def _opened(found: Format, path: Path, level: int = 0, sh_degree: int | None = N
         opened = found.open_bands(path, sh_degree)
     else:
         opened = found.open(path)
-    with opened as scene:
-        if sh_degree is not None and sh_degree < scene.facts.sh_degree:
-            scene = _without_bands(scene, sh_degree)
+    with opened as every_band:
+        scene = every_band if sh_degree is None else _without_bands(every_band, sh_degree)
         placed = in_axes(scene, USUAL) if found.axes else scene
         yield replace(placed, format=found.name)
 
 
 def _without_bands(scene: Scene, sh_degree: int) -> Scene:
+    if sh_degree >= scene.facts.sh_degree:
+        return scene
     return replace(
         scene,
         facts=without_bands(scene.facts, sh_degree),

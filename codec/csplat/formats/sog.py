@@ -86,7 +86,7 @@ def _streamed(parts: Parts, meta: Json, level: int) -> Scene:
         ranges[meta["environment"].text()] = None
     units: list[tuple[Unit, list[tuple[int, int]]]] = []
     for name, wanted in ranges.items():
-        unit = unit_of(*parts_at(parts.file(name), f"{parts.title}: {name}"))
+        unit = unit_of(*parts.inner(name))
         taken = [(0, unit.count)] if wanted is None else wanted
         if taken[-1][1] > unit.count:
             parts.refuse(f"splats up to {taken[-1][1]:,} of {name} are wanted, it has {unit.count:,}")

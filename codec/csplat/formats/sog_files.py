@@ -6,6 +6,7 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
@@ -21,6 +22,9 @@ __all__ = ["Json", "Parts", "parts_at", "picture_of"]
 _LARGEST_JSON = 1 << 25
 _LARGEST_PART = 1 << 30
 _LONGEST_NAME = 200
+_ONE, _LEVELS = "meta.json", "lod-meta.json"  # what says of one scene, and of one in levels, what its parts are
+_OF_MACOS = "__MACOSX"  # a folder in zips that macOS makes, of what belongs to no file
+_NAMED = 5  # scenes that a message names
 _EXPANSION = 4  # of a part in a zip: pictures and short texts do not deflate to less
 _FREE = 1 << 20  # bytes that may come out of a zip whatever is in it
 
@@ -38,6 +42,21 @@ class Parts:
     path: Path
     title: str
     folder: PurePosixPath | None = None
+
+    def inner(self, name: str) -> tuple[Parts, str]:
+        """Find the parts of a SOG that is a part of this one, and the name of its JSON, as `parts_at` does.
+
+        Raises:
+            InputError: it is not there, or its name leads out of the folder.
+            OSError: it cannot be read.
+        """
+        title = f"{self.title}: {name[:80]}"
+        if self.folder is None:
+            return parts_at(self.file(name), title)
+        place = self._inside(name)
+        if place.suffix.lower() != ".json":
+            self.refuse(f"{name[:80]} is a zip inside of a zip: unpack {self.title} and name its {_LEVELS}")
+        return Parts(self.path, title, self.folder / place.parent), place.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
         """The bytes of a part.
@@ -153,22 +172,49 @@ def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
     """
     title = title or path.name
     if path.is_dir():
-        names = [name for name in ("meta.json", "lod-meta.json") if (path / name).is_file()]
-        if not names:
-            Parts(path, title).refuse("a folder without meta.json, no SOG")
-        return Parts(path, title), names[0]
+        found = [PurePosixPath(name) for name in (_ONE, _LEVELS) if (path / name).is_file()]
+        if not found:
+            Parts(path, title).refuse(f"a folder without {_ONE}, no SOG")
+        return Parts(path, title), str(_only_scene(Parts(path, title), found))
     with path.open("rb") as stream:
         zipped = stream.read(2) == b"PK"
     if not zipped:
         return Parts(path.parent, title), path.name
     try:
         with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if PurePosixPath(name).name == "meta.json"]
+            found = [one for one in map(PurePosixPath, archive.namelist()) if _is_manifest(one)]
     except DAMAGED as error:
         Parts(path, title).refuse(f"a damaged zip: {' '.join(str(error).split())[:120] or type(error).__name__}")
-    if not names:
-        Parts(path, title).refuse("a zip without meta.json, no SOG")
-    return Parts(path, title, PurePosixPath(min(names, key=len)).parent), "meta.json"
+    if not found:
+        Parts(path, title).refuse(f"a zip without {_ONE}, no SOG")
+    only = _only_scene(Parts(path, title, PurePosixPath()), found)
+    return Parts(path, title, only.parent), only.name
+
+
+def _is_manifest(place: PurePosixPath) -> bool:
+    return place.name in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
+
+
+def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
+    """Choose the JSON of the scene: the one that is no part of another, of which there has to be one alone.
+
+    Args:
+        parts: the folder, or all of the zip.
+        found: each `meta.json` and `lod-meta.json`, by its place there.
+    """
+    inside: set[PurePosixPath] = set()
+    for one in found if len(found) > 1 else ():
+        if one.name == _LEVELS:
+            said = parts.json(str(one)).value
+            named = said.get("filenames") if isinstance(said, dict) else None
+            names = [*named, said.get("environment")] if isinstance(named, list) else []
+            inside |= {one.parent / name for name in names if isinstance(name, str)}
+    scenes = [one for one in found if one not in inside]
+    if len(scenes) == 1:
+        return scenes[0]
+    shown = ", ".join(str(one)[:80] for one in sorted(scenes)[:_NAMED]) + (", ..." if len(scenes) > _NAMED else "")
+    remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
+    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({shown}): {remedy}")
 
 
 def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:
