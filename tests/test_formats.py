@@ -127,7 +127,7 @@ def test_scenes_in_a_zip_are_named(tmp_path):
     with pytest.raises(InputError, match=r"a.zip is a zip that holds a/scene.ply, b.spz: unzip it"):
         csplat.read(tmp_path / "a.zip")
     (tmp_path / "b.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-30])
-    with pytest.raises(InputError, match="b.zip is a zip, and damaged"):
+    with pytest.raises(InputError, match=r"b\.zip is a zip, and damaged"):
         csplat.read(tmp_path / "b.zip")
 
 

@@ -271,7 +271,12 @@ def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) 
 
 
 def _wider(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
-    """The least and the largest of what was seen before and of some values."""
+    """Return the least and the largest of what was seen before and of some values.
+
+    Below 0 is nothing that was activated: from there on nobody looks.
+    """
+    if bounds[0] < 0.0:
+        return bounds
     return min(bounds[0], float(values.min(initial=math.inf))), max(bounds[1], float(values.max(initial=-math.inf)))
 
 

@@ -119,7 +119,7 @@ def _open(path: Path) -> Iterator[Scene]:
             own = bounds[start // _CHUNK : -(-stop // _CHUNK)]
             yield replace(facts, **_unpacked(words, own, coefficients, rest))
 
-    yield Scene(vertex.count, facts, blocks)
+    yield Scene(vertex.count, facts, blocks, [*said.findings])
 
 
 def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:

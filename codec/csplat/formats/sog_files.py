@@ -210,8 +210,12 @@ def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
             names = [*named, said.get("environment")] if isinstance(named, list) else []
             inside |= {one.parent / name for name in names if isinstance(name, str)}
     scenes = [one for one in found if one not in inside]
-    if len(scenes) == 1:
-        return scenes[0]
+    if len(scenes) != 1:
+        _refuse_several(parts, scenes)
+    return scenes[0]
+
+
+def _refuse_several(parts: Parts, scenes: Sequence[PurePosixPath]) -> NoReturn:
     shown = ", ".join(str(one)[:80] for one in sorted(scenes)[:_NAMED]) + (", ..." if len(scenes) > _NAMED else "")
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
     parts.refuse(f"it holds {len(scenes)} scenes, expected one ({shown}): {remedy}")

@@ -37,7 +37,7 @@ def lint(
     Notes are ordinary variation. Repairs are what encoding repairs by
     itself and `encode --strict` refuses; errors cannot be repaired without
     guessing. The status is 1 where there are repairs or errors; with --fix,
-    where there are errors.
+    where there are errors. A file of SH degree 4 wants --sh-degree.
 
     Examples:
       csplat lint scene.ply

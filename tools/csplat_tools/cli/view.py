@@ -61,7 +61,7 @@ def view(
         wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
-            out.findings([one for one in scene.findings if one.kind == "repair"])
+            out.findings(scene.findings)
             out.remark(*_encoded(scene, preset))
             out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
@@ -104,7 +104,7 @@ def export_html(
         wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
         exported = export.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
-        out.findings([one for one in scene.findings if one.kind == "repair"])
+        out.findings(scene.findings)
         out.remark(*_encoded(scene, preset))
     out.remark(
         f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
