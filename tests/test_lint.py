@@ -410,6 +410,13 @@ def test_columns_of_moving_splats_are_named(path):
     )
 
 
+def test_elements_that_move_splats_are_named(path):
+    rows = good_rows()
+    path.write_bytes(header(rows, after=["element delta_vertex_0 1", "property float x"]) + rows.tobytes() + bytes(4))
+    assert "of which the first moment is kept" in found(path)["other-elements"].text
+    assert 5 == len(read_ply(path))
+
+
 def test_commas_in_numbers_are_named(path):
     rows = good_rows(2)
     lines = [" ".join(map(str, row)).replace(".", ",") for row in rows.tolist()]

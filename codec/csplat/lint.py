@@ -323,7 +323,7 @@ def too_many_bands(degree: int) -> str:
     bands = f"band {degree}" if degree == MAX_SH_DEGREE + 1 else f"bands {MAX_SH_DEGREE + 1} to {degree}"
     return (
         f"SH degree {degree}, expected at most {MAX_SH_DEGREE}: --sh-degree {MAX_SH_DEGREE} of csplat encode, convert,"
-        f" lint and render, or sh_degree={MAX_SH_DEGREE} of csplat.read, leaves {bands} out"
+        f" finetune, lint and render, or sh_degree={MAX_SH_DEGREE} of csplat.read, leaves {bands} out"
     )
 
 

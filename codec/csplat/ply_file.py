@@ -25,6 +25,7 @@ from csplat.ply_columns import Rows
 __all__ = ["Content", "blocks_of", "parse"]
 
 _ELEMENT = "vertex"
+_FRAME = "delta_vertex_"  # of Brush: what later moments add to the first
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)")
 _MAX_HEADER_SIZE = 1 << 20
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
@@ -83,6 +84,8 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
     others = [element.name for element in parsed if element.name != _ELEMENT]
     if others:
         text = f"elements besides {_ELEMENT}: {', '.join(others)}: dropped"
+        if any(name.startswith(_FRAME) for name in others):
+            text += "; they move the splats, of which the first moment is kept"
         findings.append(Finding("other-elements", len(others), text, "repair"))
     rows, lists = _scalars(parsed[_ELEMENT].data)
     if lists:

@@ -25,6 +25,7 @@ from csplat_tools.cli.options import (
 from csplat_tools.cli.parsing import parse_bytes, parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Near, Views, Virtual
+from csplat_tools.files.by_disk import read_degree
 from csplat_tools.files.convert import read_source
 from csplat_tools.files.extras import need_trainer
 from csplat_tools.files.streams import check_name
@@ -152,7 +153,8 @@ def finetune(
     out.check(output, inputs=(*inputs, resume), named=named)
     check_name(output, ".csplat", "finetune", source)
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
-    read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra)
+    degree = read_degree(encoder)
+    read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra, sh_degree=degree)
     out.findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
     aside_count = aside or tuning.usually_aside(given["count"], cameras=views.cameras, data=views.data)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from csplat import formats
 from csplat.decoder import decode, open_tiles
 from csplat.files import read_array
+from csplat.model import MAX_SH_DEGREE
 from csplat_conformance.stated import Proof, Source, fits_memory, prove, prove_by_disk
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.files.console import Progress
@@ -94,9 +95,10 @@ def _proved(
 ) -> Proof:
     opened = open_tiles(data)
     header, stated = opened.header, opened.stated_errors
+    degree = MAX_SH_DEGREE  # of a file of more bands none above can have been encoded, and errors are of the others
     with source_path(source) as local:
         if fits_memory(opened, stated.source_count if stated else 0, size_of(local), memory_bytes):
-            model = formats.read(local, keep_extra=bool(header.extras))
+            model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
             return prove(Source.of(model), decode(data), header, stated, rows, progress=progress)
-        with formats.open_scene(local) as scene:
+        with formats.open_scene(local, sh_degree=degree) as scene:
             return prove_by_disk(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)
