@@ -1,9 +1,11 @@
 """Camera files and paths of cameras."""
 
 import json
+import math
 
 import numpy as np
 import pytest
+from tables import failures
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera
@@ -115,3 +117,96 @@ def test_the_central_camera_stands_and_looks_as_most_do():
     aside = look_at((0, 0, 0), (5, 0, 0), (0, -1, 0), K, 64, 48)
     assert row[2] is central_camera([aside, *row])
     assert row[0] is central_camera(row[:1])
+
+
+def standing(**fields):
+    """Return a camera of INRIA at 1 2 3 that looks along x, z up: 64 by 48 pixels, focal length 50; or else."""
+    inria = {"position": [1, 2, 3], "rotation": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], "fx": 50.0, "fy": 50.0}
+    return {"id": 0, "img_name": "a.png", "width": 64, "height": 48, **inria, **fields}
+
+
+OPENGL = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
+ENTRY = {
+    "camera_to_world": [value for row in OPENGL for value in row],
+    "fov": math.degrees(2 * math.atan(24 / 50)),
+    "aspect": 4 / 3,
+}
+NERFSTUDIO = {"camera_type": "perspective", "render_width": 64, "render_height": 48, "camera_path": [ENTRY], "fps": 24}
+FRAME = {"file_path": "images/a.png", "transform_matrix": OPENGL}
+TRANSFORMS = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [FRAME]}
+
+#: Files of other programs that hold this camera, its principal point, and a word of the report.
+FOREIGN = {
+    "INRIA": ([standing()], (32, 24), "INRIA"),
+    "nerfstudio": (NERFSTUDIO, (32, 24), "nerfstudio"),
+    "nerfstudio, by rows": ({**NERFSTUDIO, "camera_path": [{**ENTRY, "camera_to_world": OPENGL}]}, (32, 24), "path"),
+    "transforms": (TRANSFORMS, (32, 24), "transforms.json"),
+    "own fields of a frame": (
+        {"frames": [{**FRAME, "w": 64, "h": 48, "camera_angle_x": 2 * math.atan(32 / 50), "cx": 30, "cy": 20}]},
+        (30, 20),
+        "1 camera",
+    ),
+    "a scaled world": (
+        {**TRANSFORMS, "frames": [{"transform_matrix": (np.array(OPENGL) * [[2, 2, 2, 1]]).tolist()}]},
+        (32, 24),
+        "1 pose scaled",
+    ),
+    "distortion": ({**TRANSFORMS, "k1": 0.1}, (32, 24), "the distortion of its lens is left out"),
+}
+
+
+def test_camera_files_of_other_programs_are_read(tmp_path):
+    wanted = look_at([1, 2, 3], [2, 2, 3], UP, K, 64, 48).viewmat
+
+    def check(case):
+        document, middle, word = case
+        (tmp_path / "c.json").write_text(json.dumps(document))
+        report = []
+        (camera,) = load_cameras(tmp_path / "c.json", report)
+        assert np.allclose(wanted, camera.viewmat)
+        assert np.allclose([50.0, 50.0, *middle], [camera.K[0, 0], camera.K[1, 1], *camera.K[:2, 2]])
+        assert (64, 48) == (camera.W, camera.H)
+        assert any(word in line for line in report)
+
+    assert [] == failures(FOREIGN, check)
+
+
+#: Files that are wrong, and what the error says.
+WRONG = {
+    "INRIA, no focal length": ([standing(), standing(fx=None)], "camera 1: fx is None, expected a number"),
+    "INRIA, no position": ([standing(position=None)], "camera 0: rotation and position have other shapes"),
+    "INRIA, another entry": ([standing(), {"K": 1}], "camera 1: width is None"),
+    "INRIA, no rotation": (
+        [standing(rotation=[[1, 1, 1]] * 3)],
+        "camera 0: the camera's viewmat does not begin",
+    ),
+    "INRIA, no object": ([standing(), 3], "camera 1 is int, expected an object"),
+    "nerfstudio, panorama": ({**NERFSTUDIO, "camera_type": "equirectangular"}, "camera_type is equirectangular"),
+    "nerfstudio, no size": ({**NERFSTUDIO, "render_width": None}, "camera_path 0: render_width is None"),
+    "nerfstudio, angle": ({**NERFSTUDIO, "camera_path": [{**ENTRY, "fov": 200}]}, "fov is 200, expected degrees"),
+    "nerfstudio, empty": ({**NERFSTUDIO, "camera_path": []}, "lists no cameras"),
+    "transposed": (
+        {**NERFSTUDIO, "camera_path": [{**ENTRY, "camera_to_world": np.transpose(OPENGL).ravel().tolist()}]},
+        "camera_to_world has the last row 1 2 3 1, expected 0 0 0 1: .* transposed",
+    ),
+    "transforms, no size": ({"camera_angle_x": 0.8, "frames": [FRAME]}, "frame 0: w and h are missing, .*--data"),
+    "transforms, fisheye": ({**TRANSFORMS, "is_fisheye": True}, "frame 0: camera_model is a fisheye"),
+    "transforms, no matrix": ({**TRANSFORMS, "frames": [{}]}, "frame 0: transform_matrix has shape"),
+    "ours, transposed": (
+        [{"K": K.tolist(), "viewmat": np.transpose(OPENGL).tolist(), "W": 640, "H": 480}],
+        "camera 0: the camera's viewmat has the last row 1 2 3 1, expected 0 0 0 1: .* transposed",
+    ),
+    "no pixels": ([standing(fx=0.8, fy=1.0)], "camera 0: the focal length across is 0.8 for 64 pixels, expected 3.2"),
+    "swapped": ({**TRANSFORMS, "cx": 24, "cy": 32}, "camera 0: the principal point is 24 32 in 64×48 pixels, expected"),
+    "another object": ({"cameras": []}, "expected a list of {K, viewmat, W, H}, cameras.json of INRIA"),
+}
+
+
+def test_faults_of_camera_files_name_the_camera_and_the_field(tmp_path):
+    def check(case):
+        document, says = case
+        (tmp_path / "c.json").write_text(json.dumps(document))
+        with pytest.raises(InputError, match=says):
+            load_cameras(tmp_path / "c.json")
+
+    assert [] == failures(WRONG, check)

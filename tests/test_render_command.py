@@ -164,6 +164,23 @@ def test_nothing_is_replaced_without_force(ply, cameras, tmp_path):
     assert (48, 64, 3) == pixels(tmp_path / "out" / "right.png").shape
 
 
+def test_a_camera_file_of_another_program_is_reported(ply, tmp_path):
+    rotation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    entry = {
+        "img_name": "a",
+        "width": 64,
+        "height": 48,
+        "position": [0, 0, -4],
+        "rotation": rotation,
+        "fx": 60,
+        "fy": 60,
+    }
+    (tmp_path / "inria.json").write_text(json.dumps([entry]))
+    told = call("render", ply, "--cameras", tmp_path / "inria.json", "-o", tmp_path / "out")
+    assert "cameras.json of INRIA: 1 camera" in told
+    assert ["a.png"] == names(tmp_path / "out")
+
+
 def test_a_distorting_size_is_refused(ply, cameras, tmp_path):
     pytest.importorskip("numba", reason="the renderer needs numba")
     assert "distorted" in refused("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--size", "64x64")

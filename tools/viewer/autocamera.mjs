@@ -63,6 +63,11 @@ export function readCamera(entry) {
   const { K, viewmat, W, H, near } = /** @type {Record<string, any>} */ (entry ?? {});
   const k = numbers(K, 3, 'K');
   const m = numbers(viewmat, 4, 'viewmat');
+  if (m.slice(12).join() !== '0,0,0,1') {
+    throw new TypeError(
+      `the viewmat of a camera has the last row ${m.slice(12).join(' ')}, expected 0 0 0 1: transposed?`,
+    );
+  }
   if (!(W >= 1 && H >= 1 && k[0] > 0 && k[4] > 0)) throw new TypeError('a camera has no size or no focal length');
   const rows = [0, 4, 8].map((at) => /** @type {Vec3} */ (m.slice(at, at + 3)));
   const bent = rows.some((a, i) => rows.some((b, j) => Math.abs(dot(a, b) - Number(i === j)) > ROTATION_TOLERANCE));

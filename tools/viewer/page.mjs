@@ -1,5 +1,6 @@
 // What the address of the page asks for, and what a page that carries its scene has inside.
 
+import { ownCameras } from './camera_forms.mjs';
 import { unitDirection } from './vectors.mjs';
 
 /**
@@ -77,7 +78,7 @@ export function readWishes(query) {
  * Get the cameras that the address names.
  *
  * @param {string} text JSON, or where it lies
- * @returns {Promise<unknown[]>}
+ * @returns {Promise<unknown[]>} entries of a camera file
  */
 export async function fetchCameras(text) {
   let json = text;
@@ -86,8 +87,7 @@ export async function fetchCameras(text) {
     if (!response.ok) throw new Error(`${text}: HTTP status ${response.status}`);
     json = await response.text();
   }
-  const value = JSON.parse(json);
-  return Array.isArray(value) ? value : [value];
+  return ownCameras(JSON.parse(json));
 }
 
 /**

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["DEFAULT_NEAR", "MAX_IMAGE_SIZE", "Camera"]
+__all__ = ["DEFAULT_NEAR", "MAX_IMAGE_SIZE", "Camera", "check_last_row"]
 
 F64 = NDArray[np.float64]
 
@@ -101,6 +101,25 @@ class Camera:
         return cls(entry["K"], entry["viewmat"], entry["W"], entry["H"], near, image)
 
 
+def check_last_row(pose: F64, name: str) -> None:
+    """Check that a pose moves points and does nothing else; one that is written by columns is recognised.
+
+    Args:
+        pose: [4, 4].
+        name: of the field, and where it stands.
+
+    Raises:
+        InputError: its last row is not 0 0 0 1.
+    """
+    wanted = (0.0, 0.0, 0.0, 1.0)
+    if (pose[3] == wanted).all():
+        return
+    found = " ".join(f"{value:g}" for value in pose[3])
+    by_columns = (pose[:, 3] == wanted).all()
+    hint = ": its last column is that, so it is transposed" if by_columns else ""
+    raise InputError(f"{name} has the last row {found}, expected 0 0 0 1{hint}")
+
+
 def _matrix(name: str, value: ArrayLike, size: int) -> F64:
     try:
         matrix = np.array(value, np.float64)
@@ -141,8 +160,7 @@ def _check_intrinsics(K: F64) -> None:
 
 def _check_pose(viewmat: F64) -> None:
     R = viewmat[:3, :3]
-    if (viewmat[3] != (0.0, 0.0, 0.0, 1.0)).any():
-        raise InputError("the camera's viewmat has a last row other than 0 0 0 1")
+    check_last_row(viewmat, "the camera's viewmat")
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(R @ R.T - np.eye(3)).max()
         proper = np.linalg.det(R) > 0.0

@@ -1,7 +1,7 @@
 """Camera files, and cameras on a path: looking at a point, orbiting around it.
 
 A camera file is a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes,
-pixel centres at +0.5; `near` and `image` may be left out.
+pixel centres at +0.5; `near` and `image` may be left out. Files of other programs are read too: `camera_forms`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
+from csplat.files import read_text
 from csplat_render.camera import DEFAULT_NEAR, Camera
+from csplat_render.camera_forms import check_intrinsics, foreign_cameras
 
 __all__ = ["central_camera", "intrinsics", "load_cameras", "look_at", "orbit", "relative_to", "resized", "save_cameras"]
 
@@ -25,11 +27,12 @@ F64 = NDArray[np.float64]
 _PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
 
 
-def load_cameras(path: str | Path) -> list[Camera]:
+def load_cameras(path: str | Path, report: list[str] | None = None) -> list[Camera]:
     """Read a camera file.
 
     Args:
         path: a JSON file, see above.
+        report: takes lines on how the file of another program was understood.
 
     Returns:
         Its cameras, at least one.
@@ -39,13 +42,25 @@ def load_cameras(path: str | Path) -> list[Camera]:
     """
     path = Path(path)
     try:
-        entries = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:  # JSON and UTF-8 errors alike
+        entries = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a JSON file: {error}") from error
+    cameras = foreign_cameras(entries, str(path), [] if report is None else report)
+    if cameras is None:
+        cameras = _own_cameras(entries, path)
+    for number, camera in enumerate(cameras):
+        K = camera.K
+        focals, middle = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
+        check_intrinsics(focals, middle, (camera.W, camera.H), f"{path}, camera {number}")
+    return cameras
+
+
+def _own_cameras(entries: object, path: Path) -> list[Camera]:
     if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path} is not a camera file, wanted a list of {{K, viewmat, W, H}}")
+        raise InputError(
+            f"{path} is not a camera file, expected a list of {{K, viewmat, W, H}}, cameras.json of INRIA, a camera "
+            "path of nerfstudio, or transforms.json"
+        )
     cameras = []
     for number, entry in enumerate(entries):
         try:

@@ -77,6 +77,8 @@ def render(
     film repeats for ever; WebP loses a little, GIF has 256 colours, PNG loses
     nothing. MP4 is H.264 and wants the film extra. Cameras stand relative to
     the scene's origin, those of a data set where its pictures were taken.
+    Camera files are our own, INRIA's cameras.json, camera paths of nerfstudio,
+    and transforms.json.
     An orbit shows an object whole; inside of a room it goes where fine splats
     are to be seen, or beside the cameras that you name. Needs the packages of
     the render extra.
@@ -107,7 +109,9 @@ def render(
     read = load_model(source, sh_degree=sh_degree)
     out.findings(read.findings)
     model = upright.upright().applied(read.model)
-    cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split)
+    report: list[str] = []
+    cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split, report=report)
+    out.remark(*report)
     if orbit is not None:
         upright.seeming(seeming_up(model), out)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)

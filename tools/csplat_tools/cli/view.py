@@ -25,7 +25,7 @@ from csplat_tools.present.viewing import ViewScene, open_scene, seeming_wishes, 
 __all__ = ["export_element", "export_html", "view"]
 
 _Cameras = Annotated[
-    str | None, typer.Option(metavar="FILE.json", help="Look from these cameras: a list of {K, viewmat, W, H, near}.")
+    str | None, typer.Option(metavar="FILE.json", help="Look from these cameras, see `csplat render`.")
 ]
 
 
@@ -54,7 +54,9 @@ def view(
       csplat view scene.csplat --no-browser --port 8000
     """
     out.check(inputs=(source, cameras))
-    wishes = view_wishes(cameras, upright.upright())
+    report: list[str] = []
+    wishes = view_wishes(cameras, upright.upright(), report)
+    out.remark(*report)
     with ExitStack() as stack:
         with out.bar() as progress:
             scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
@@ -95,7 +97,9 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    wishes = view_wishes(cameras, upright.upright())
+    report: list[str] = []
+    wishes = view_wishes(cameras, upright.upright(), report)
+    out.remark(*report)
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
     with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:

@@ -52,6 +52,7 @@ def find_cameras(
     size: tuple[int, int] | None = None,
     *,
     split: Split = "test",
+    report: list[str] | None = None,
 ) -> list[Camera]:
     """Get the cameras that a command line names: a file's, a data set's, or those of an orbit.
 
@@ -62,6 +63,7 @@ def find_cameras(
         data: a data set, whose size counts, not `size`, unless there is an orbit.
         size: width and height of the pictures; the file's own, or 640 by 480, if left out.
         split: of a data set: which of its cameras.
+        report: takes lines on how the camera file of another program was understood.
 
     Raises:
         InputError: none of the three is given, or both a file and a set; the file or the set is none; a picture of that
@@ -71,7 +73,7 @@ def find_cameras(
         raise InputError("wanted the cameras: a file of them, a data set, or a number for an orbit")
     cameras: list[Camera] = []
     if path is not None:
-        cameras = load_cameras(path)
+        cameras = load_cameras(path, report)
     elif data is not None:
         shots = (
             data if orbit_count is None else replace(data, size=None)

@@ -77,13 +77,13 @@ def open_scene(path: str, *, preset: PresetName, progress: Progress | None = Non
         yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
 
 
-def view_wishes(camera: str | None, facts: SceneOverrides = _NONE) -> dict[str, str]:
+def view_wishes(camera: str | None, facts: SceneOverrides = _NONE, report: list[str] | None = None) -> dict[str, str]:
     """Put options into words that the page understands.
 
     Args:
-        camera: a camera file: a list of {K, viewmat, W, H, near}. The page looks from the first and steps through
-            all of them.
+        camera: a camera file, see `load_cameras`. The page looks from the first and steps through all of them.
         facts: axes and up instead of the scene's.
+        report: takes lines on how the camera file of another program was understood.
 
     Returns:
         Parameters of the page.
@@ -93,7 +93,7 @@ def view_wishes(camera: str | None, facts: SceneOverrides = _NONE) -> dict[str, 
     """
     wishes = {}
     if camera is not None:
-        entries = [one.to_json() for one in load_cameras(camera)]
+        entries = [one.to_json() for one in load_cameras(camera, report)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
     if facts.coordinate_system is not None:
         wishes["axes"] = facts.coordinate_system

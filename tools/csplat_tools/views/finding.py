@@ -130,7 +130,8 @@ def _of_file(
     virtual: tuple[int, tuple[int, int], int],
     aside: int | None,
 ) -> ViewSet:
-    given = list({pose(camera): camera for camera in load_cameras(path)}.values())
+    report: list[str] = []
+    given = list({pose(camera): camera for camera in load_cameras(path, report)}.values())
     said = TrainedOn.of(source.metadata)
     colour, notes = _colour(background, said)
     few = len(given) < _ENOUGH
@@ -143,8 +144,9 @@ def _of_file(
         judges, rest = _parted(given, evenly(every, _MOST_JUDGES))
         decides, teaches = _apart(rest, aside)
     return ViewSet(
-        _named_file(path), colour, teaches, decides, judges, virtual=few, origin=source.origin, notes=tuple(notes)
-    )
+        _named_file(path), colour, teaches, decides, judges, virtual=few, origin=source.origin,
+        notes=(*report, *notes),
+    )  # fmt: skip
 
 
 def _of_data(

@@ -217,6 +217,7 @@ for (const [what, change] of Object.entries({
   'no viewmat': { viewmat: undefined },
   'a scaled viewmat': { viewmat: FILE_CAMERA.viewmat.map((row) => row.map((value) => 2 * value)) },
   'a mirrored viewmat': { viewmat: [[-1, 0, 0, 0], ...FILE_CAMERA.viewmat.slice(1)] },
+  'a transposed viewmat': { viewmat: [0, 1, 2, 3].map((k) => FILE_CAMERA.viewmat.map((row) => row[k])) },
   'NaN in K': {
     K: [
       [NaN, 0, 0],

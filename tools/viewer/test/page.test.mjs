@@ -3,6 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
+import { readCamera } from '../autocamera.mjs';
 import { keepCommand, upWord } from '../keep.mjs';
 import { explain } from '../messages.mjs';
 import { fetchCameras, readWishes } from '../page.mjs';
@@ -53,6 +54,76 @@ for (const query of [...WRONG, ...NOWHERE]) {
     assert.deepEqual(wishes, readWishes(new URLSearchParams()).wishes);
   });
 }
+
+// Each of these stands at 1 2 3 and looks along x, z up: 64 by 48 pixels, focal length 50.
+const FOREIGN = {
+  'cameras.json of INRIA': [
+    {
+      id: 0,
+      img_name: 'a',
+      width: 64,
+      height: 48,
+      fx: 50,
+      fy: 50,
+      position: [1, 2, 3],
+      rotation: [
+        [0, 0, 1],
+        [-1, 0, 0],
+        [0, -1, 0],
+      ],
+    },
+  ],
+  'a camera path of nerfstudio': {
+    render_width: 64,
+    render_height: 48,
+    camera_path: [
+      {
+        fov: (360 / Math.PI) * Math.atan(24 / 50),
+        camera_to_world: [0, 0, -1, 1, -1, 0, 0, 2, 0, 1, 0, 3, 0, 0, 0, 1],
+      },
+    ],
+  },
+  'transforms.json': {
+    ...{ w: 64, h: 48, camera_angle_x: 2 * Math.atan(32 / 50) },
+    frames: [
+      {
+        file_path: 'a',
+        transform_matrix: [
+          [0, 0, -1, 1],
+          [-1, 0, 0, 2],
+          [0, 1, 0, 3],
+          [0, 0, 0, 1],
+        ],
+      },
+    ],
+  },
+};
+
+for (const [what, file] of Object.entries(FOREIGN)) {
+  test(`${what} gives cameras`, async () => {
+    const [entry] = await fetchCameras(JSON.stringify(file));
+    const { viewmat, lens } = readCamera(entry);
+    assert.deepEqual(
+      viewmat.map((value) => value + 0),
+      [0, -1, 0, 2, 0, 0, -1, 3, 1, 0, 0, -1, 0, 0, 0, 1],
+    );
+    for (const name of ['fx', 'fy']) assert.ok(Math.abs(lens[name] - 50) < 1e-9, `${lens[name]}`);
+    assert.deepEqual([lens.cx, lens.cy, lens.W, lens.H], [32, 24, 64, 48]);
+  });
+}
+
+test('other cameras that are none are refused', async () => {
+  const { frames, ...document } = FOREIGN['transforms.json'];
+  const turned = [{ transform_matrix: [0, 1, 2, 3].map((k) => frames[0].transform_matrix.map((row) => row[k])) }];
+  for (const [wrong, says] of [
+    [{ ...document, frames: turned }, /transform_matrix has the last row 1 2 3 1, expected 0 0 0 1/],
+    [{ ...document, frames: [{}] }, /transform_matrix is not/],
+    [{ ...FOREIGN['a camera path of nerfstudio'], camera_type: 'equirectangular' }, /camera_type is equirectangular/],
+    [[{ rotation: [1] }], /rotation and position/],
+  ]) {
+    await assert.rejects(fetchCameras(JSON.stringify(wrong)), says);
+  }
+});
 
 test('cameras may stand in the address', async () => {
   assert.deepEqual(await fetchCameras(' [{"W": 1}, {"W": 2}]'), [{ W: 1 }, { W: 2 }]);

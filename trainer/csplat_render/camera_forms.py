@@ -1,0 +1,321 @@
+"""Camera files of other programs: cameras.json of INRIA, camera paths of nerfstudio, transforms.json.
+
+INRIA's: a list of {id, img_name, width, height, position, rotation, fx, fy}; `rotation` is camera to world by rows,
+axes as OpenCV's. The principal point is the middle. nerfstudio's path: {render_width, render_height, camera_path:
+[{camera_to_world, fov, aspect}]}; 16 numbers by rows, axes as OpenGL's: x to the right, y up, z backwards; `fov` is
+down the image, in degrees. transforms.json of instant-ngp and nerfstudio: {w, h, fl_x or camera_angle_x, frames:
+[{file_path, transform_matrix}]}, the same axes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError, counted
+from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row
+
+__all__ = [
+    "PERSPECTIVES",
+    "check_intrinsics",
+    "finite_number",
+    "focal_lengths",
+    "foreign_cameras",
+    "frame_values",
+    "note_on_scales",
+    "viewmat_of_opengl",
+]
+
+F64 = NDArray[np.float64]
+
+#: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
+PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+_FOCAL_RANGE = (0.05, 100.0)  # of focal lengths, relative to the image's side: 169 to 0.6 degrees of view
+_MOST_UNEQUAL = 2.0  # of focal lengths across and down
+_SWAPPED = 0.02  # relative, of a principal point to half of the other side
+_NEAR = 0.01  # scene units, of nerfstudio's renderer
+_SCALE_TOLERANCE = 1e-3
+_ANGLES_AGREE = 0.01  # relative, of a focal length with one stated beside it; files hold few digits
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+def foreign_cameras(document: object, where: str, report: list[str]) -> list[Camera] | None:
+    """Read cameras in the words of another program.
+
+    Args:
+        document: a JSON file's.
+        where: the file, for messages.
+        report: takes a line on how the file was understood.
+
+    Returns:
+        Its cameras; `None` where it is none of those above.
+
+    Raises:
+        InputError: a field is missing or no number, or a pose is none.
+    """
+    if isinstance(document, list) and document and isinstance(document[0], Mapping) and "rotation" in document[0]:
+        cameras = _each(document, where, "camera", _inria)
+        many = counted(len(cameras), "camera")
+        report.append(f"{where} is a cameras.json of INRIA: {many}, principal points in the middle")
+        return cameras
+    if not isinstance(document, Mapping):
+        return None
+    if isinstance(document.get("camera_path"), list):
+        cameras = _each(document["camera_path"], where, "camera_path", lambda e, at: _nerfstudio(document, e, at))
+        report.append(f"{where} is a camera path of nerfstudio: {counted(len(cameras), 'camera')}")
+        return cameras
+    if isinstance(document.get("frames"), list):
+        cameras = _each(document["frames"], where, "frame", lambda e, at: _frame(document, e, at))
+        report.append(f"{where} is a transforms.json: {counted(len(cameras), 'camera')}")
+        report += note_on_scales([frame["transform_matrix"] for frame in document["frames"]], where)
+        if any(one.get(key) for key in _DISTORTION for one in (document, *document["frames"])):
+            report.append(f"{where}: the distortion of its lens is left out, renders are straight")
+        return cameras
+    return None
+
+
+def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Join what a transforms.json states for all frames with what one of them states: its own counts."""
+    values = {**document, **frame}
+    for axis in "xy":
+        if f"fl_{axis}" in frame and f"camera_angle_{axis}" not in frame:
+            values.pop(f"camera_angle_{axis}", None)
+    return values
+
+
+def check_intrinsics(
+    focals: tuple[float, float], middle: tuple[float, float], size: tuple[float, float], where: str
+) -> None:
+    """Check a camera against reason: focal lengths in other units, numbers that are swapped.
+
+    Args:
+        focals: across and down, pixels.
+        middle: the principal point, pixels.
+        size: width and height, pixels.
+        where: file and place, for messages; "" where there is none.
+
+    Raises:
+        InputError: no camera is like that.
+    """
+    where = f"{where}: " if where else ""
+    (fx, fy), (cx, cy), (width, height) = focals, middle, size
+    low, high = _FOCAL_RANGE
+    for name, focal, side in (("across", fx, width), ("down", fy, height)):
+        if not low <= focal / side <= high:
+            raise InputError(
+                f"{where}the focal length {name} is {focal:g} for {side:g} pixels, expected {low * side:g} to "
+                f"{high * side:g}: it is in pixels of images of that size, not in millimetres or other units"
+            )
+    if not 1.0 / _MOST_UNEQUAL <= fx / fy <= _MOST_UNEQUAL:
+        raise InputError(
+            f"{where}the focal lengths are {fx:g} across and {fy:g} down, expected about the same: one of them is wrong"
+        )
+    point = f"{where}the principal point is {cx:g} {cy:g} in {width:g}×{height:g} pixels"
+    if not (-width <= cx <= 2.0 * width and -height <= cy <= 2.0 * height):
+        raise InputError(f"{point}, expected about the middle")
+    away = max(abs(2.0 * cx / width - 1.0), abs(2.0 * cy / height - 1.0))
+    away_if_swapped = max(abs(2.0 * cx / height - 1.0), abs(2.0 * cy / width - 1.0))
+    if away_if_swapped <= _SWAPPED < away:
+        wanted = f"{0.5 * width:g} {0.5 * height:g}"
+        raise InputError(f"{point}, expected about {wanted}: width and height, or its two numbers, are swapped")
+
+
+def finite_number(values: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """Look up a finite number.
+
+    Raises:
+        InputError: it is missing, and there is no default, or it is something else.
+    """
+    value = values.get(key)
+    if value is None and default is not None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} is {value!r}, expected a number")
+    return float(value)
+
+
+def focal_lengths(
+    values: Mapping[str, Any], width: float, height: float, where: str, *, fisheye: bool = False
+) -> tuple[float, float]:
+    """Read focal lengths, or angles of view, as a transforms.json states them.
+
+    Args:
+        values: fl_x, fl_y, camera_angle_x, camera_angle_y: one at least.
+        width: of the images, pixels.
+        height: the same.
+        where: for messages.
+        fisheye: angles of view are not those of a pinhole: what is stated twice is not compared.
+
+    Returns:
+        Across and down, pixels; the same number where one is stated.
+
+    Raises:
+        InputError: none is stated, one is out of range, or two contradict each other.
+    """
+    fx = _focal(values, "x", width, where, fisheye=fisheye)
+    fy = _focal(values, "y", height, where, fisheye=fisheye)
+    if fx is None and fy is None:
+        raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
+    fx, fy = fx or fy, fy or fx  # square pixels unless both are named
+    assert fx is not None
+    assert fy is not None
+    return fx, fy
+
+
+def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
+    """World to camera with OpenCV axes, from camera to world with OpenGL axes.
+
+    Args:
+        matrix: [4, 4] or [3, 4], by rows.
+        name: of the field, for messages.
+        where: for messages.
+
+    Raises:
+        InputError: it is no rotation, but for one scale of the world, with a translation.
+    """
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {name} is not a matrix of numbers") from None
+    if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
+        raise InputError(f"{where}: {name} has shape {list(pose.shape)}, expected [4, 4], finite")
+    if len(pose) == 4:
+        check_last_row(pose, f"{where}: {name}")
+    axes = pose[:3, :3] * np.array([1.0, -1.0, -1.0])
+    lengths = np.linalg.norm(axes, axis=0)
+    scale = float(lengths.mean())  # some exporters leave the scale of the world in the axes
+    determinant = float(np.linalg.det(axes))
+    if not (scale > 0.0 and determinant > 0.0 and np.abs(lengths / scale - 1.0).max() <= _SCALE_TOLERANCE):
+        found = ", ".join(f"{length:.4g}" for length in lengths)
+        raise InputError(
+            f"{where}: {name} begins with axes of lengths {found} and determinant {determinant:.4g}, expected a "
+            "rotation: it is mirrored, sheared or zero"
+        )
+    u, _, vt = np.linalg.svd(axes / scale)  # the nearest rotation: files hold few digits
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = (u @ vt).T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
+    return viewmat
+
+
+def note_on_scales(matrices: Sequence[Any], where: str) -> list[str]:
+    """Report poses that hold the scale of the world in their axes, which `viewmat_of_opengl` takes off.
+
+    Args:
+        matrices: as that takes them.
+        where: the file, for messages.
+    """
+    scales = [float(np.linalg.norm(np.array(matrix, np.float64)[:3, :3], axis=0).mean()) for matrix in matrices]
+    scaled = [scale for scale in scales if abs(scale - 1.0) > _SCALE_TOLERANCE]
+    if not scaled:
+        return []
+    return [
+        f"{where}: {counted(len(scaled), 'pose')} scaled (the first by {scaled[0]:g}), which is taken off: places stay"
+    ]
+
+
+def _each(entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]) -> list[Camera]:
+    """Read the entries of a list; a fault names its file and its number."""
+    if not entries:
+        raise InputError(f"{where} lists no cameras")
+    cameras = []
+    for index, entry in enumerate(entries):
+        at = f"{where}, {kind} {index}"
+        if not isinstance(entry, Mapping):
+            raise InputError(f"{at} is {type(entry).__name__}, expected an object")
+        cameras.append(read(entry, at))
+    return cameras
+
+
+def _camera(
+    at: str,
+    focals: tuple[float, float],
+    middle: tuple[float, float],
+    viewmat: F64,
+    size: tuple[float, float],
+    near: float,
+    image: Any,
+) -> Camera:
+    (fx, fy), (cx, cy), (width, height) = focals, middle, size
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    try:
+        return Camera.from_json({"K": K, "viewmat": viewmat, "W": width, "H": height, "near": near, "image": image})
+    except InputError as error:
+        raise InputError(f"{at}: {error}") from error
+
+
+def _middle(width: float, height: float) -> tuple[float, float]:
+    return width / 2.0, height / 2.0
+
+
+def _inria(entry: Mapping[str, Any], at: str) -> Camera:
+    width, height = finite_number(entry, "width", at), finite_number(entry, "height", at)
+    focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
+    try:
+        rotation, position = (np.array(entry.get(key), np.float64) for key in ("rotation", "position"))
+    except (TypeError, ValueError):
+        rotation = position = np.zeros(0)
+    if rotation.shape != (3, 3) or position.shape != (3,):
+        raise InputError(f"{at}: rotation and position have other shapes, expected [3, 3] and [3]")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ position
+    return _camera(at, focals, _middle(width, height), viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name"))
+
+
+def _nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
+    kind = str(document.get("camera_type") or "perspective")
+    if kind.lower() != "perspective":
+        raise InputError(f"{at}: camera_type is {kind}, expected perspective")
+    width, height = finite_number(document, "render_width", at), finite_number(document, "render_height", at)
+    angle = finite_number(entry, "fov", at)
+    if not 0.0 < angle < 180.0:
+        raise InputError(f"{at}: fov is {angle:g}, expected degrees above 0 and below 180")
+    matrix = entry.get("camera_to_world")
+    if isinstance(matrix, list) and len(matrix) == 16:
+        matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
+    viewmat = viewmat_of_opengl(matrix, "camera_to_world", at)
+    focal = 0.5 * height / math.tan(math.radians(angle) / 2.0)
+    return _camera(at, (focal, focal), _middle(width, height), viewmat, (width, height), _NEAR, None)
+
+
+def _frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
+    values = frame_values(document, frame)
+    if values.get("w") is None or values.get("h") is None:
+        raise InputError(f"{at}: w and h are missing, expected the size of the images: --data reads it from them")
+    width, height = finite_number(values, "w", at), finite_number(values, "h", at)
+    model = str(values.get("camera_model") or "").upper()
+    if values.get("is_fisheye") or model not in PERSPECTIVES:
+        raise InputError(f"{at}: camera_model is {model or 'a fisheye'}, expected one of {', '.join(PERSPECTIVES[1:])}")
+    fx, fy = focal_lengths(values, width, height, at)
+    cx, cy = finite_number(values, "cx", at, width / 2.0), finite_number(values, "cy", at, height / 2.0)
+    viewmat = viewmat_of_opengl(values.get("transform_matrix"), "transform_matrix", at)
+    return _camera(at, (fx, fy), (cx, cy), viewmat, (width, height), _NEAR, values.get("file_path"))
+
+
+def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:
+    """The focal length along one axis, stated in pixels or by the angle of view; `None` where neither is there."""
+    length, angle = values.get(f"fl_{axis}"), values.get(f"camera_angle_{axis}")
+    by_angle = None
+    if angle is not None and not (fisheye and length is not None):
+        radians = finite_number(values, f"camera_angle_{axis}", where)
+        if not 0.0 < radians < math.pi:
+            hint = " (degrees?)" if math.pi <= radians < 180.0 else ""
+            raise InputError(f"{where}: camera_angle_{axis} is {radians:g}{hint}, expected radians above 0 and below π")
+        by_angle = 0.5 * size / math.tan(0.5 * radians)
+    if length is None:
+        return by_angle
+    focal = finite_number(values, f"fl_{axis}", where)
+    if focal <= 0.0:
+        raise InputError(f"{where}: fl_{axis} is {focal:g}, expected above 0")
+    if by_angle is not None and abs(by_angle / focal - 1.0) > _ANGLES_AGREE:
+        raise InputError(
+            f"{where}: fl_{axis} is {focal:g}, expected {by_angle:.6g} as camera_angle_{axis} = {angle:g} says for "
+            f"{size:g} pixels: leave out the one that is wrong"
+        )
+    return focal
