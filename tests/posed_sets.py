@@ -85,7 +85,7 @@ def quaternion(rotation):
     return np.linalg.eigh(np.array(lower))[1][:, -1]
 
 
-MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
 
 
 def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H):

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat_trainer.data.colmap_files import ColmapImage, count_images, read_cameras, read_images, read_points
-from csplat_trainer.data.dataset import Found, Lens, Shot
+from csplat_trainer.data.dataset import Found, Shot
 from csplat_trainer.data.image_files import find_images, find_masks, missing_images
+from csplat_trainer.data.lens import Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import lists_next_to, split_every, split_listed
 

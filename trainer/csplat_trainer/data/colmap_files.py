@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
-from csplat_trainer.data.dataset import Lens
+from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import finite_points
 
 __all__ = ["ColmapImage", "count_images", "read_cameras", "read_images", "read_points"]
@@ -22,19 +22,45 @@ __all__ = ["ColmapImage", "count_images", "read_cameras", "read_images", "read_p
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# Number in binary files, name, how many parameters. Those with a lens below are supported.
-_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
+_UNIT_TOLERANCE = 0.01  # of a quaternion's length; text files may hold few digits
+
+# By their numbers in binary files.
+_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+)
+
+# Parameters, in their order, of the models that can be undone.
+_LAYOUTS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fx fy cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
 }
 
 
@@ -73,10 +99,10 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     data = _Bytes(path)
     for _ in range(data.count(24)):
         number, model, width, height = data.unpack("<iiQQ")
-        if model not in _MODELS:
-            raise InputError(f"{path}: camera {number} has the unknown model {model}")
-        name, parameters = _MODELS[model]
-        values = [float(value) for value in data.unpack(f"<{parameters}d")]
+        name = _MODELS[model] if 0 <= model < len(_MODELS) else f"of number {model}"
+        # How many parameters others have is of no interest: they are refused.
+        parameter_count = len(_LAYOUTS.get(name, "").split())
+        values = [float(value) for value in data.unpack(f"<{parameter_count}d")]
         cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
     data.end()
     return cameras
@@ -252,25 +278,27 @@ def _integer(word: str, where: str) -> int:
 
 
 def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
-    match model, values:
-        case "SIMPLE_PINHOLE", [f, cx, cy]:
-            lens = Lens(width, height, f, f, cx, cy)
-        case "PINHOLE", [fx, fy, cx, cy]:
-            lens = Lens(width, height, fx, fy, cx, cy)
-        case "SIMPLE_RADIAL", [f, cx, cy, k]:
-            lens = Lens(width, height, f, f, cx, cy, (k, 0.0, 0.0, 0.0))
-        case "RADIAL", [f, cx, cy, k1, k2]:
-            lens = Lens(width, height, f, f, cx, cy, (k1, k2, 0.0, 0.0))
-        case "OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2]:
-            lens = Lens(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
-        case _:
-            raise InputError(
-                f"{where}: the lens {model} with {len(values)} parameters is not supported; wanted PINHOLE, "
-                "SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV (COLMAP's image_undistorter makes PINHOLE of others)"
-            )
-    if not (width >= 1 and height >= 1 and lens.fx > 0 and lens.fy > 0 and np.isfinite(values).all()):
+    layout = _LAYOUTS.get(model, "").split()
+    if not layout:
+        raise InputError(f"{where}: the lens is {model}, expected one of {', '.join(_LAYOUTS)}: use {UNDISTORTER}")
+    if len(values) != len(layout):
+        raise InputError(f"{where}: the lens {model} has {len(values)} parameters, expected {' '.join(layout)}")
+    named = dict(zip(layout, values, strict=True))
+    fx = named.pop("f", None)
+    fx, fy = (named.pop("fx"), named.pop("fy")) if fx is None else (fx, fx)
+    if not (width >= 1 and height >= 1 and fx > 0 and fy > 0 and np.isfinite(values).all()):
         raise InputError(f"{where}: the lens {model} has a size or focal length that is no number above 0")
-    return lens
+    cx, cy = named.pop("cx"), named.pop("cy")
+    k1, k2, k3, k4, k5, k6 = (named.get(f"k{i}", 0.0) for i in range(1, 7))
+    tangential, prism = (named.get("p1", 0.0), named.get("p2", 0.0)), (named.get("sx1", 0.0), named.get("sy1", 0.0))
+    if model == "FOV":
+        return Lens(width, height, fx, fy, cx, cy, projection="fov", omega=named["omega"], source=where)
+    if model.endswith("FISHEYE"):
+        radial = (k1, k2, k3, k4)
+        return Lens(
+            width, height, fx, fy, cx, cy, radial, tangential, prism=prism, projection="equidistant", source=where
+        )
+    return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3), tangential, (k4, k5, k6), source=where)
 
 
 def _viewmat(pose: list[float] | tuple[float, ...], where: str) -> F64:
@@ -279,6 +307,10 @@ def _viewmat(pose: list[float] | tuple[float, ...], where: str) -> F64:
     length = float(np.linalg.norm(q))
     if not (np.isfinite(length) and length > 0.0 and np.isfinite(t).all()):
         raise InputError(f"{where}: the pose is not finite or its rotation is zero")
+    if abs(length - 1.0) > _UNIT_TOLERANCE:
+        raise InputError(
+            f"{where}: the rotation QW QX QY QZ has length {length:.4g}, expected 1: is another column among the four?"
+        )
     w, x, y, z = q / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [

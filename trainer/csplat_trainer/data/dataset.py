@@ -13,9 +13,10 @@ from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
 from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR
+from csplat_trainer.data.lens import Lens
 from csplat_trainer.pictures import Picture
 
-__all__ = ["DataSet", "Found", "Lens", "Shot", "near_plane"]
+__all__ = ["DataSet", "Found", "Shot", "near_plane"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -77,39 +78,6 @@ class DataSet:
         """
         for picture in (*self.train, *self.test):
             _ = picture.pixels, picture.mask
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A pinhole with OpenCV's radial and tangential distortion, for pictures of one size.
-
-    Attributes:
-        width: of the pictures that the numbers are meant for, pixels.
-        height: the same.
-        fx: focal length across, pixels.
-        fy: focal length down, pixels.
-        cx: principal point, pixels; the centre of the first pixel lies at 0.5.
-        cy: the same.
-        distortion: k1, k2, p1, p2.
-    """
-
-    width: float
-    height: float
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-
-    def scaled(self, width: int, height: int) -> Lens:
-        """The same lens for pictures of another size; each axis is scaled by itself."""
-        x, y = width / self.width, height / self.height
-        return Lens(width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.distortion)
-
-    @property
-    def distorts(self) -> bool:
-        """Whether it is more than a pinhole."""
-        return any(value != 0.0 for value in self.distortion)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from csplat.errors import InputError, counted
-from csplat_trainer.data.pixels import image_size
+from csplat_trainer.data.image_pixels import image_size
 
 __all__ = [
     "FoundImages",

@@ -12,10 +12,12 @@ from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED
 from csplat.upright import Direction, up_of_axes
 from csplat_render.camera import MAX_IMAGE_SIZE
+from csplat_trainer.data.checks import check_shots, notes_on_images, notes_on_lenses, notes_on_poses
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Found, Shot, near_plane
+from csplat_trainer.data.image_pixels import read_head
 from csplat_trainer.data.level import find_level
-from csplat_trainer.data.pixels import picture_of, undistorted_lens
+from csplat_trainer.data.pixels import picture_of
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["load"]
@@ -37,8 +39,10 @@ def load(
     | recognised by | kind |
     |---|---|
     | `transforms_train.json` | NeRF-synthetic, made with Blender; RGBA |
-    | `transforms.json` | instant-ngp, nerfstudio; OpenCV distortion is undone |
+    | `transforms.json` | instant-ngp, nerfstudio |
     | `sparse/0/cameras.bin` or `.txt` | COLMAP, as Mip-NeRF 360, Tanks and Temples, Deep Blending are laid out |
+
+    What files state is checked against what they hold: `checks`. Lenses are straightened: `lens`.
 
     Args:
         path: its folder, or the `transforms.json`.
@@ -61,9 +65,12 @@ def load(
     if not found.train:
         raise InputError(f"{path} leaves no images to train on")
     shots = [*found.train, *found.test]
+    heads = {shot.path: read_head(shot.path) for shot in (*shots, *found.val)}
+    check_shots([*shots, *found.val], heads)
     near = near_plane(shots) if near is None else near
     train, test, val = (
-        [picture_of(shot, size, near) for shot in part] for part in (found.train, found.test, found.val)
+        [picture_of(shot, heads[shot.path], size, near) for shot in part]
+        for part in (found.train, found.test, found.val)
     )
     name = f"{found.kind} {path}"
     sizes = sorted({(picture.camera.W, picture.camera.H) for picture in (*train, *test)})
@@ -75,9 +82,7 @@ def load(
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
         report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
-    if any(shot.lens.distorts for shot in shots):
-        zooms = [undistorted_lens(lens).fx / lens.fx for lens in {shot.lens for shot in shots} if lens.distorts]
-        report.append(f"lens distortion is undone, the images are enlarged by up to {100 * (max(zooms) - 1):.1f} %")
+    report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *notes_on_poses(shots, found.points)]
     axes, up, said = _upright(found.coordinate_system, shots)
     return DataSet(
         name,

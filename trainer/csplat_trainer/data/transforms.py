@@ -6,7 +6,6 @@ Both hold camera-to-world matrices with OpenGL axes: x to the right, y up, z bac
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -17,20 +16,28 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
-from csplat_trainer.data.dataset import Found, Lens, Shot
+from csplat_render.camera_forms import (
+    PERSPECTIVES,
+    finite_number,
+    focal_lengths,
+    frame_values,
+    note_on_scales,
+    viewmat_of_opengl,
+)
+from csplat_trainer.data.dataset import Found, Shot
 from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain, shown
-from csplat_trainer.data.pixels import image_size
+from csplat_trainer.data.image_pixels import image_size
+from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_listed
 
 __all__ = ["read_blender", "read_transforms"]
 
 F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
-_SCALE_TOLERANCE = 1e-3
-_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_RATIONAL = "FULL_OPENCV"
+_FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def read_blender(folder: Path, images: str | None = None) -> Found:
@@ -131,9 +138,12 @@ def _shots(
     for frame in frames:
         if frame.name in found.files:
             image, where = found.files[frame.name], f"{path}, frame {frame.number}"
-            lens = _lens({**document, **frame.values}, image, where)
-            viewmat = _viewmat(frame.values.get("transform_matrix"), where)
+            lens = _lens(frame_values(document, frame.values), image, where)
+            viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
             shots.append(Shot(_plain(frame.name, image), image, lens, viewmat, masks.get(frame.name)))
+    report += note_on_scales(
+        [frame.values["transform_matrix"] for frame in frames if frame.name in found.files], path.name
+    )
     return shots
 
 
@@ -254,68 +264,32 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
-    """Intrinsics: focal lengths or angles of view, for the size named or the file's own."""
-    model = str(values.get("camera_model", ""))
-    if model.upper() not in _PINHOLES or values.get("is_fisheye"):
-        raise InputError(f"{where}: camera model {model or 'fisheye'} is not supported, wanted a pinhole or OPENCV")
-    if any(_number(values, key, where, 0.0) != 0.0 for key in ("k3", "k4")):
-        raise InputError(f"{where}: distortion by k3 or k4 is not supported, wanted k1, k2, p1, p2")
+    """Intrinsics: focal lengths or angles of view, for the size named or the file's own; and the distortion."""
+    model = str(values.get("camera_model") or "")
+    fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
+    if not fisheye and model.upper() not in PERSPECTIVES:
+        raise InputError(
+            f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
+            f"use {UNDISTORTER}, or what straightens images in the program that found the poses"
+        )
     if "w" in values and "h" in values:
-        width, height = _number(values, "w", where), _number(values, "h", where)
+        width, height = finite_number(values, "w", where), finite_number(values, "h", where)
     else:
         width, height = (float(side) for side in image_size(image))
     if not (width >= 1.0 and height >= 1.0):
-        raise InputError(f"{where}: pictures of {width:g}×{height:g} pixels")
-    fx, fy = _focal(values, "x", width, where), _focal(values, "y", height, where)
-    if fx is None and fy is None:
-        raise InputError(f"{where}: no focal length, wanted fl_x or camera_angle_x")
-    fx, fy = fx or fy, fy or fx  # square pixels unless both are named
-    assert fx is not None
-    assert fy is not None
-    cx, cy = _number(values, "cx", where, width / 2.0), _number(values, "cy", where, height / 2.0)
-    k1, k2, p1, p2 = (_number(values, key, where, 0.0) for key in ("k1", "k2", "p1", "p2"))
-    return Lens(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
-
-
-def _focal(values: Mapping[str, Any], axis: str, size: float, where: str) -> float | None:
-    if values.get(f"fl_{axis}") is not None:
-        focal = _number(values, f"fl_{axis}", where)
-    elif values.get(f"camera_angle_{axis}") is not None:
-        angle = _number(values, f"camera_angle_{axis}", where)
-        if not 0.0 < angle < math.pi:
-            raise InputError(f"{where}: camera_angle_{axis} is {angle:g}, wanted radians above 0 and below π")
-        focal = 0.5 * size / math.tan(0.5 * angle)
-    else:
-        return None
-    if focal <= 0.0:
-        raise InputError(f"{where}: the focal length is {focal:g}, wanted above 0")
-    return focal
-
-
-def _number(values: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
-    value = values.get(key)
-    if value is None and default is not None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {value!r}, wanted a number")
-    return float(value)
-
-
-def _viewmat(matrix: Any, where: str) -> F64:
-    """World to camera with OpenCV axes, from camera to world with OpenGL axes."""
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: transform_matrix is not a matrix of numbers") from None
-    if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{where}: transform_matrix has shape {list(pose.shape)}, wanted [4, 4], finite")
-    axes = pose[:3, :3] * np.array([1.0, -1.0, -1.0])
-    lengths = np.linalg.norm(axes, axis=0)
-    scale = float(lengths.mean())  # some exporters leave the scale of the world in the axes
-    if not (scale > 0.0 and np.linalg.det(axes) > 0.0 and np.abs(lengths / scale - 1.0).max() <= _SCALE_TOLERANCE):
-        raise InputError(f"{where}: transform_matrix does not begin with a rotation (mirrored, sheared or zero)")
-    u, _, vt = np.linalg.svd(axes / scale)  # the nearest rotation: files hold few digits
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = (u @ vt).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
-    return viewmat
+        raise InputError(f"{where}: w and h are {width:g} and {height:g}, expected 1 or more")
+    fx, fy = focal_lengths(values, width, height, where, fisheye=fisheye)
+    cx, cy = finite_number(values, "cx", where, width / 2.0), finite_number(values, "cy", where, height / 2.0)
+    k1, k2, k3, k4, k5, k6 = (finite_number(values, f"k{i}", where, 0.0) for i in range(1, 7))
+    p1, p2 = finite_number(values, "p1", where, 0.0), finite_number(values, "p2", where, 0.0)
+    # OpenCV's rational model divides by k4 to k6; other programs go on multiplying: only the model's name tells which.
+    apart = {"k5": k5, "k6": k6} | ({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
+    strange = [f"{key} is {value:g}" for key, value in apart.items() if value != 0.0]
+    if strange and (fisheye or model.upper() != _RATIONAL):
+        raise InputError(
+            f"{where}: {strange[0]} with camera_model {model or 'not named'}, expected 0: k4 to k6 belong to "
+            f"{_RATIONAL}, k1 to k4 to OPENCV_FISHEYE; or use {UNDISTORTER}"
+        )
+    if fisheye:
+        return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3, k4), projection="equidistant", source=where)
+    return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3), (p1, p2), (k4, k5, k6), source=where)

@@ -12,7 +12,7 @@ from csplat_bench.common.command import listed, tell
 from csplat_bench.datasets.protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import Found
-from csplat_trainer.data.pixels import image_size
+from csplat_trainer.data.image_pixels import image_size
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["TEST_EVERY", "PictureChoice", "SceneFolder", "choose_pictures", "choose_scenes", "find_scene_folders"]

@@ -1,0 +1,180 @@
+"""Checks of what a set states against what its files are: sizes, lenses, poses; and notes on how they were read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError, counted
+from csplat_render.camera_forms import check_intrinsics
+from csplat_trainer.data.dataset import Shot
+from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
+from csplat_trainer.data.lens import Lens, undistorted_lens
+from csplat_trainer.data.pixels import shown_size
+
+__all__ = ["check_shots", "notes_on_images", "notes_on_lenses", "notes_on_poses"]
+
+_ROUNDING = 1.0  # pixels, of each side of an image that was made smaller
+_NEARLY = 0.02  # relative, of scales across and down: beyond it an image was cropped, turned, or is another camera's
+_MIDDLE = (0.25, 0.75)  # of the image: principal points elsewhere are reported
+_SMALL_RANGE = 1.0 / 8.0  # of what 16 bits hold: images of 12 bits are as dark as that
+_SAME = 1e-6  # relative, of places
+_SHOTS, _POINTS = 64, 4096  # of a set, at most, that are looked at to see whether they belong together
+
+
+def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> None:
+    """Check lenses against reason, images against their cameras' sizes, and masks against their images'.
+
+    Args:
+        shots: all of a set.
+        heads: of their files.
+
+    Raises:
+        InputError: something contradicts itself.
+    """
+    for lens in {shot.lens: None for shot in shots}:
+        check_intrinsics((lens.fx, lens.fy), (lens.cx, lens.cy), (lens.width, lens.height), lens.source)
+    for shot in shots:
+        lens, size = shot.lens, shown_size(shot.path, heads[shot.path].size, shot.lens)
+        source = f"which {lens.source} states" if lens.source else "its camera's"
+        remedy = "cropped or squeezed images need the intrinsics of what they are now"
+        _check_shape(shot.path, size, (lens.width, lens.height), source, remedy)
+        if shot.mask is not None:
+            mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
+            _check_shape(shot.mask, mask_size, size, f"its image's ({shot.name})", "it is the mask of another image")
+
+
+def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> list[str]:
+    """Report pixels, turns and masks that could mean something else.
+
+    Raises:
+        InputError: a file that is looked at is damaged.
+    """
+    notes = []
+    for stored_as in sorted({head.stored_as for head in heads.values()} - {""}):
+        files = [path for path, head in heads.items() if head.stored_as == stored_as]
+        low, high, white = value_range(files[0])
+        line = f"{counted(len(files), 'image')} of {stored_as}: 0 to {white:g} is read as black to white"
+        line += f"; the first, {files[0].name}, holds {low:g} to {high:g}"
+        notes.append(line + (": scale them if that is too dark" if high < _SMALL_RANGE * white else ""))
+    several = [head for head in heads.values() if head.frame_count > 1]
+    if several:
+        what = f"{counted(len(several), 'file')} with several images: the first of each is read"
+        notes.append(f"{what} ({several[0].path.name} has {several[0].frame_count})")
+    sizes = {shot.path: shown_size(shot.path, heads[shot.path].size, shot.lens) for shot in shots}
+    misfits = [shot for shot in shots if _misfit(sizes[shot.path], (shot.lens.width, shot.lens.height)) > 0.0]
+    if misfits:
+        (width, height), lens = sizes[misfits[0].path], misfits[0].lens
+        notes.append(
+            f"{counted(len(misfits), 'image')} not quite of the shape of their cameras' ({misfits[0].path.name}: "
+            f"{width}×{height}, {lens.width:g}×{lens.height:g}): each side is scaled by itself"
+        )
+    turned = [path for path, size in sizes.items() if size != heads[path].size]
+    if turned:
+        many = counted(len(turned), "image")
+        notes.append(f"{many} turned as EXIF says: their cameras' sizes are those of images as shown")
+    as_stored = [head for path, head in heads.items() if path not in turned and _turn_is_undecided(head)]
+    if as_stored:
+        notes.append(
+            f"EXIF turns {counted(len(as_stored), 'image')} ({as_stored[0].path.name}: orientation "
+            f"{as_stored[0].orientation}): read as stored; if their poses are those of images as shown, turn the files"
+        )
+    mask = next((shot.mask for shot in shots if shot.mask is not None), None)
+    if mask is not None:
+        with opened_image(mask) as image:
+            taken_as = mask_values(image, mask).taken_as
+        if taken_as:
+            notes.append(f"masks as {mask.name}: {taken_as}")
+    return notes
+
+
+def notes_on_lenses(shots: Sequence[Shot]) -> list[str]:
+    """Report what is undone, and principal points far from the middle."""
+    notes = []
+    lenses = list({shot.lens: None for shot in shots})
+    bent = [(lens, undistorted_lens(lens)) for lens in lenses if lens.distorts]
+    if bent:
+        zoom = max(straight.fx / lens.fx for lens, straight in bent)
+        notes.append(f"lens distortion is undone, the images are enlarged by up to {100 * (zoom - 1):.1f} %")
+    wide = [straight for lens, straight in bent if lens.projection == "equidistant"]
+    if wide:
+        angle = min(2.0 * math.degrees(math.atan(0.5 * one.width / one.fx)) for one in wide)
+        notes.append(f"fisheye images are cut to what a pinhole shows: {angle:.0f} degrees across")
+    off = [lens for lens in lenses if not _is_in_the_middle(lens)]
+    if off:
+        lens = off[0]
+        notes.append(
+            f"{lens.source}: the principal point is {lens.cx:g} {lens.cy:g} in {lens.width:g}×{lens.height:g} pixels, "
+            "far from the middle: is it that of another size?"
+        )
+    return notes
+
+
+def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
+    """Report cameras that all stand at one place, and cameras that see none of the points.
+
+    Args:
+        shots: all that teach or judge.
+        points: [P, 3], of the set, or `None`.
+    """
+    notes = []
+    places = np.stack([-shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3] for shot in shots])
+    spread = np.ptp(places, axis=0).max()
+    if len(shots) > 1 and spread <= _SAME * (1.0 + np.abs(places).max()):
+        notes.append(f"all {len(shots)} cameras stand at one place: depth cannot be found from these images")
+    if points is not None and len(points):
+        some_shots, some_points = shots[:: -(-len(shots) // _SHOTS)], points[:: -(-len(points) // _POINTS)]
+        blind = [shot for shot in some_shots if not _sees_any(shot, some_points)]
+        if 2 * len(blind) > len(some_shots):
+            notes.append(
+                f"{len(blind)} of {len(some_shots)} cameras ({blind[0].name}, …) see none of the points: are their "
+                "poses camera to world, or are the points of another scene?"
+            )
+    return notes
+
+
+def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
+    """Whether a point lies in front of a camera, and within twice the width and height of its image."""
+    x, y, z = (points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]).T
+    lens = shot.lens
+    across, down = np.abs(x) * lens.fx <= lens.width * z, np.abs(y) * lens.fy <= lens.height * z
+    return bool(((z > 0.0) & across & down).any())
+
+
+def _check_shape(path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str) -> None:
+    """Refuse an image that is not its camera's, or its image's, made smaller or larger as a whole."""
+    if _misfit(size, wanted) <= _NEARLY:
+        return
+    (width, height), (wanted_width, wanted_height) = size, wanted
+    if _misfit((height, width), wanted) <= _NEARLY:
+        remedy = "the sides are swapped: turn the images, or find poses of them as they are"
+    shape = f"{wanted_width:g}×{wanted_height:g}"
+    raise InputError(f"{path} is {width}×{height} pixels, expected the shape of {shape}, {source}: {remedy}")
+
+
+def _misfit(size: tuple[int, int], wanted: tuple[float, float]) -> float:
+    """How much more an image is scaled along one side than along the other, relative; 0 where rounding explains it."""
+    (low_x, high_x), (low_y, high_y) = (
+        ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
+        for side, other in zip(size, wanted, strict=True)
+    )
+    if max(low_x, low_y) <= min(high_x, high_y):
+        return 0.0
+    across, down = size[0] / wanted[0], size[1] / wanted[1]
+    return max(across / down, down / across) - 1.0
+
+
+def _is_in_the_middle(lens: Lens) -> bool:
+    low, high = _MIDDLE
+    return low <= lens.cx / lens.width <= high and low <= lens.cy / lens.height <= high
+
+
+def _turn_is_undecided(head: ImageHead) -> bool:
+    """Whether EXIF turns an image and its camera's size does not tell whether the camera's program did."""
+    width, height = head.size
+    return head.orientation in (2, 3, 4) or (head.orientation in (5, 6, 7, 8) and width == height)

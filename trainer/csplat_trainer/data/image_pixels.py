@@ -1,0 +1,268 @@
+"""Image files: their heads, their pixels as RGB or RGBA in 8 bits, and the values of masks.
+
+Every way of storing pixels that pillow opens is read for what it means, or refused by name:
+
+| stored as | read as |
+|---|---|
+| 8 bits, grey or RGB, with alpha or without; palettes; CMYK, YCbCr, LAB | pillow's conversion |
+| 1 bit | 0 and 1 |
+| 16 bits RGB | the upper 8 bits |
+| 16 bits grey | 0 to 65535 stand for 0 to 1 |
+| floats, one channel | 0 to 1; refused where values lie beyond |
+| 32 bits grey, signed integers, several channels of more than 8 bits in planes | refused |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
+
+from csplat.errors import InputError
+
+__all__ = [
+    "COUNTS",
+    "ImageHead",
+    "MaskValues",
+    "image_size",
+    "mask_values",
+    "opened_image",
+    "read_head",
+    "rgb_pixels",
+    "value_range",
+]
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+#: A mask's values from which on pixels count.
+COUNTS = 128
+
+_WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
+_CONVERTED = (*_WITH_ALPHA, "1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+_GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
+_GREY_16_IN_32 = ("PNG", "PPM")  # files whose grey of 16 bits pillow holds in 32
+_FLOAT = "F"
+_DEEP = ";16"  # in pillow's names of raw data of which it keeps the upper 8 bits
+_FLOAT_TOLERANCE = 1e-3  # of a range of 0 to 1, for files that were resampled
+_WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
+_HEAD_SIZE = 32
+
+# By the first bytes and where they lie: what people have images in and pillow does not open.
+_UNREAD = (
+    (0, b"\x76\x2f\x31\x01", "an OpenEXR file, which is not read"),
+    (0, b"#?", "a Radiance HDR file, which is not read"),
+    (4, b"ftyphe", "a HEIC file, which is not read"),
+    (4, b"ftypmif1", "a HEIC file, which is not read"),
+    (4, b"ftypavif", "an AVIF file, which this pillow does not read"),
+    (0, b"\xff\x0a", "a JPEG XL file, which is not read"),
+    (4, b"JXL ", "a JPEG XL file, which is not read"),
+    (0, b"II*\0", "a TIFF that is damaged, or not of 8 or 16 bits or of floats in one channel"),
+    (0, b"MM\0*", "a TIFF that is damaged, or not of 8 or 16 bits or of floats in one channel"),
+)
+_RAW = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # pillow takes the thumbnail in some of them
+
+
+@dataclass(frozen=True)
+class ImageHead:
+    """The head of an image file.
+
+    Attributes:
+        path: the file.
+        size: width and height as stored.
+        stored_as: how pixels are stored where that leaves a choice of what they mean: `16-bit grey`, `16-bit colours`,
+            `floats`; else "".
+        has_alpha: whether there is transparency.
+        orientation: of EXIF, 1 to 8; 1 is upright. Of a TIFF always 1: pillow turns it.
+        frame_count: images in the file, of which the first is read.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    stored_as: str
+    has_alpha: bool
+    orientation: int
+    frame_count: int
+
+
+@dataclass(frozen=True, eq=False)
+class MaskValues:
+    """The values of a mask, 0..255.
+
+    Attributes:
+        values: [H, W] uint8; pixels count from `COUNTS` on.
+        taken_as: how the file was understood where it is no image of black and white; else "".
+    """
+
+    values: U8
+    taken_as: str = ""
+
+
+@contextmanager
+def opened_image(path: Path) -> Iterator[Image.Image]:
+    """Open an image and read its head. Faults in the rest are reported in the same way.
+
+    Raises:
+        InputError: the file is no image, or of a kind that is not read.
+    """
+    if path.suffix.lower() in _RAW:
+        raise InputError(f"{path} is a camera's raw file, expected an image: develop it to PNG or JPEG")
+    try:
+        with Image.open(path) as image:
+            yield image
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        name = _unread_kind(path) if isinstance(error, UnidentifiedImageError) else None
+        if name is not None:
+            raise InputError(f"{path} is {name}: convert it to PNG or JPEG") from error
+        raise InputError(f"{path} is not an image that can be read: {error}") from error
+
+
+def read_head(path: Path) -> ImageHead:
+    """Read the head of an image file; pixels are not decoded.
+
+    Raises:
+        InputError: the file is no image, or its pixels are of a kind that is refused.
+    """
+    with opened_image(path) as image:
+        stored_as, has_alpha = _stored_as(image, path), _has_alpha(image)
+        # The plug-in for PNG would decode all pixels to find EXIF behind them; that for TIFF turns the image itself.
+        orientation = 1
+        if image.format != "TIFF":
+            orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
+        # Phones append images for depth or brightness to a JPEG ("MPO"): nobody means them.
+        frame_count = 1 if image.format == "MPO" else int(getattr(image, "n_frames", 1))
+        return ImageHead(path, image.size, stored_as, has_alpha, orientation, frame_count)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file; its pixels are not read."""
+    with opened_image(path) as image:
+        return image.size
+
+
+def rgb_pixels(image: Image.Image, path: Path) -> U8:
+    """Decode an image.
+
+    Args:
+        image: as opened.
+        path: its file, for messages.
+
+    Returns:
+        [H, W, 3], or [H, W, 4] where the file has transparency.
+
+    Raises:
+        InputError: pixels are of a kind that is refused, or floats lie beyond 0 to 1.
+    """
+    _stored_as(image, path)
+    if image.mode in _CONVERTED:
+        return np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"))
+    stored = np.asarray(image)
+    grey = np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
+    channels = [grey, grey, grey]
+    if "transparency" in image.info:  # one grey value that is seen through
+        channels.append(np.where(stored == image.info["transparency"], 0, 255).astype(np.uint8))
+    return np.stack(channels, axis=2)
+
+
+def mask_values(image: Image.Image, path: Path) -> MaskValues:
+    """Decode a mask: white where its image counts.
+
+    Where colours are alike all over and alpha is not, alpha is the mask. Where no pixel is brighter than half and there
+    are at most two values, 0 and another, as in masks of 0 and 1 and in label images, pixels other than 0 count.
+
+    Raises:
+        InputError: as `rgb_pixels`; or no pixel is brighter than half and there are more than two values.
+    """
+    taken_as = ""
+    if image.mode not in _CONVERTED:
+        values = _grey_mask(image, path)
+    else:
+        values = np.asarray(image.convert("L"))
+        if _has_alpha(image) and values.min() == values.max():
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+            if alpha.min() < alpha.max():
+                values, taken_as = alpha, "colours are alike all over: alpha is the mask"
+    top = int(values.max())
+    if 0 < top < COUNTS:
+        found = np.unique(values)
+        if len(found) > 2 or (len(found) == 2 and found[0] > 0):
+            raise InputError(
+                f"{path} is a mask of values from {found[0]} to {top}, expected {COUNTS} or more where its image counts"
+            )
+        taken_as = f"values are {' and '.join(str(value) for value in found)}: {top} counts as white"
+        values = np.where(values > 0, 255, 0).astype(np.uint8)
+    return MaskValues(values, taken_as)
+
+
+def value_range(path: Path) -> tuple[float, float, float]:
+    """Return the least and the greatest value of an image as stored, and which value is read as white."""
+    with opened_image(path) as image:
+        white = 1.0 if image.mode == _FLOAT else 255.0 if image.mode in _CONVERTED else 65535.0
+        stored = np.asarray(image)
+        return float(stored.min()), float(stored.max()), white
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in _WITH_ALPHA or "transparency" in image.info
+
+
+def _stored_as(image: Image.Image, path: Path) -> str:
+    """Name how pixels are stored where that leaves a choice of what they mean; else "".
+
+    Raises:
+        InputError: they are of a kind that is refused.
+    """
+    if isinstance(image, TiffImagePlugin.TiffImageFile):
+        bits = image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (1,))
+        if image.tag_v2.get(TiffImagePlugin.PLANAR_CONFIGURATION) == _IN_PLANES and len(bits) > 1 and max(bits) > 8:
+            raise InputError(f"{path} holds {max(bits)} bits in planes of one colour each, expected RGB pixel by pixel")
+    if image.mode in _CONVERTED:
+        tiles = image.tile if isinstance(image, ImageFile.ImageFile) else []
+        return "16-bit colours" if any(_DEEP in str(tile[3]) for tile in tiles) else ""
+    if image.mode in _GREY_16 or (image.mode == "I" and image.format in _GREY_16_IN_32):
+        return "16-bit grey"
+    if image.mode == _FLOAT:
+        return "floats"
+    kind = "grey of 32 bits or with a sign" if image.mode == "I" else f"pixels of the kind {image.mode}"
+    raise InputError(f"{path} holds {kind}, expected 8 or 16 bits without a sign: convert it to PNG")
+
+
+def _unit_grey(image: Image.Image, path: Path) -> F64:
+    """Scale grey values to 0..1."""
+    stored = np.asarray(image)
+    if image.mode != _FLOAT:
+        values: F64 = stored / 65535.0
+        inverted = isinstance(image, TiffImagePlugin.TiffImageFile) and (
+            image.tag_v2.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == _WHITE_IS_ZERO
+        )
+        return 1.0 - values if inverted else values
+    low, high = float(stored.min()), float(stored.max())
+    if not (low >= -_FLOAT_TOLERANCE and high <= 1.0 + _FLOAT_TOLERANCE):
+        raise InputError(f"{path} holds floats from {low:g} to {high:g}, expected 0 to 1: scale them, or save as PNG")
+    return np.clip(stored.astype(np.float64), 0.0, 1.0)
+
+
+def _grey_mask(image: Image.Image, path: Path) -> U8:
+    """Bring a mask of more than 8 bits to 8: labels and values up to 255 stay what they are, others are scaled."""
+    stored = np.asarray(image)
+    low, high = float(stored.min()), float(stored.max())
+    if low >= 0.0 and high <= 255.0 and (image.mode != _FLOAT or high > 1.0):
+        values: U8 = np.rint(stored).astype(np.uint8)
+        return values
+    _stored_as(image, path)
+    return np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
+
+
+def _unread_kind(path: Path) -> str | None:
+    """Recognise an image by its first bytes where pillow does not open it."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_SIZE)
+    except OSError:
+        return None
+    return next((name for at, magic, name in _UNREAD if head[at:].startswith(magic)), None)
