@@ -23,7 +23,7 @@ _ROUNDING = 1.0  # pixels, of each side of an image that was made smaller
 _NEARLY = 0.02  # relative, of scales across and down: beyond it an image was cropped, turned, or is another camera's
 _MIDDLE = (0.25, 0.75)  # of the image: principal points elsewhere are reported
 _SMALL_RANGE = 1.0 / 8.0  # of what 16 bits hold: images of 12 bits are as dark as that
-_SAME = 1e-6  # relative, of places
+_SAME = 1e-9  # relative, of places; coordinates of maps are a million times the distance of cameras
 _SHOTS, _POINTS = 64, 4096  # of a set, at most, that are looked at to see whether they belong together
 
 
