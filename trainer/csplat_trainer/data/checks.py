@@ -20,7 +20,7 @@ from csplat_trainer.data.pixels import shown_size
 __all__ = ["check_shots", "notes_on_images", "notes_on_lenses", "notes_on_poses"]
 
 _ROUNDING = 1.0  # pixels, of each side of an image that was made smaller
-_NEARLY = 0.02  # relative, of scales across and down: beyond it an image was cropped, turned, or is another camera's
+_NEARLY = 0.02  # relative, of scales across and down: beyond it an image is turned, or a mask is another image's
 _MIDDLE = (0.25, 0.75)  # of the image: principal points elsewhere are reported
 _SMALL_RANGE = 1.0 / 8.0  # of what 16 bits hold: images of 12 bits are as dark as that
 _SAME = 1e-9  # relative, of places; coordinates of maps are a million times the distance of cameras
@@ -41,12 +41,16 @@ def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> None:
         check_intrinsics((lens.fx, lens.fy), (lens.cx, lens.cy), (lens.width, lens.height), lens.source)
     for shot in shots:
         lens, size = shot.lens, shown_size(shot.path, heads[shot.path].size, shot.lens)
-        source = f"which {lens.source} states" if lens.source else "its camera's"
-        remedy = "cropped or squeezed images need the intrinsics of what they are now"
-        _check_shape(shot.path, size, (lens.width, lens.height), source, remedy)
+        wanted = (lens.width, lens.height)
+        if _misfit(size, wanted) > _NEARLY >= _misfit((size[1], size[0]), wanted):
+            source = f"which {lens.source} states" if lens.source else "its camera's"
+            remedy = "the sides are swapped: turn the images, or find poses of them as they are"
+            raise _misshapen(shot.path, size, wanted, source, remedy)
         if shot.mask is not None:
             mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
-            _check_shape(shot.mask, mask_size, size, f"its image's ({shot.name})", "it is the mask of another image")
+            if _misfit(mask_size, size) > _NEARLY:
+                remedy = "it is the mask of another image"
+                raise _misshapen(shot.mask, mask_size, size, f"its image's ({shot.name})", remedy)
 
 
 def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> list[str]:
@@ -71,8 +75,9 @@ def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> l
     if misfits:
         (width, height), lens = sizes[misfits[0].path], misfits[0].lens
         notes.append(
-            f"{counted(len(misfits), 'image')} not quite of the shape of their cameras' ({misfits[0].path.name}: "
-            f"{width}×{height}, {lens.width:g}×{lens.height:g}): each side is scaled by itself"
+            f"{counted(len(misfits), 'image')} not of the shape of their cameras' ({misfits[0].path.name}: "
+            f"{width}×{height}, {lens.width:g}×{lens.height:g}): each side is scaled by itself, which suits squeezed "
+            "images; cropped ones need other intrinsics"
         )
     turned = [path for path, size in sizes.items() if size != heads[path].size]
     if turned:
@@ -146,15 +151,9 @@ def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
     return bool(((z > 0.0) & across & down).any())
 
 
-def _check_shape(path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str) -> None:
-    """Refuse an image that is not its camera's, or its image's, made smaller or larger as a whole."""
-    if _misfit(size, wanted) <= _NEARLY:
-        return
-    (width, height), (wanted_width, wanted_height) = size, wanted
-    if _misfit((height, width), wanted) <= _NEARLY:
-        remedy = "the sides are swapped: turn the images, or find poses of them as they are"
-    shape = f"{wanted_width:g}×{wanted_height:g}"
-    raise InputError(f"{path} is {width}×{height} pixels, expected the shape of {shape}, {source}: {remedy}")
+def _misshapen(path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str) -> InputError:
+    found, shape = f"{size[0]}×{size[1]}", f"{wanted[0]:g}×{wanted[1]:g}"
+    return InputError(f"{path} is {found} pixels, expected the shape of {shape}, {source}: {remedy}")
 
 
 def _misfit(size: tuple[int, int], wanted: tuple[float, float]) -> float:
