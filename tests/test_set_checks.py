@@ -1,6 +1,7 @@
 """Data sets that contradict themselves: sizes, lenses and poses that cannot be those of the images."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -153,13 +154,42 @@ def test_smaller_images_may_be_rounded_either_way(tmp_path):
     assert line.startswith("10 images not of the shape of their cameras' (0001.png: 480×324, 480×320)")
 
 
-def test_a_quaternion_of_another_length_is_refused(tmp_path):
+def test_a_rotation_of_another_length_is_normalised_and_reported(tmp_path):
     write_colmap_set(tmp_path, text=True)
     file = tmp_path / "sparse" / "0" / "images.txt"
-    number, w, *rest = next(line for line in file.read_text().splitlines() if "png" in line).split(" ")
-    file.write_text(f"{number} {float(w) + 1} {' '.join(rest)}\n\n")
-    with pytest.raises(InputError, match=r"images\.txt, line 1: the rotation QW QX QY QZ has length .* expected 1"):
-        load(tmp_path)
+    pose = next(line for line in file.read_text().splitlines() if "im 002" in line)
+    number, *quaternion, x, y, z, camera, im, name = pose.split(" ")
+    longer = " ".join(str(2.0 * float(value)) for value in quaternion)
+    file.write_text(file.read_text().replace(pose, f"{number} {longer} {x} {y} {z} {camera} {im} {name}"))
+    data = load(tmp_path)
+    line = "images.txt: 1 rotation QW QX QY QZ not of unit length, normalised: im 002.png has length 2"
+    assert line in data.report
+    assert np.allclose(cameras(9)[2].viewmat, data.train[1].camera.viewmat)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_cameras_and_poses_that_are_no_use_do_not_refuse_a_set(tmp_path, text):
+    write_colmap_set(tmp_path, text=text)
+    model = tmp_path / "sparse" / "0"
+    if text:
+        file = model / "cameras.txt"
+        file.write_text(f"{file.read_text()}8 OPENCV_FISHEYE 48 32 -nan(ind) 1 1 1 1 1 1 1\n9 LENS 1 1\n")
+        file = model / "images.txt"
+        pose = next(line for line in file.read_text().splitlines() if "im 003" in line)
+        number, *_, camera, im, name = pose.split(" ")
+        lost = f"{number} -nan(ind) nan 1.#IND -1.#QNAN00 0 0 0 {camera} {im} {name}"
+        file.write_text(file.read_text().replace(pose, lost))
+    else:
+        data = (model / "cameras.bin").read_bytes()
+        other = struct.pack("<iiQQ8d", 8, 5, 48, 32, *[np.nan] * 8)
+        (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + data[8:] + other)
+        data = (model / "images.bin").read_bytes()
+        at = data.index(b"im 003.png") - 4 - 56
+        (model / "images.bin").write_bytes(data[:at] + struct.pack("<7d", *[np.nan] * 7) + data[at + 56 :])
+    data = load(tmp_path, test_every=0)
+    assert 8 == len(data.train)
+    name = "images.txt" if text else "images.bin"
+    assert f"{name}: 1 image without a finite pose, left out: im 003.png" in data.report
 
 
 def test_doubtful_lenses_and_poses_are_reported(tmp_path):

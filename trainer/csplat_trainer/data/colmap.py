@@ -71,9 +71,11 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
-    cameras, (registered, report) = read_cameras(cameras_path), read_images(images_path)
+    registered, report = read_images(images_path)
+    used = {image.camera for image in registered}
+    cameras = read_cameras(cameras_path, used)
     other = cameras_path.with_suffix(".txt")
-    if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other)):
+    if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
         report.append(f"{other.name} holds other cameras than {cameras_path.name}, which is read")
     if not registered:
         raise InputError(f"{images_path} holds no images")

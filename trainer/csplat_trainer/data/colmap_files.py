@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
+from csplat_trainer.data.image_files import shown
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import finite_points
 
@@ -64,6 +66,9 @@ _LAYOUTS = {
 }
 
 
+_NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
+
+
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
     """A registered image.
@@ -79,11 +84,12 @@ class ColmapImage:
     viewmat: F64
 
 
-def read_cameras(path: Path) -> dict[int, Lens]:
+def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, Lens]:
     """Read cameras.bin or cameras.txt.
 
     Args:
         path: the file; its ending tells which.
+        used: ids of the cameras to read: others may have any lens; `None`: all.
 
     Raises:
         InputError: the file is damaged, or holds a lens that cannot be undone here.
@@ -91,10 +97,13 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     cameras = {}
     if path.suffix == ".txt":
         for words, where in _lines(path):
+            number = _integer(words[0], where)
+            if used is not None and number not in used:
+                continue
             numbers = _numbers(words[2:], where)
             if len(numbers) < 2:
-                raise InputError(f"{where}: wanted id, model, width, height, parameters")
-            cameras[_integer(words[0], where)] = _lens(words[1], numbers[0], numbers[1], numbers[2:], where)
+                raise InputError(f"{where}: expected id, model, width, height, parameters")
+            cameras[number] = _lens(words[1].upper(), numbers[0], numbers[1], numbers[2:], where)
         return cameras
     data = _Bytes(path)
     for _ in range(data.count(24)):
@@ -103,7 +112,8 @@ def read_cameras(path: Path) -> dict[int, Lens]:
         # How many parameters others have is of no interest: they are refused.
         parameter_count = len(_LAYOUTS.get(name, "").split())
         values = [float(value) for value in data.unpack(f"<{parameter_count}d")]
-        cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
+        if used is None or number in used or not parameter_count:  # of a lens without a name the end is not known
+            cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
     data.end()
     return cameras
 
@@ -112,30 +122,40 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     """Read images.bin or images.txt; the keypoints of each image are skipped.
 
     Returns:
-        The images, and a line if the text file has not the layout that COLMAP writes.
+        The images, and lines on what is unusual: the layout of the text; images without a finite pose, which are left
+        out; rotations that are not of unit length, which are normalised.
 
     Raises:
         InputError: the file is damaged.
     """
-    images = []
+    found: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, and where it stands
+    notes: list[str] = []
     if path.suffix == ".txt":
         lines, notes = _image_lines(path)
         for line, where in lines:
             words = line.split(None, 9)
             if len(words) < 10:
                 raise InputError(f"{where}: expected id, rotation, translation, camera and name")
-            pose = _numbers(words[1:8], where)
-            images.append(ColmapImage(words[9].rstrip(), _integer(words[8], where), _viewmat(pose, where)))
-        return images, notes
-    data = _Bytes(path)
-    for _ in range(data.count(73)):
-        number, *pose, camera = data.unpack("<i7di")
-        name = data.string()
-        (matches,) = data.unpack("<Q")
-        data.skip(24 * matches)
-        images.append(ColmapImage(name, camera, _viewmat(pose, f"{path}, image {number}")))
-    data.end()
-    return images, []
+            found.append((words[9].rstrip(), _integer(words[8], where), _numbers(words[1:8], where), where))
+    else:
+        data = _Bytes(path)
+        for _ in range(data.count(73)):
+            number, *pose, camera = data.unpack("<i7di")
+            name = data.string()
+            (matches,) = data.unpack("<Q")
+            data.skip(24 * matches)
+            found.append((name, camera, pose, f"{path}, image {number}"))
+        data.end()
+    finite = [one for one in found if np.isfinite(one[2]).all()]
+    lost = [name for name, _, pose, _ in found if not np.isfinite(pose).all()]
+    if lost:
+        notes.append(f"{path.name}: {counted(len(lost), 'image')} without a finite pose, left out: {shown(lost)}")
+    lengths = [(float(np.linalg.norm(pose[:4])), name) for name, _, pose, _ in finite]
+    other = [f"{name} has length {length:.4g}" for length, name in lengths if abs(length - 1.0) > _UNIT_TOLERANCE]
+    if other:
+        what = f"{counted(len(other), 'rotation')} QW QX QY QZ not of unit length, normalised"
+        notes.append(f"{path.name}: {what}: {shown(other)}")
+    return [ColmapImage(name, camera, _viewmat(pose, where)) for name, camera, pose, where in finite], notes
 
 
 def count_images(path: Path) -> int:
@@ -264,6 +284,8 @@ def _is_keypoints(words: list[str]) -> bool:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
+    """Read numbers, those that are none among them: C++ programs on Windows write `-nan(ind)` and `1.#IND`."""
+    words = [_NO_NUMBER.sub("nan", word) for word in words]
     try:
         return [float(word) for word in words]
     except ValueError as error:
@@ -301,16 +323,12 @@ def _lens(model: str, width: float, height: float, values: list[float], where: s
     return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3), tangential, (k4, k5, k6), source=where)
 
 
-def _viewmat(pose: list[float] | tuple[float, ...], where: str) -> F64:
-    """A matrix of a rotation w x y z and a translation."""
+def _viewmat(pose: Sequence[float], where: str) -> F64:
+    """Return the matrix of a rotation w x y z and a translation."""
     q, t = np.array(pose[:4], np.float64), np.array(pose[4:7], np.float64)
     length = float(np.linalg.norm(q))
-    if not (np.isfinite(length) and length > 0.0 and np.isfinite(t).all()):
-        raise InputError(f"{where}: the pose is not finite or its rotation is zero")
-    if abs(length - 1.0) > _UNIT_TOLERANCE:
-        raise InputError(
-            f"{where}: the rotation QW QX QY QZ has length {length:.4g}, expected 1: is another column among the four?"
-        )
+    if not (np.isfinite(length) and length > 0.0):
+        raise InputError(f"{where}: the rotation is zero, or beyond what a number holds")
     w, x, y, z = q / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
