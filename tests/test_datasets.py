@@ -490,10 +490,10 @@ def test_nothing_is_decoded_before_it_is_asked_for(request, monkeypatch, kind, s
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: decoded.add(file.filename) or decode(file))
     data = load(folder, size)
     wanted = (size or (W, H))[::-1]
-    assert not decoded
+    assert (kind == "blender") == len(decoded)  # whether there is transparency, one image tells
     assert all(picture.has_alpha == (kind == "blender") for picture in (*data.train, *data.test))
     assert data.background == ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0))
-    assert not decoded
+    decoded.clear()
     assert wanted == data.test[0].pixels.shape[:2]
     assert wanted == replace(data.test[0], camera=data.test[0].camera).pixels.shape[:2]
     assert 1 == len(decoded)  # a picture with another camera shares what was read
@@ -557,6 +557,21 @@ def test_a_mask_that_is_not_there_or_hides_all_is_refused(ngp):
     Image.fromarray(np.zeros((H, W), np.uint8)).save(ngp / "masks" / "one.png")
     with pytest.raises(InputError, match=r"the mask of images/0001\.png hides all of it"):
         load(ngp).read()
+
+
+def test_alpha_that_is_1_all_over_is_none(ngp):
+    for number in (1, 2, 3):
+        with Image.open(ngp / "images" / f"000{number}.png") as image:
+            image.convert("RGBA").save(ngp / "images" / f"000{number}.png")
+    data = load(ngp)
+    assert (0.0, 0.0, 0.0) == data.background
+    assert not any(picture.has_alpha for picture in data.train)
+    assert (H, W, 3) == data.train[0].pixels.shape
+    assert "alpha is 1 all over 3 images: they count as images without alpha" in data.report
+    Image.new("RGBA", (W, H)).save(ngp / "images" / "0005.png")
+    data = load(ngp)
+    assert (1.0, 1.0, 1.0) == data.background
+    assert 4 == sum(picture.has_alpha for picture in (*data.train, *data.test))
 
 
 def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):

@@ -14,7 +14,7 @@ Every way of storing pixels that pillow opens is read for what it means, or refu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,7 @@ __all__ = [
     "MaskValues",
     "image_size",
     "mask_values",
+    "opaque_images",
     "opened_image",
     "read_head",
     "rgb_pixels",
@@ -137,6 +138,28 @@ def read_head(path: Path) -> ImageHead:
         # Phones append images for depth or brightness to a JPEG ("MPO"): nobody means them.
         frame_count = 1 if image.format == "MPO" else int(getattr(image, "n_frames", 1))
         return ImageHead(path, image.size, stored_as, has_alpha, orientation, frame_count)
+
+
+def opaque_images(heads: Iterable[ImageHead]) -> list[ImageHead]:
+    """Find out whether images have an alpha channel that says nothing, as exporters of photographs write.
+
+    Alpha is decoded until an image has some transparency: then that of all counts.
+
+    Args:
+        heads: of the files of a set.
+
+    Returns:
+        All images with an alpha channel if it is 1 all over all of them; else none.
+
+    Raises:
+        InputError: a file that is looked at is damaged.
+    """
+    with_alpha = [head for head in heads if head.has_alpha]
+    for head in with_alpha:
+        with opened_image(head.path) as image:
+            if (rgb_pixels(image, head.path)[..., 3:] < 255).any():
+                return []
+    return with_alpha
 
 
 def image_size(path: Path) -> tuple[int, int]:

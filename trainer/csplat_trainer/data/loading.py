@@ -15,7 +15,7 @@ from csplat_render.camera import MAX_IMAGE_SIZE
 from csplat_trainer.data.checks import check_shots, notes_on_images, notes_on_lenses, notes_on_poses
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Found, Shot, near_plane
-from csplat_trainer.data.image_pixels import read_head
+from csplat_trainer.data.image_pixels import opaque_images, read_head
 from csplat_trainer.data.level import find_level
 from csplat_trainer.data.pixels import picture_of
 from csplat_trainer.data.transforms import read_blender, read_transforms
@@ -67,6 +67,8 @@ def load(
     shots = [*found.train, *found.test]
     heads = {shot.path: read_head(shot.path) for shot in (*shots, *found.val)}
     check_shots([*shots, *found.val], heads)
+    opaque = opaque_images(heads.values())
+    heads |= {head.path: replace(head, has_alpha=False) for head in opaque}
     near = near_plane(shots) if near is None else near
     train, test, val = (
         [picture_of(shot, heads[shot.path], size, near) for shot in part]
@@ -82,6 +84,8 @@ def load(
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
         report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
+    if opaque:
+        report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
     report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *notes_on_poses(shots, found.points)]
     axes, up, said = _upright(found.coordinate_system, shots)
     return DataSet(

@@ -40,7 +40,8 @@ def picture_of(shot: Shot, head: ImageHead, size: tuple[int, int] | None, near: 
     width, height = shown_size(shot.path, head.size, shot.lens)
     lens = shot.lens.scaled(width, height)
     straight = undistorted_lens(lens) if lens.distorts else lens
-    read = partial(_read, shot.path, lens, straight, size, turned=(width, height) != head.size)
+    turned = (width, height) != head.size
+    read = partial(_read, shot.path, lens, straight, size, turned=turned, with_alpha=head.has_alpha)
     mask = None if shot.mask is None else UnreadMask(partial(_read_mask, shot.mask, lens, straight, size))
     width, height = size or (width, height)
     seen = straight.scaled(width, height)
@@ -85,10 +86,14 @@ def _upright(pixels: U8, image: Image.Image) -> U8:
     return turned[::-1] if flips else turned
 
 
-def _read(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool) -> U8:
+def _read(
+    path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
+) -> U8:
     """Pixels of a file, straight, in the size that is wanted; turned as EXIF says, or as they are stored."""
     with opened_image(path) as stored:
         pixels = rgb_pixels(stored, path)
+        if not with_alpha:
+            pixels = pixels[..., :3]
         if turned:
             pixels = _upright(pixels, stored)
     if lens.distorts:
