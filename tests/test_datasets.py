@@ -198,6 +198,17 @@ def test_points_are_those_of_ply_file_path(ngp):
         load(ngp)
 
 
+def test_points_of_a_blender_set_are_read_if_nothing_is_transparent(blender):
+    columns = "".join(f"property float {name}\n" for name in "xyz")
+    (blender / "points3d.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n1 2 3\n")
+    data = load(blender)
+    assert data.points is None
+    assert any("points3d.ply is not read" in line for line in data.report)
+    for path in blender.glob("t*/*.png"):
+        Image.new("RGB", (W, H)).save(path)
+    assert [[1.0, 2.0, 3.0]] == load(blender).points.tolist()
+
+
 def test_points_of_colmap_may_be_a_ply(colmap_set):
     model = colmap_set / "sparse" / "0"
     (model / "points3D.bin").unlink()

@@ -26,7 +26,7 @@ from csplat_render.camera_forms import (
 )
 from csplat_trainer.data.dataset import Found, Shot
 from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain, shown
-from csplat_trainer.data.image_pixels import image_size
+from csplat_trainer.data.image_pixels import image_size, read_head
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_listed
@@ -35,6 +35,7 @@ __all__ = ["read_blender", "read_transforms"]
 
 F32 = NDArray[np.float32]
 
+_POINT_CLOUDS = ("points3d.ply", "points3D.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _RATIONAL = "FULL_OPENCV"
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -61,7 +62,8 @@ def read_blender(folder: Path, images: str | None = None) -> Found:
     val_path = folder / "transforms_val.json"
     val = _shots(val_path, images, report, needed=False) if val_path.is_file() else []
     _check_distinct([*train, *test, *val], folder)
-    return Found("Blender set", train, test, report=report, coordinate_system=_BLENDER_AXES, val=val)
+    points, colours = _points_next_to(train, folder, report)
+    return Found("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
 
 
 def read_transforms(path: Path, test_every: int, images: str | None = None) -> Found:
@@ -234,6 +236,21 @@ def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple
     cloud = next((candidate for candidate in candidates if candidate.is_file()), None)
     if cloud is None:
         report.append(f"{path.name}: ply_file_path names {name}, which is not there: no points")
+        return None, None
+    report.append(f"points from {cloud.name}")
+    return read_point_cloud(cloud)
+
+
+def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F32 | None, F32 | None]:
+    """Read the points that 3DGS and its kin put next to a set of Blender's.
+
+    Where images have transparency they are not read: programs write random points there, and the outline says more.
+    """
+    cloud = next((path for name in _POINT_CLOUDS if (path := folder / name).is_file()), None)
+    if cloud is None:
+        return None, None
+    if train and read_head(train[0].path).has_alpha:
+        report.append(f"{cloud.name} is not read: the images' transparency says where splats may start")
         return None, None
     report.append(f"points from {cloud.name}")
     return read_point_cloud(cloud)
