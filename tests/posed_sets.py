@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.cameras import intrinsics, look_at, relative_to
 
 W, H = 48, 32
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,10 +38,10 @@ def write_picture(path, camera, mode="RGB", scale=1):
     Image.fromarray(pixels, mode).save(path)
 
 
-def assert_dots_are_where_points_fall(pictures):
+def assert_dots_are_where_points_fall(pictures, points=POINTS):
     for picture in pictures:
         camera = picture.camera
-        for point, colour in zip(POINTS, COLOURS, strict=True):
+        for point, colour in zip(points, COLOURS, strict=True):
             c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
             u, v = (camera.K @ (c / c[2]))[:2]
             assert (picture.pixels[int(v), int(u), :3] == colour).all()
@@ -61,12 +61,14 @@ def write_blender(folder, up=(0, 0, 1)):
         (folder / f"transforms_{part}.json").write_text(json.dumps(document))
 
 
-def write_transforms(folder, missing=(), up=(0, 0, 1)):
+def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
     frames = []
     for i, camera in enumerate(cameras(10, up=up)):
         if i not in missing:
             write_picture(folder / "images" / f"{i:04}.png", camera)
-        frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": to_opengl(camera)})
+        pose = np.array(to_opengl(camera))
+        pose[:3, 3] += at
+        frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": pose.tolist()})
     K = intrinsics(W, H, 50.0)
     intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
     document = {**intrinsic, "frames": frames}
@@ -88,8 +90,9 @@ def quaternion(rotation):
 MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
 
 
-def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H):
-    """A sparse model of cameras and the three points."""
+def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H, at=(0, 0, 0)):
+    """A sparse model of cameras and the three points, with all coordinates around another place."""
+    shots, points = [relative_to(np.negative(at), one) for one in shots], POINTS + at
     folder.mkdir(parents=True, exist_ok=True)
     K = shots[0].K
     parameters = parameters or [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
@@ -105,7 +108,7 @@ def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, wi
         (folder / "images.txt").write_text("# comment\n# another\n" + "".join(lines))
         rows = [
             f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 0 2 0\n"
-            for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+            for i, (p, c) in enumerate(zip(points, COLOURS, strict=True))
         ]
         (folder / "points3D.txt").write_text("# comment\n" + "".join(rows))
         return
@@ -116,17 +119,17 @@ def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, wi
         data += struct.pack("<i7di", i + 1, *pose, 7) + name.encode() + b"\0"
         data += struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
     (folder / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(POINTS))
-    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
+    data = struct.pack("<Q", len(points))
+    for i, (point, colour) in enumerate(zip(points, COLOURS, strict=True)):
         data += struct.pack("<Q3d3BdQ", i, *point, *map(int, colour), 0.5, i) + struct.pack("<ii", 1, 2) * i
     (folder / "points3D.bin").write_bytes(data)
 
 
-def write_colmap_set(folder, text=False, up=(0, 0, 1)):
+def write_colmap_set(folder, text=False, up=(0, 0, 1), at=(0, 0, 0)):
     shots = cameras(9, up=up)
     for i, camera in enumerate(shots):
         write_picture(folder / "images" / f"im {i:03}.png", camera)
-    write_colmap(folder / "sparse" / "0", shots, text=text)
+    write_colmap(folder / "sparse" / "0", shots, text=text, at=at)
 
 
 def rename_in_images_txt(folder, name):

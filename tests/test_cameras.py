@@ -9,7 +9,17 @@ from tables import failures
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera
-from csplat_render.cameras import central_camera, direction, intrinsics, load_cameras, look_at, orbit, save_cameras
+from csplat_render.cameras import (
+    camera_outliers,
+    central_camera,
+    direction,
+    intrinsics,
+    load_cameras,
+    look_at,
+    orbit,
+    relative_to,
+    save_cameras,
+)
 
 K = intrinsics(640, 480, 60.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -117,6 +127,58 @@ def test_the_central_camera_stands_and_looks_as_most_do():
     aside = look_at((0, 0, 0), (5, 0, 0), (0, -1, 0), K, 64, 48)
     assert row[2] is central_camera([aside, *row])
     assert row[0] is central_camera(row[:1])
+    far = look_at((0, 1e6, 0), (0, 1e6, 5), (0, -1, 0), K, 64, 48)
+    assert row[2] is central_camera([*row, far])
+
+
+def viewmats(positions, target=(0.0, 0.0, 4.0)):
+    """Cameras at some places, which all look at a point."""
+    K = intrinsics(64, 48, 50.0)
+    return np.stack([look_at(position, target, (0, -1, 0), K, 64, 48).viewmat for position in positions])
+
+
+def test_cameras_far_from_all_others_are_outliers():
+    rng = np.random.default_rng(0)
+    near = rng.normal(size=(16, 3))
+    for count in (1, 2, 4):
+        placed = near.copy()
+        placed[:count] *= 5000.0
+        placed += (1e6, 2e6, 3e6)
+        found = camera_outliers(viewmats(placed, (1e6, 2e6, 3e6 + 4)))
+        assert [True] * count + [False] * (16 - count) == found.tolist()
+
+
+def test_cameras_that_belong_to_a_set_are_no_outliers():
+    rng = np.random.default_rng(0)
+    ones = rng.normal(size=(90, 3))
+    ahead = np.geomspace(5.0, 2000.0, 20)[:, None] * np.array([1.0, 0.0, 0.0])
+    for name, positions, points in (
+        ("one", ones[:1], None),
+        ("all in one place", np.zeros((9, 3)), None),
+        ("three, one of them far away", [(0, 0, 0), (1, 0, 0), (1e5, 0, 0)], None),
+        ("a corridor", np.linspace((0, 0, 0), (1000, 0, 0), 200), None),
+        ("a flight towards a building", np.concatenate([ones, ahead]), None),
+        ("two places", np.concatenate([ones[:60], ones[60:] + np.array((1e4, 0, 0))]), None),
+        ("close-ups and overviews", np.concatenate([0.01 * ones[:80], ones[80:]]), None),
+        ("a tripod that was moved once", np.concatenate([1e-3 * ones[:15], [(0.5, 0, 0)]]), ones + np.array((0, 0, 3))),
+    ):
+        assert not camera_outliers(viewmats(positions), points).any(), name
+
+
+def test_cameras_around_an_origin_far_from_0_are_told_from_those_around_0(tmp_path):
+    K, place, path = intrinsics(64, 48, 50.0), np.array((500123.0, 4649876.0, 214.0)), tmp_path / "cameras.json"
+    own = [look_at((x, 3, 0), (0, 0, 5), (0, -1, 0), K, 64, 48) for x in (-2, 0, 2)]
+    for cameras, origin, said in (
+        (own, place, 0),
+        ([relative_to(-place, one) for one in own], place, 1),
+        (own, np.zeros(3), 0),
+        (own, np.array((0.0, 3.0, 1.0)), 0),
+    ):
+        save_cameras(path, cameras)
+        notes = []
+        found = load_cameras(path, notes, origin)
+        assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(own, found, strict=True))
+        assert said == len(notes)
 
 
 def standing(**fields):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,8 +32,10 @@ from posed_sets import (  # noqa: E402
     write_transforms,
 )
 
+from csplat_render.cameras import relative_to  # noqa: E402
 from csplat_trainer.data import load  # noqa: E402
 from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
+from csplat_trainer.starting import scene_of  # noqa: E402
 
 
 @pytest.fixture
@@ -414,6 +417,73 @@ def test_colours_do_not_bleed_from_where_nothing_is(tmp_path):
 def test_the_near_plane_follows_the_distance_of_the_cameras(blender):
     assert np.isclose(0.03 * np.sqrt(10.0), load(blender).train[0].camera.near)
     assert 0.011 == load(blender, near=0.011).train[0].camera.near
+
+
+FAR_PLACES = {"UTM": (500123.25, 4649876.5, 214.75), "ECEF": (-2.7e6, -4.3e6, 3.85e6), "one axis": (0.0, 0.0, 9000.0)}
+
+
+@pytest.mark.parametrize("write", [write_colmap_set, partial(write_colmap_set, text=True), write_transforms])
+@pytest.mark.parametrize("place", FAR_PLACES)
+def test_a_set_far_from_0_is_measured_from_an_origin_near_it(tmp_path, write, place):
+    at = np.array(FAR_PLACES[place])
+    write(tmp_path / "near")
+    write(tmp_path / "far", at=at)
+    near, far = load(tmp_path / "near"), load(tmp_path / "far")
+    assert any("coordinates lie far from 0" in line for line in far.report)
+    assert np.abs(at - far.origin).max() < 4.0
+    assert all(float(value).is_integer() for value in far.origin)
+    for one, other in zip((*near.train, *near.test), (*far.train, *far.test), strict=True):
+        assert np.allclose(one.camera.position, other.camera.position + far.origin - at, atol=1e-6)
+        assert near.train[0].camera.near == pytest.approx(other.camera.near)
+    assert_dots_are_where_points_fall([*far.train, *far.test], POINTS + at - far.origin)
+    if near.points is not None:
+        assert np.allclose(POINTS + at, far.points + np.array(far.origin), atol=1e-6)
+        assert np.float32 == far.points.dtype
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (20.0, -30.0, 10.0)])
+def test_a_set_near_0_keeps_its_coordinates(tmp_path, at):
+    write_colmap_set(tmp_path, at=at)
+    data = load(tmp_path)
+    assert (0.0, 0.0, 0.0) == data.origin
+    assert np.array_equal((POINTS + at).astype(np.float32), data.points)
+    write_transforms(tmp_path, at=at)
+    assert (0.0, 0.0, 0.0) == load(tmp_path / "transforms.json").origin
+
+
+def test_cameras_far_from_all_others_are_named_and_do_not_count(tmp_path):
+    write_colmap_set(tmp_path)
+    usual = load(tmp_path).train[0].camera.near
+    for moved, words in (
+        ([3], "the camera of im 003.png stands"),
+        ([3, 5], "the cameras of im 003.png, im 005.png stand"),
+        ([8], "1 test image will score badly"),
+    ):
+        shots = cameras(9)
+        for i in moved:
+            shots[i] = relative_to((3000.0, -4000.0 - 100 * i, 0.0), shots[i])
+        write_colmap(tmp_path / "sparse" / "0", shots)
+        data = load(tmp_path)
+        assert (7, 2) == (len(data.train), len(data.test))
+        assert [words in line for line in data.report if "times the usual distance" in line] == [True]
+        assert usual == pytest.approx(data.train[0].camera.near, rel=0.05)
+        assert scene_of(data.counted).extent < 5.0
+        assert (0.0, 0.0, 0.0) == data.origin
+    assert not any("usual distance" in line for line in reports_of_near_sets(tmp_path / "near"))
+
+
+def reports_of_near_sets(folder):
+    write_colmap_set(folder)
+    return load(folder).report
+
+
+def test_a_camera_beyond_float32_is_refused(tmp_path):
+    write_colmap_set(tmp_path)
+    shots = cameras(9)
+    shots[3] = relative_to((1e39, 0.0, 0.0), shots[3])
+    write_colmap(tmp_path / "sparse" / "0", shots)
+    with pytest.raises(InputError, match=r"camera of im 003.png stands .* units from 0"):
+        load(tmp_path)
 
 
 def test_refuses_what_is_no_data_set(tmp_path):

@@ -111,6 +111,8 @@ def test_a_path_leads_along_cameras_and_looks_as_they_do(spread, off):
         assert camera.viewmat[2, :3] @ towards > 0.95
     middle = np.mean([camera.position for camera in cameras], axis=0)
     assert np.linalg.norm(middle - places.mean(axis=0)) < 0.4
+    far = look_at([0, 5000.0, 0], [0, 0, 0], [0, 0, 1], K, 64, 48)
+    assert same(cameras, orbit_cameras(niche(), 24, 64, 48, along=[*known, far]))
 
 
 def test_surroundings_that_carry_cameras_are_travelled_along_them():

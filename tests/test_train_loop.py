@@ -12,7 +12,7 @@ from csplat import decode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.training import TrainedOn
 from csplat_render.camera import Camera
-from csplat_render.cameras import intrinsics, orbit
+from csplat_render.cameras import intrinsics, orbit, relative_to
 from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.training.train import tuning_after
@@ -138,6 +138,31 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, t
     resumed_as_if_never_stopped(make_data(make_model), TrainOptions(**QUICK, strategy=strategy), tmp_path)
 
 
+def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path):
+    """Also where the run goes on with images that are measured from another one."""
+    data, place = make_data(make_model), np.array((500123.0, 4649876.0, 214.0))
+    options = TrainOptions(**{**QUICK, "iterations": 30})
+    plain = train(data, options).model
+    moved = train(replace(data, origin=tuple(place)), options, outputs=Outputs(tmp_path / "c.npz")).model
+    assert tuple(place) == moved.origin
+    assert np.array_equal(plain.means, moved.means)
+    shift = np.array((1.0, -2.0, 0.5))
+    shifted = [replace(one, camera=relative_to(shift, one.camera)) for one in data.train]
+    other = DataSet("other", shifted, [], origin=tuple(place + shift))
+    again = train(other, options, outputs=Outputs(resume=tmp_path / "c.npz")).model
+    assert tuple(place + shift) == again.origin
+    assert np.allclose(plain.means - shift, again.means, atol=1e-5)
+
+
+def test_one_camera_far_away_does_not_stop_splats_from_learning(make_data, make_model):
+    data = make_data(make_model)
+    away = replace(data.train[0], camera=relative_to((3e4, 0.0, 0.0), data.train[0].camera))
+    far = replace(data, train=[away, *data.train[1:]])
+    assert data.train == data.counted
+    assert data.train[1:] == far.counted
+    assert scene_of(data.train).extent == pytest.approx(train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2)
+
+
 def resumed_as_if_never_stopped(data, options, folder):
     """Compare a run with one that goes on from the middle of it; return the run and the checkpoint of that."""
     outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"
@@ -220,6 +245,13 @@ def test_points_are_where_splats_start(make_data, make_model):
     result = train(given, TrainOptions(**{**QUICK, "iterations": 1}, lr_means=0.0, lr_means_final=0.0, noise=0.0))
     assert {tuple(row) for row in points.tolist()} == {tuple(row) for row in result.model.means.tolist()}
     assert result.metrics is None
+
+
+def test_points_that_no_camera_sees_are_refused(make_data, make_model):
+    data = replace(make_data(make_model), points=np.full((5, 3), 4e6, np.float32))
+    with pytest.raises(InputError, match="no camera sees any of the data set's 5 points, expected both in the same"):
+        train(data, TrainOptions(**QUICK))
+    assert train(data, TrainOptions(**{**QUICK, "iterations": 1}, init="box")).log["losses"]
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from PIL import Image
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat.training import TRAINING, TrainedOn
-from csplat_render.cameras import resized, save_cameras
+from csplat_render.cameras import relative_to, resized, save_cameras
 from csplat_render.judge import renderer
 from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
@@ -224,3 +224,25 @@ def test_another_origin_judges_alike(sets, scene):
     judges = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).photograph_judge() for one in (scene, moved)]
     assert judges[0].psnr(scene) == pytest.approx(judges[1].psnr(moved), abs=0.01)
     assert judges[0].psnr(scene) == pytest.approx(judges[0].psnr(moved), abs=0.01)
+
+
+def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
+    """The scene has another origin than the set, and the camera file none."""
+    place = np.array((500123.25, 4649876.5, 214.75))
+    shutil.copytree(sets["rgb"], tmp_path / "set")
+    document = json.loads((tmp_path / "set" / "transforms.json").read_text())
+    for frame in document["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += place
+        frame["transform_matrix"] = pose.tolist()
+    (tmp_path / "set" / "transforms.json").write_text(json.dumps(document))
+    far = replace(scene, origin=tuple(place))
+    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).photograph_judge().psnr(scene)
+    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).photograph_judge()
+    assert wanted == pytest.approx(judge.psnr(far), abs=0.01)
+    own = cameras(3)
+    save_cameras(tmp_path / "own.json", own)
+    save_cameras(tmp_path / "far.json", [relative_to(-place, one) for one in own])
+    one, other = (find_view_set(far, cameras=str(tmp_path / f"{name}.json")) for name in ("own", "far"))
+    assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(one.judges, other.judges, strict=True))
+    assert [False, True] == [any("stand around the scene's origin" in line for line in v.notes) for v in (one, other)]

@@ -20,38 +20,62 @@ from csplat.files import read_text
 from csplat_render.camera import DEFAULT_NEAR, Camera
 from csplat_render.camera_forms import check_intrinsics, foreign_cameras
 
-__all__ = ["central_camera", "intrinsics", "load_cameras", "look_at", "orbit", "relative_to", "resized", "save_cameras"]
+__all__ = [
+    "camera_outliers",
+    "central_camera",
+    "intrinsics",
+    "load_cameras",
+    "look_at",
+    "nearest_point",
+    "orbit",
+    "relative_to",
+    "resized",
+    "save_cameras",
+]
 
+B = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 
 _PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
+_FAR = 20.0  # usual distances from the middle beyond which a camera may be an outlier,
+_GAP = 5.0  # if it is this many times as far away as the farthest of the others,
+_ORIGIN_FAR = 100.0  # times the distance of cameras from an origin, at least, that the origin is from 0
+_MOST_OUTLIERS = 0.25  # share of the cameras: more of them are a part of the set
 
 
-def load_cameras(path: str | Path, report: list[str] | None = None) -> list[Camera]:
+def load_cameras(
+    path: str | Path, report: list[str] | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> list[Camera]:
     """Read a camera file.
 
     Args:
-        path: a JSON file, see above.
-        report: takes lines on how the file of another program was understood.
+        path: a JSON file, see above. Its cameras are relative to the scene's origin. Where that is a hundred times as
+            far from 0 as from the middle of the cameras, they are in coordinates of a map, and it is taken off.
+        report: takes lines on how the file was understood.
+        origin: [3], of the scene.
 
     Returns:
-        Its cameras, at least one.
+        Its cameras, at least one, relative to the origin.
 
     Raises:
         InputError: the file is absent, is not JSON, or holds something else than cameras.
     """
-    path = Path(path)
+    path, report = Path(path), [] if report is None else report
     try:
         entries = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a JSON file: {error}") from error
-    cameras = foreign_cameras(entries, str(path), [] if report is None else report)
+    cameras = foreign_cameras(entries, str(path), report)
     if cameras is None:
         cameras = _own_cameras(entries, path)
     for number, camera in enumerate(cameras):
         K = camera.K
         focals, middle = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
         check_intrinsics(focals, middle, (camera.W, camera.H), f"{path}, camera {number}")
+    away = np.median([camera.position for camera in cameras], axis=0) - origin
+    if _ORIGIN_FAR * float(np.linalg.norm(away)) < float(np.linalg.norm(origin)):
+        report.append(f"{path}: the cameras stand around the scene's origin, which is taken off their coordinates")
+        cameras = [relative_to(origin, camera) for camera in cameras]
     return cameras
 
 
@@ -78,11 +102,63 @@ def central_camera(cameras: Sequence[Camera]) -> Camera:
     Args:
         cameras: one at least.
     """
+    outliers = camera_outliers(np.stack([camera.viewmat for camera in cameras]))
+    cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
     places = np.stack([camera.position for camera in cameras])
     ahead = np.stack([camera.viewmat[2, :3] for camera in cameras])
     away = np.sqrt(np.sum((places - places.mean(axis=0)) ** 2, axis=1))
     turned = np.sqrt(np.sum((ahead - ahead.mean(axis=0)) ** 2, axis=1))
     return cameras[int(np.argmin(away / max(float(away.mean()), 1e-300) + turned))]
+
+
+def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> B:
+    """Find cameras that stand far away from all others, as structure from motion leaves them where it fails.
+
+    What cameras look at counts, too: of a set whose cameras stand close together, one is no outlier that is only as
+    far away as that. Distances that grow little by little (a flight towards a building) belong to the set.
+
+    Args:
+        viewmats: [N, 4, 4], world to camera, OpenCV axes.
+        points: [P, 3], points of the scene, where they are known.
+
+    Returns:
+        [N], true for outliers: none of fewer than four cameras, a quarter of all at most.
+    """
+    positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    middle = np.median(positions, axis=0)
+    with np.errstate(over="ignore"):  # beyond the square root of float64 all are infinitely far away
+        distances = np.sqrt(np.sum((positions - middle) ** 2, axis=1))
+    order = np.argsort(distances, kind="stable")
+    away = distances[order]
+    for first in range(math.ceil((1.0 - _MOST_OUTLIERS) * len(away)), len(away)):
+        if first < 3 or not away[first] > max(_FAR * away[len(away) // 2], _GAP * away[first - 1]):
+            continue
+        others = order[:first]
+        if points is not None and len(points):
+            subject = np.median(points, axis=0)
+        else:
+            subject = nearest_point(positions[others] - middle, viewmats[others, 2, :3]) + middle
+        if away[first] > _FAR * float(np.sqrt(np.sum((subject - middle) ** 2))):
+            outliers: B = distances >= away[first]
+            return outliers
+    return np.zeros(len(distances), np.bool_)
+
+
+def nearest_point(positions: F64, axes: F64) -> F64:
+    """Find the point nearest to all lines of sight, by least squares over the distances from the lines.
+
+    Args:
+        positions: [N, 3], where cameras stand.
+        axes: [N, 3], unit length, where they look.
+
+    Returns:
+        [3]. Of lines that are parallel the point nearest to the mean position: it has a little weight.
+    """
+    weight = 1e-6 * len(positions)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    left = across.sum(axis=0) + weight * np.eye(3)
+    right = np.einsum("nij,nj->i", across, positions) + weight * positions.mean(axis=0)
+    return np.asarray(np.linalg.solve(left, right), np.float64)
 
 
 def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:

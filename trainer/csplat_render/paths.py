@@ -21,7 +21,7 @@ from csplat.model import SplatModel
 from csplat.training import VIEW
 from csplat.upright import up_of
 from csplat_render.camera import Camera
-from csplat_render.cameras import direction, intrinsics, look_at, orbit
+from csplat_render.cameras import camera_outliers, direction, intrinsics, look_at, orbit
 from csplat_render.cloud import Cloud, detail, sample_cloud
 from csplat_render.standing import standing
 from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
@@ -242,6 +242,8 @@ def _beside(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -
     Returns:
         [count, 3] positions; [count, 3] directions of unit length; [3], which way is up.
     """
+    outliers = camera_outliers(np.stack([camera.viewmat for camera in cameras]))
+    cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
     rotations = np.stack([camera.viewmat[:3, :3] for camera in cameras])
     positions = np.stack([camera.position for camera in cameras])
     above = -np.mean(rotations[:, 1], axis=0) if up is None else np.array(up, np.float64)

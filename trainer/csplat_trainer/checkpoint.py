@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ class Checkpoint:
         queue: pictures that are still to come in this round.
         options: of the run, as a dictionary.
         log: what was logged so far.
+        origin: what the means are relative to.
     """
 
     iteration: int
@@ -40,6 +42,7 @@ class Checkpoint:
     queue: list[int]
     options: dict[str, Any]
     log: dict[str, Any]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
@@ -52,6 +55,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
         "queue": checkpoint.queue,
         "options": checkpoint.options,
         "log": checkpoint.log,
+        "origin": checkpoint.origin,
     }
     arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
     for kind in ("values", "first", "second"):
@@ -82,7 +86,19 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         facts["queue"],
         facts["options"],
         facts["log"],
+        _origin(path, facts),
     )
+
+
+def _origin(path: str | Path, facts: dict[str, Any]) -> tuple[float, float, float]:
+    """Return the origin that a checkpoint states; those of older versions state none, and had 0."""
+    try:
+        x, y, z = (float(value) for value in facts.get("origin", (0.0, 0.0, 0.0)))
+    except (TypeError, ValueError):
+        x = y = z = math.nan
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+        raise InputError(f"{path}: origin is {facts['origin']!r}, expected three numbers")
+    return x, y, z
 
 
 def _check(path: str | Path, parts: list[Splats]) -> None:

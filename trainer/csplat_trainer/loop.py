@@ -113,7 +113,7 @@ class _Run:
             raise InputError("there is no picture to train on")
         data.read()
         self._data, self._options, self._outputs = data, options, outputs
-        self._scene = scene_of(data.train)
+        self._scene = scene_of(data.counted)
         self._rng = Generator(PCG64(options.seed))
         self._iteration = 0
         self._queue: list[int] = []
@@ -176,7 +176,7 @@ class _Run:
             points = 0 if data.points is None or options.init in ("hull", "box") else len(data.points)
             count = points or max(1, int(_FIRST_SHARE * options.max_splats))
         return starting_splats(
-            data.train,
+            data.counted,
             scene,
             min(count, options.max_splats),
             options.sh_degree,
@@ -192,6 +192,10 @@ class _Run:
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._data.train)]
         self._log |= checkpoint.log
+        shift = np.subtract(checkpoint.origin, self._data.origin)
+        if shift.any():  # of a set with other cameras
+            means = checkpoint.parameters.values["means"]
+            checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
         return adapt(checkpoint.parameters, options, self._rng)
 
     def _step(self, degree: int) -> tuple[float, float]:
@@ -324,6 +328,7 @@ class _Run:
                 self._queue,
                 asdict(self._options),
                 self._log,
+                self._data.origin,
             ),
         )
 
@@ -332,7 +337,7 @@ class _Run:
         said = {TRAINING: self._data.trained_on(self._behind).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object shows itself, from any side
             said[VIEW] = _first_view([picture.camera for picture in self._data.train])
-        model = replace(model, metadata=said)
+        model = replace(model, metadata=said, origin=self._data.origin)
         return with_up(model, self._data.up, self._data.coordinate_system)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def scene_of(pictures: Sequence[Picture]) -> StartingScene:
     """Find out where the scene lies.
 
     Args:
-        pictures: at least one.
+        pictures: at least one, without outliers: `DataSet.counted`.
     """
     cameras = [picture.camera for picture in pictures]
     positions = np.array([camera.position for camera in cameras])
@@ -113,6 +113,11 @@ def starting_splats(
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         if bad:
             raise InputError(f"{bad} of the data set's {len(points)} points are NaN or infinite: wanted finite ones")
+        if not any(len(_pixels_at(picture, points.astype(np.float64))[0]) for picture in pictures):
+            raise InputError(
+                f"no camera sees any of the data set's {len(points)} points, expected both in the same coordinates:"
+                " --set init=box starts without points"
+            )
         means, colour = _at_points(points, colours, count, scene, rng)
     else:
         masked = have_masks and init in ("hull", "auto")

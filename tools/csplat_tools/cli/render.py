@@ -76,7 +76,8 @@ def render(
     Each picture takes the name of its camera's photograph, or a number. A
     film repeats for ever; WebP loses a little, GIF has 256 colours, PNG loses
     nothing. MP4 is H.264 and wants the film extra. Cameras stand relative to
-    the scene's origin, those of a data set where its pictures were taken.
+    the scene's origin, or around it where it is far from 0; those of a data set
+    where its pictures were taken.
     Camera files are our own, INRIA's cameras.json, camera paths of nerfstudio,
     and transforms.json.
     An orbit shows an object whole; inside of a room it goes where fine splats

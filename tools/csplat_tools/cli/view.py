@@ -54,13 +54,11 @@ def view(
       csplat view scene.csplat --no-browser --port 8000
     """
     out.check(inputs=(source, cameras))
-    report: list[str] = []
-    wishes = view_wishes(cameras, upright.upright(), report)
-    out.remark(*report)
+    wishes = view_wishes(cameras, upright.upright())
     with ExitStack() as stack:
         with out.bar() as progress:
             scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
-        wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
+        wishes |= _scene_wishes(scene, cameras, upright, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.findings(scene.findings)
@@ -97,15 +95,13 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    report: list[str] = []
-    wishes = view_wishes(cameras, upright.upright(), report)
-    out.remark(*report)
+    wishes = view_wishes(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
     with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
-        wishes |= seeming_wishes(upright.seeming(scene.seems_up, out))
+        wishes |= _scene_wishes(scene, cameras, upright, out)
         exported = export.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.findings(scene.findings)
@@ -143,6 +139,16 @@ def export_element(
     write_bytes(output, script)
     out.remark(f"{output}: {format_bytes(len(script))}, {format_bytes(len(gzip.compress(script)))} as servers send it")
     out.publish({"size_bytes": len(script)})
+
+
+def _scene_wishes(scene: ViewScene, cameras: str | None, upright: Upright, out: Output) -> dict[str, str]:
+    """Return what the page is told of a scene: cameras relative to its origin, which way seems to be up."""
+    wishes = {}
+    if cameras is not None:
+        report: list[str] = []
+        wishes = view_wishes(cameras, report=report, origin=scene.header.origin)
+        out.remark(*report)
+    return wishes | seeming_wishes(upright.seeming(scene.seems_up, out))
 
 
 def _encoded(scene: ViewScene, preset: str) -> list[str]:

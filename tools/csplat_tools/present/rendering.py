@@ -73,7 +73,7 @@ def find_cameras(
         raise InputError("wanted the cameras: a file of them, a data set, or a number for an orbit")
     cameras: list[Camera] = []
     if path is not None:
-        cameras = load_cameras(path, report)
+        cameras = load_cameras(path, report, model.origin)
     elif data is not None:
         shots = (
             data if orbit_count is None else replace(data, size=None)

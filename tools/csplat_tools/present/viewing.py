@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,13 +77,19 @@ def open_scene(path: str, *, preset: PresetName, progress: Progress | None = Non
         yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
 
 
-def view_wishes(camera: str | None, facts: SceneOverrides = _NONE, report: list[str] | None = None) -> dict[str, str]:
+def view_wishes(
+    camera: str | None,
+    facts: SceneOverrides = _NONE,
+    report: list[str] | None = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> dict[str, str]:
     """Put options into words that the page understands.
 
     Args:
         camera: a camera file, see `load_cameras`. The page looks from the first and steps through all of them.
         facts: axes and up instead of the scene's.
         report: takes lines on how the camera file of another program was understood.
+        origin: the scene's.
 
     Returns:
         Parameters of the page.
@@ -93,7 +99,7 @@ def view_wishes(camera: str | None, facts: SceneOverrides = _NONE, report: list[
     """
     wishes = {}
     if camera is not None:
-        entries = [one.to_json() for one in load_cameras(camera, report)]
+        entries = [one.to_json() for one in load_cameras(camera, report, origin)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
     if facts.coordinate_system is not None:
         wishes["axes"] = facts.coordinate_system

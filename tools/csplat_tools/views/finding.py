@@ -15,6 +15,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TrainedOn
@@ -80,7 +83,7 @@ def find_view_set(
 
     Args:
         source: the scene.
-        cameras: a camera file, relative to the scene's origin.
+        cameras: a camera file, see `csplat_render.cameras.load_cameras`.
         data: instead: a data set.
         background: behind everything; `None`: what the scene says it was trained in front of, else black.
         count: virtual views that teach; 16 more do, too, which a removal keeps apart to check what the others taught.
@@ -131,7 +134,7 @@ def _of_file(
     aside: int | None,
 ) -> ViewSet:
     report: list[str] = []
-    given = list({pose(camera): camera for camera in load_cameras(path, report)}.values())
+    given = list({pose(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
     said = TrainedOn.of(source.metadata)
     colour, notes = _colour(background, said)
     few = len(given) < _ENOUGH
@@ -159,7 +162,9 @@ def _of_data(
     wanted, notes = _settled(data, said)
     every = _TEST_EVERY if wanted.test_every is None else wanted.test_every
     found = load(wanted.path, wanted.size, images=wanted.images, test_every=every, near=wanted.near)
-    train, test, val = (_moved(part, source) for part in (found.train, found.test, evenly(found.val, _MOST_DECIDING)))
+    shift = np.subtract(source.origin, found.origin)
+    parts = (found.train, found.test, evenly(found.val, _MOST_DECIDING))
+    train, test, val = (_moved(part, shift) for part in parts)
     colour, more = _colour(background, said, photographs=True)
     if split == "train":
         train, test, val = [], train, []
@@ -214,8 +219,8 @@ def _named(colour: Colour) -> str:
     return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
 
 
-def _moved(pictures: Sequence[Picture], source: SplatModel) -> list[Picture]:
-    return [replace(one, camera=relative_to(source.origin, one.camera)) for one in pictures]
+def _moved(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> list[Picture]:
+    return [replace(one, camera=relative_to(shift, one.camera)) for one in pictures]
 
 
 def _virtual(

@@ -25,6 +25,7 @@ from csplat_trainer.data.splits import lists_next_to, split_every, split_listed
 __all__ = ["find_model", "read_colmap"]
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")  # with models in numbered folders, or one in itself
 _IMAGE_FOLDERS = ("images", "input", ".")
@@ -180,7 +181,7 @@ def _masks(folder: Path, names: list[str], report: list[str]) -> dict[str, Path]
     return masks.files
 
 
-def _points(model: Path, report: list[str]) -> tuple[F32, F32] | tuple[None, None]:
+def _points(model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
     """Read the points of a model; 3DGS keeps them as a PLY, too."""
     path = _file(model, "points3D")
     if path is not None:

@@ -163,11 +163,11 @@ def count_images(path: Path) -> int:
     return len(_image_lines(path)[0]) if path.suffix == ".txt" else _Bytes(path).count(73)
 
 
-def read_points(path: Path) -> tuple[F32, F32]:
+def read_points(path: Path) -> tuple[F64, F32]:
     """Read points3D.bin or points3D.txt.
 
     Returns:
-        Points, [P, 3] float32, and their colours, [P, 3] float32 in 0..1. Points that are not
+        Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1. Points that are not
         finite, or beyond float32, are left out.
     """
     points: list[tuple[float, ...]] = []

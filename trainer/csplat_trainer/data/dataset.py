@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
 from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR
+from csplat_render.cameras import camera_outliers, nearest_point
 from csplat_trainer.data.lens import Lens
 from csplat_trainer.pictures import Picture
 
@@ -33,7 +35,7 @@ class DataSet:
         name: kind and place, for messages: `COLMAP set /data/garden`.
         train: pictures to learn from, at least one.
         test: pictures that were held out; none if the set is too small or names none.
-        points: [P, 3] float32, points of the scene; `None` where the set has none.
+        points: [P, 3] float32, points of the scene, relative to `origin`; `None` where the set has none.
         points_rgb: [P, 3] float32 in 0..1, their colours.
         report: what was found, left out and changed, a line each.
         coordinate_system: as in `SplatModel`, where the kind of set has a custom.
@@ -42,6 +44,8 @@ class DataSet:
         size: what the pictures are scaled to, width and height; `None`: they are not.
         images: the folder of pictures that was asked for; `None`: the reader chose.
         val: pictures that the set names to decide by: they neither teach nor judge.
+        origin: [3] float64, what points and cameras are relative to, in the coordinates of the set's files; other than
+            0 where these lie so far from 0 that float32 would lose what shows.
     """
 
     name: str
@@ -56,6 +60,7 @@ class DataSet:
     size: tuple[int, int] | None = None
     images: str | None = None
     val: list[Picture] = field(default_factory=list)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -69,6 +74,19 @@ class DataSet:
             background: red, green, blue behind the splats when the scene was judged.
         """
         return TrainedOn(background, self.test_every, self.size, self.train[0].camera.near, self.images)
+
+    @cached_property
+    def outliers(self) -> list[Picture]:
+        """The images whose cameras stand far away from all others (`camera_outliers`)."""
+        images = [*self.train, *self.test, *self.val]
+        outliers = camera_outliers(np.stack([image.camera.viewmat for image in images]), self.points)
+        return [image for image, outlier in zip(images, outliers, strict=True) if outlier]
+
+    @property
+    def counted(self) -> list[Picture]:
+        """The training images that say where the scene lies: all but outliers, or all where only such are left."""
+        outliers = {id(image) for image in self.outliers}
+        return [image for image in self.train if id(image) not in outliers] or self.train
 
     def read(self) -> None:
         """Read all pictures that teach or judge now: a damaged one is found before anything is done with the others.
@@ -107,7 +125,7 @@ class Found:
         kind: `Blender set`, …
         train: shots to train on.
         test: shots that are held out.
-        points: [P, 3] float32 or `None`.
+        points: [P, 3] float64 or `None`.
         points_rgb: [P, 3] float32 in 0..1 or `None`.
         report: lines for the user.
         test_every: as in `DataSet`.
@@ -118,7 +136,7 @@ class Found:
     kind: str
     train: list[Shot]
     test: list[Shot]
-    points: F32 | None = None
+    points: F64 | None = None
     points_rgb: F32 | None = None
     report: list[str] = field(default_factory=list)
     test_every: int | None = None
@@ -126,19 +144,19 @@ class Found:
     val: list[Shot] = field(default_factory=list)
 
 
-def near_plane(shots: Sequence[Shot]) -> float:
+def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
     """A near plane that suits a set: a small part of the distance to what its cameras look at.
 
     Scene units are arbitrary where poses come from photographs; the renderer's default, which it
     never exceeds, may lie beyond the scene.
+
+    Args:
+        shots: at least one; outliers do not count.
+        points: [P, 3], points of the scene, where they are known.
     """
-    rotations = np.stack([shot.viewmat[:3, :3] for shot in shots])
-    positions = -np.einsum("nji,nj->ni", rotations, np.stack([shot.viewmat[:3, 3] for shot in shots]))
-    axes = rotations[:, 2]
-    # The point nearest to all lines of sight; a little of the middle keeps parallel lines solvable.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    left = across.sum(axis=0) + 1e-6 * len(shots) * np.eye(3)
-    right = np.einsum("nij,nj->i", across, positions) + 1e-6 * len(shots) * positions.mean(axis=0)
-    focus = np.linalg.solve(left, right)
+    viewmats = np.stack([shot.viewmat for shot in shots])
+    viewmats = viewmats[~camera_outliers(viewmats, points)]
+    positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    focus = nearest_point(positions, viewmats[:, 2, :3])
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
     return min(DEFAULT_NEAR, _NEAR * distance) if distance > 0.0 else DEFAULT_NEAR

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED
 from csplat.upright import Direction, up_of_axes
@@ -18,6 +20,7 @@ from csplat_trainer.data.dataset import DataSet, Found, Shot, near_plane
 from csplat_trainer.data.image_pixels import opaque_images, read_head
 from csplat_trainer.data.level import find_level
 from csplat_trainer.data.pixels import picture_of
+from csplat_trainer.data.placement import centre, describe_outliers
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["load"]
@@ -64,12 +67,13 @@ def load(
     found = _find(path, size, images, test_every)
     if not found.train:
         raise InputError(f"{path} leaves no images to train on")
+    found, origin = centre(found)
     shots = [*found.train, *found.test]
     heads = {shot.path: read_head(shot.path) for shot in (*shots, *found.val)}
     check_shots([*shots, *found.val], heads)
     opaque = opaque_images(heads.values())
     heads |= {head.path: replace(head, has_alpha=False) for head in opaque}
-    near = near_plane(shots) if near is None else near
+    near = near_plane(shots, found.points) if near is None else near
     train, test, val = (
         [picture_of(shot, heads[shot.path], size, near) for shot in part]
         for part in (found.train, found.test, found.val)
@@ -88,11 +92,11 @@ def load(
         report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
     report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *notes_on_poses(shots, found.points)]
     axes, up, said = _upright(found.coordinate_system, shots)
-    return DataSet(
+    data = DataSet(
         name,
         train,
         test,
-        found.points,
+        None if found.points is None else found.points.astype(np.float32),
         found.points_rgb,
         tuple(line for line in (*report, said) if line),
         axes,
@@ -101,7 +105,10 @@ def load(
         size,
         images,
         val,
+        origin,
     )
+    outliers = describe_outliers(data)
+    return replace(data, report=(*data.report, outliers)) if outliers else data
 
 
 def _upright(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None, str]:

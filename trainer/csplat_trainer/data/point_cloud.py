@@ -20,7 +20,7 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 _GREY = 127.5
 
 
-def finite_points(points: F64, colours: F64) -> tuple[F32, F32]:
+def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:
     """Leave out points that are not finite or beyond float32.
 
     Args:
@@ -28,15 +28,13 @@ def finite_points(points: F64, colours: F64) -> tuple[F32, F32]:
         colours: [P, 3], 0 to 255; clipped to that.
 
     Returns:
-        Points, [P, 3] float32, and their colours, [P, 3] float32 in 0..1.
+        Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1.
     """
-    with np.errstate(over="ignore"):
-        points32 = points.astype(np.float32)
-    good = np.isfinite(points32).all(axis=1) & np.isfinite(points).all(axis=1) & np.isfinite(colours).all(axis=1)
-    return points32[good], (np.clip(colours[good], 0.0, 255.0) / 255.0).astype(np.float32)
+    good = (np.abs(points) <= np.finfo(np.float32).max).all(axis=1) & np.isfinite(colours).all(axis=1)
+    return points[good], (np.clip(colours[good], 0.0, 255.0) / 255.0).astype(np.float32)
 
 
-def read_point_cloud(path: Path) -> tuple[F32, F32]:
+def read_point_cloud(path: Path) -> tuple[F64, F32]:
     """Read the points of a PLY, with or without colours; grey are those without.
 
     Args:

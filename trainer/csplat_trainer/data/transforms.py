@@ -34,6 +34,7 @@ from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_
 __all__ = ["read_blender", "read_transforms"]
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 _POINT_CLOUDS = ("points3d.ply", "points3D.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
@@ -225,7 +226,7 @@ def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str,
     return {name: found.files[mask] for name, mask in named.items()}
 
 
-def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple[F32 | None, F32 | None]:
+def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
     """Read the point cloud that nerfstudio's `ply_file_path` names, which has the coordinates of the cameras."""
     name = document.get("ply_file_path")
     if name is None:
@@ -241,7 +242,7 @@ def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple
     return read_point_cloud(cloud)
 
 
-def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F32 | None, F32 | None]:
+def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
     """Read the points that 3DGS and its kin put next to a set of Blender's.
 
     Where images have transparency they are not read: programs write random points there, and the outline says more.

@@ -158,7 +158,8 @@ def _views_of(data: DataSet, model: SplatModel) -> Views:
     """The photographs of a data set that teach, in front of what the scene says was behind it."""
     trained = TrainedOn.of(model.metadata)
     behind = data.background if trained is None else trained.background
-    looks = [View(relative_to(model.origin, one.camera), one) for one in data.train]
+    shift = np.subtract(model.origin, data.origin)
+    looks = [View(relative_to(shift, one.camera), one) for one in data.train]
     return split_views(looks, np.array(behind, np.float32))
 
 
