@@ -163,6 +163,21 @@ def test_one_camera_far_away_does_not_stop_splats_from_learning(make_data, make_
     assert scene_of(data.train).extent == pytest.approx(train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2)
 
 
+@pytest.mark.slow
+def test_large_units_make_no_other_scene(make_data, make_model):
+    data = make_data(make_model)
+
+    def larger(picture: Picture) -> Picture:
+        viewmat = picture.camera.viewmat.copy()
+        viewmat[:3, 3] *= 1e5
+        return replace(picture, camera=replace(picture.camera, viewmat=viewmat))
+
+    millimetres = replace(data, train=[larger(one) for one in data.train], test=[larger(one) for one in data.test])
+    options = TrainOptions(**{**QUICK, "iterations": 200})
+    usual, large = (train(one, options).metrics["psnr"] for one in (data, millimetres))
+    assert large == pytest.approx(usual, abs=1.0)
+
+
 def resumed_as_if_never_stopped(data, options, folder):
     """Compare a run with one that goes on from the middle of it; return the run and the checkpoint of that."""
     outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"

@@ -50,6 +50,7 @@ _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
 _LEFT_AT_ONCE, _STEPS_BETWEEN = 0.85, 100  # share of the splats that stays where some go late, and steps that follow
+_LARGE_EXTENT = 50.0  # scene units; the weight of the mean standard deviation is meant for scenes that are no larger
 _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
 
 
@@ -126,7 +127,8 @@ class _Run:
             parameters = self._go_on(load_checkpoint(outputs.resume))
         self._exposures = Exposures(len(data.train), self._log.get("exposures", ()))
         self._lpips = _lpips(options, outputs)
-        self._engine = _engine(parameters, options, self._lpips)
+        share = min(1.0, _LARGE_EXTENT / self._scene.extent)
+        self._engine = _engine(parameters, replace(options, scale_weight=share * options.scale_weight), self._lpips)
         self._behind = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._behind, np.float32)
 
