@@ -1,5 +1,6 @@
 """`csplat convert` and `csplat formats`: any format to any other, what is changed on the way, what is lost."""
 
+import inspect
 import json
 from dataclasses import replace
 
@@ -10,13 +11,18 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import formats
+from csplat.encoder import EncodeOptions
+from csplat.formats import spz, spz_file
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat.scene import scene_of
 from csplat.turning import in_axes
-from csplat_tools.cli.app import app
+from csplat_tools.cli.app import app, command_function
+from csplat_tools.files.by_disk import Scale
+from csplat_tools.files.convert import encode_file
 from csplat_tools.files.converting import convert_file
 from csplat_tools.files.filters import Filters, isolated
+from csplat_tools.files.scenes import opened_scenes
 
 
 def call(*words, status=0):
@@ -237,3 +243,36 @@ def keeps_what_both_call_exact(tmp_path, first, second, model):
     places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats have an order of their own
     assert np.allclose(*places, atol=1e-2 * max(1.0, np.abs(source.means).max()))
     assert min(source.sh_degree, other.degree) == found.sh_degree
+
+
+@pytest.mark.slow
+def test_every_command_that_reads_scenes_can_be_told_what_a_file_is(tmp_path, ply):
+    call("convert", ply, tmp_path / "a.splat")
+    bare = tmp_path / "bare"
+    (tmp_path / "a.splat").rename(bare)
+    assert "--from splat" in call("info", bare, status=1).stderr
+    assert json.loads(call("info", bare, "--from", "splat", "--json").stdout)["splats"] == 200
+    call("lint", bare, "--from", "splat")
+    call("convert", bare, tmp_path / "b.ply", "--from", "splat")
+    call("encode", bare, tmp_path / "b.csplat", "--from", "splat")
+    call("verify", tmp_path / "b.csplat", "--source", bare, "--from", "splat")
+    assert "the format is 'x', wanted one of" in call("encode", bare, "-", "--from", "x", status=1).stderr
+    for name in ("compare", "export-html", "finetune", "render", "sensitivity", "simplify", "tradeoff", "view"):
+        assert "read_as" in inspect.signature(command_function(name)).parameters, name
+
+
+def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_model, monkeypatch):
+    csplat.write(tmp_path / "a.spz", make_model(50, 1))
+    unpacked = []
+
+    def counting(*words, any_degree):
+        unpacked.append(words)
+        return spz_file.read_packed(*words, any_degree=any_degree)
+
+    monkeypatch.setattr(spz, "read_packed", counting)
+    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=Scale(by_disk=True))
+    assert 1 == len(unpacked)
+    with opened_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
+        assert 50 == one.count
+    assert 3 == len(unpacked)
+    assert csplat.decode(tmp_path / "a.csplat").sh_degree == 1

@@ -109,6 +109,7 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
         (SMALL.replace(b"little", b"big"), "wanted binary_little_endian"),
         (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
         (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "chunk 0 has no finite max_y"),
+        (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .* above max_x"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, data, says):

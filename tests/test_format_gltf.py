@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from filed import filed
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import formats, gltf_file
+from csplat.formats import formats, gltf_file, lint
 from csplat.model import SplatModel
 from csplat.turning import turned
 
@@ -177,6 +178,13 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
         path.write_text(json.dumps(said))
         return filed(path)
 
+    said["buffers"][0]["uri"] = "a%20b.bin"
+    for encoding in ("utf-8-sig", "utf-16"):
+        path.write_text(json.dumps(said), encoding=encoding)
+        assert 2 == len(filed(path))
+    (path.parent / "lfs.bin").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(InputError, match=r"lfs\.bin' is a pointer of Git LFS"):
+        read_from("lfs.bin")
     for uri in ("a%20b.bin", "data:application/octet-stream;base64," + base64.b64encode(data).decode()):
         assert TWO["POSITION"].tolist() == read_from(uri).means.tolist()
     for uri in ("../out.bin", "link.bin", str(tmp_path / "out.bin"), "http://a/b.bin", "no.bin", "", ".", "a\0b",
@@ -191,10 +199,11 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
         ("asset/version", "1.0", "wanted 2.0"),
         ("asset", 3, "no asset"),
         ("asset/extras", {"csplat": ["csplat origin 1"]}, "origin"),
-        ("extensionsRequired", [["x"], "EXT_meshopt_compression"], "EXT_meshopt_compression is not understood"),
+        ("extensionsRequired", 3, "extensionsRequired: found 3"),
+        ("meshes/0/primitives/0/extensions/KHR_draco_mesh_compression", {}, "draco_mesh_compression is not understood"),
         ("meshes/0/primitives/0/extensions", {}, "no splats"),
         (f"meshes/0/primitives/0/extensions/{PREFIX}/kernel", "sphere", "kernel: found 'sphere'"),
-        (f"meshes/0/primitives/0/extensions/{PREFIX}/colorSpace", "lin_rec709_display", "colorSpace: found"),
+        (f"meshes/0/primitives/0/extensions/{PREFIX}/colorSpace", "acescg", "colorSpace: found"),
         (f"meshes/0/primitives/0/extensions/{PREFIX}/extensions", {"packed": {}}, "packed is not understood"),
         ("meshes/0/primitives/0/attributes/POSITION", 99, "accessors/99: there is none"),
         ("meshes/0/primitives/0/attributes/POSITION", 3, "wanted 3 numbers"),
@@ -212,7 +221,7 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
         ("bufferViews/0/byteStride", 4, "every 4"),
         ("bufferViews/0/extensions", {"EXT_meshopt_compression": {}}, "packed buffers"),
         ("bufferViews/0/buffer", 7, "buffers/7: there is none"),
-        ("buffers/0/byteLength", 10**9, "truncated"),
+        ("bufferViews/4/byteOffset", 5000, "of a buffer of"),
         ("buffers/0/uri", [], "uri: found"),
         ("nodes/0/children", [0], "more than one parent"),
         ("nodes/0/scale", [1, 0, 1], "flattens"),
@@ -231,6 +240,7 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
 def test_what_breaks_a_rule_is_refused_by_its_place(place, value, says):
     said, data = document(TWO)
     said["nodes"].append({"mesh": 0, "translation": [1, 2, 1e39]})
+    said["extensionsRequired"] = ["KHR_draco_mesh_compression"]
     *above, key = place.split("/")
     holder = said
     for step in above:
@@ -258,6 +268,215 @@ def test_values_that_are_not_finite_are_refused(name):
     array[1, 0] = np.nan
     with pytest.raises(InputError, match=r"data, splats 0 to 1: .* NaN"):
         read(*document(TWO | {name: array}))
+
+
+def linted(path, said, data):
+    """What lint finds in a file, and its splats along the axes of the file."""
+    path.write_bytes(glb(said, data))
+    return {one.id: one for one in lint(path)}, filed(path)
+
+
+def many(count=40, **changed):
+    """Attributes of more splats, with some of them in other values."""
+    rng = np.random.default_rng(0)
+    arrays = {name: np.resize(array, (count, array.shape[1])).copy() for name, array in TWO.items()}
+    arrays[f"{PREFIX}:SCALE"] = rng.uniform(0.01, 0.1, (count, 3)).astype("<f4")
+    arrays[f"{PREFIX}:SH_DEGREE_0_COEF_0"] = rng.uniform(-1.5, 1.5, (count, 3)).astype("<f4")
+    return arrays | {f"{PREFIX}:{name}": value for name, value in changed.items()}
+
+
+def test_logarithms_are_recognised_by_their_sign(tmp_path):
+    arrays = many()
+    right = filed(glb(*document(arrays)))
+    logs = np.log(arrays[f"{PREFIX}:SCALE"])
+    said, data = document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"})
+    found, model = linted(tmp_path / "a.glb", said, data)
+    assert ("repair", 40) == (found["log-scales"].kind, found["log-scales"].count)
+    assert "written by writer 1" in found["log-scales"].text
+    np.testing.assert_allclose(right.scales, model.scales, atol=1e-6)
+    with pytest.raises(InputError, match="log-scales"):
+        csplat.read(tmp_path / "a.glb", strict=True)
+
+
+@pytest.mark.parametrize("values", [[-0.5], [-40.0] * 39])
+def test_negative_scales_that_are_no_logarithms_are_refused_by_splat_and_value(tmp_path, values):
+    scales = many()[f"{PREFIX}:SCALE"]
+    scales[1 : 1 + len(values), 2] = values
+    (tmp_path / "a.glb").write_bytes(glb(*document(many(SCALE=scales))))
+    with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
+        csplat.read(tmp_path / "a.glb")
+    assert ["error"] == [one.kind for one in lint(tmp_path / "a.glb") if one.id == "negative-scales"]
+
+
+def test_scales_of_large_splats_are_no_logarithms(tmp_path):
+    for writer, findings in (("other", []), ("splat-transform 2.3.1", ["unclear-scales"])):
+        asset = {"version": "2.0", "generator": writer}
+        found, model = linted(tmp_path / "a.glb", *document(many(SCALE=np.full((40, 3), 5, "<f4")), asset=asset))
+        assert findings == list(found)
+        np.testing.assert_allclose(np.log(5), model.scales, rtol=1e-6)
+
+
+def test_opacities_out_of_range_are_clipped_read_as_logits_or_refused(tmp_path):
+    opacities = np.linspace(0, 1.4, 40, dtype="<f4")[:, None]
+    found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=opacities)))
+    assert ("repair", 12) == (found["out-of-range-opacities"].kind, found["out-of-range-opacities"].count)
+    assert np.minimum(opacities[:, 0], 1).tolist() == model.opacities.tolist()
+    logits = np.linspace(-6, 6, 40, dtype="<f4")[:, None]
+    found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=logits)))
+    assert "repair" == found["logit-opacities"].kind
+    np.testing.assert_allclose(1 / (1 + np.exp(-logits[:, 0])), model.opacities, atol=1e-6)
+    (tmp_path / "a.glb").write_bytes(glb(*document(many(OPACITY=np.linspace(0, 255, 40, dtype="<f4")[:, None]))))
+    with pytest.raises(InputError, match=r"OPACITY of splat 1 is 6\.53846, expected 0 to 1"):
+        csplat.read(tmp_path / "a.glb")
+
+
+def test_rotations_of_length_0_are_told(tmp_path):
+    found, model = linted(tmp_path / "a.glb", *document(TWO | {f"{PREFIX}:ROTATION": np.zeros((2, 4), "<f4")}))
+    assert 2 == found["zero-quats"].count
+    assert [[1, 0, 0, 0]] * 2 == model.quats.tolist()
+
+
+@pytest.mark.parametrize("bands", [{}, BAND])
+def test_linear_colours_are_fitted_and_the_error_is_told(tmp_path, bands):
+    said, data = document(TWO | {name: array * np.float32(0.02) for name, array in bands.items()})
+    raw = filed(glb(said, data))
+    said["meshes"][0]["primitives"][0]["extensions"][PREFIX]["colorSpace"] = "lin_rec709_display"
+    found, model = linted(tmp_path / "a.glb", said, data)
+    assert "repair" == found["linear-colours"].kind
+    told = float(found["linear-colours"].text.split("sRGB, ")[1].split()[0])
+    assert (told == 0) if not bands else (0 < told < 2)
+    view = np.array([0, 0.48860251 * -1 * 0.6, 0, 0.48860251 * -1 * 0.8], "f4")[
+        1:
+    ]  # the first band, seen along .8 .6 0
+
+    def colours(scene):
+        return 0.5 + 0.28209479 * scene.sh0 + (np.einsum("nkc,k->nc", scene.shN, view) if bands else 0)
+
+    linear = colours(raw)
+    wanted = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(wanted, colours(model), atol=0.01 if bands else 1e-6)
+
+
+def test_bands_above_the_third_are_left_out_when_fewer_are_asked_for():
+    names = [f"SH_DEGREE_{one}_COEF_{m}" for one in (1, 2, 3, 4) for m in range(2 * one + 1)]
+    bands = {f"{PREFIX}:{name}": np.ones((2, 3), "<f4") for name in names}
+    data = glb(*document(TWO | bands))
+    with pytest.raises(InputError, match="SH degree 4, expected at most 3: --sh-degree 3"):
+        csplat.read(data)
+    assert [3, 1] == [csplat.read(data, sh_degree=degree).sh_degree for degree in (3, 1)]
+
+
+def test_required_extensions_that_splats_do_not_use_mean_nothing():
+    said, data = document(TWO)
+    said["extensionsRequired"] = ["KHR_materials_unlit", "KHR_texture_basisu", "KHR_draco_mesh_compression", "X_y"]
+    said["meshes"].append({"primitives": [{"extensions": {"KHR_draco_mesh_compression": {"bufferView": 9}}}]})
+    said["nodes"].append({"mesh": 1})
+    said["scenes"][0]["nodes"].append(1)
+    assert TWO["POSITION"].tolist() == read(said, data).means.tolist()
+
+
+def test_hidden_nodes_are_not_shown():
+    said, data = document(TWO)
+    said["nodes"].append({"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}})
+    said["scenes"][0]["nodes"].append(1)
+    assert 2 == len(read(said, data))
+
+
+def test_every_instance_is_shown():
+    offsets, sizes = np.diag([1, 5, 9]).astype("<f4"), np.repeat(np.float32([[1], [2], [1]]), 3, 1)
+    arrays = TWO | {"T": offsets, "S": sizes}
+    said, data = document(arrays)
+    for name in "TS":
+        del said["meshes"][0]["primitives"][0]["attributes"][name]
+    said["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 5, "SCALE": 6}}}
+    model = read(said, data)
+    assert np.allclose(np.tile(TWO["POSITION"], (3, 1)) * sizes.repeat(2, 0) + offsets.repeat(2, 0), model.means)
+    said["accessors"][6]["count"] = 2
+    with pytest.raises(InputError, match=r"rows, wanted one number of instances"):
+        read(said, data)
+
+
+def test_an_early_draft_is_named():
+    arrays = {name.replace(f"{PREFIX}:", "_"): array for name, array in TWO.items()}
+    said, data = document(arrays)
+    said["meshes"][0]["primitives"][0]["extensions"][PREFIX] = {}
+    with pytest.raises(InputError, match="an early draft of KHR_gaussian_splatting"):
+        read(said, data)
+
+
+def packed(tmp_path, model, name, *, bounds=True, draft=False):
+    """A GLB that holds an SPZ of a scene, by one of the names that there were."""
+    csplat.write(tmp_path / "a.spz", replace(model, coordinate_system="RUB"))
+    data = (tmp_path / "a.spz").read_bytes()
+    inner = {name: {"bufferView": 0}}
+    splats = {} if draft else {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extensions = inner if name == OLD else {PREFIX: {**splats, "extensions": inner}}
+    said, _ = document({})
+    said["meshes"][0]["primitives"][0] |= {"attributes": {"POSITION": 0}, "extensions": extensions}
+    said |= {
+        "accessors": [{"componentType": 5126, "count": len(model), "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
+        "buffers": [{"byteLength": len(data)}],
+        "extensionsRequired": [PREFIX, name],
+    }
+    if bounds:
+        said["accessors"][0] |= {"min": model.means.min(0).tolist(), "max": model.means.max(0).tolist()}
+    return said, data
+
+
+OLD = "KHR_spz_gaussian_splats_compression"
+
+
+@pytest.mark.parametrize("name", [f"{PREFIX}_compression_spz_2", OLD])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_spz_in_a_glb_is_read(tmp_path, make_model, name, degree):
+    model = make_model(50, degree)
+    model = replace(model, means=np.abs(model.means), means_double=None)  # so that turning it leaves its bounds
+    said, data = packed(tmp_path, model, name)
+    said["nodes"][0]["translation"] = [10, 20, 30]
+    found, back = linted(tmp_path / "a.glb", said, data)
+    alone = filed(tmp_path / "a.spz")
+    assert ["spz-axes"] == list(found)
+    assert ("LUF", degree, 50) == (back.coordinate_system, back.sh_degree, len(back))
+    assert np.allclose(alone.means + np.array([10, 20, 30]), back.means, atol=1e-5)
+    assert (alone.shN == back.shN).all()
+    assert (alone.scales == back.scales).all()
+
+
+def test_spz_in_a_glb_is_turned_as_the_text_has_it_where_bounds_allow_it(tmp_path, make_model):
+    model = replace(make_model(50, 1), means_double=None)
+    name = f"{PREFIX}_compression_spz_2"
+    flip = np.float32([-1, 1, -1])
+    ends = np.sort(np.stack([model.means.min(0), model.means.max(0)]) * flip, axis=0)
+    turned_bounds = {"min": ends[0].tolist(), "max": ends[1].tolist()}
+    said, data = packed(tmp_path, model, name)
+    said["accessors"][0] |= turned_bounds
+    for one in (said, packed(tmp_path, model, name, bounds=False)[0]):
+        found, back = linted(tmp_path / "a.glb", one, data)
+        assert {} == found
+        assert np.allclose(filed(tmp_path / "a.spz").means * flip, back.means)
+    found, back = linted(tmp_path / "a.glb", *packed(tmp_path, model, name, bounds=False, draft=True))
+    assert "CesiumJS" in found["spz-axes"].text
+
+
+def test_spz_in_a_glb_that_contradicts_it_is_refused(tmp_path, make_model):
+    said, data = packed(tmp_path, make_model(50, 0), OLD)
+    said["accessors"][0]["count"] = 49
+    with pytest.raises(InputError, match="POSITION: 49 rows, its SPZ has 50"):
+        read(said, data)
+    said["accessors"][0]["count"] = 50
+    with pytest.raises(InputError, match=r"data, bufferViews/0 is no SPZ"):
+        read(said, b"x" * len(data))
+
+
+def test_a_buffer_that_is_shorter_than_it_says_is_told(tmp_path):
+    said, data = document(TWO)
+    said["buffers"][0]["byteLength"] += 1000
+    found, model = linted(tmp_path / "a.glb", said, data)
+    assert ["short-buffer"] == list(found)
+    assert TWO["POSITION"].tolist() == model.means.tolist()
+    with pytest.raises(InputError, match="truncated"):
+        read(said, data[:-8])
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import open_scene
+from csplat.formats import lint, open_scene
 from csplat.scene import BLOCK
 
 LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
@@ -115,6 +115,8 @@ def test_splats_that_are_not_finite_are_dropped_and_counted():
         (simple(1, partial=(1, 1)), "hold fewer than its 5 splats"),
         (simple(1, full=2), "2 full buckets and 2 others, of 3"),
         (simple(1, block=np.nan), "finite places"),
+        (simple(1, block=-5.0), "its blocks are -5 long"),
+        (ksplat(2, [section(rows(2, 5, 1), 2, 1)], sh=(2.0, -2.0)), "wanted numbers"),
         (simple(1, centres=CENTRES * np.float32(1.1e36)), "finite places"),
     ],
 )
@@ -143,3 +145,15 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, level):
     for at in told:
         says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
         assert not says or ("a.ksplat" in says and "\n" not in says)
+
+
+@pytest.mark.parametrize(("scale", "found"), [(-4.0, "log-scales"), ([0.5, -0.5, 0.5], "negative-scales")])
+def test_forbidden_values_are_told(tmp_path, scale, found):
+    table = rows(1, 5, 0)
+    table["s"] = scale
+    table["q"][2] = 0
+    (tmp_path / "a.ksplat").write_bytes(ksplat(1, [section(table, 1, 0)]))
+    findings = {one.id: one.count for one in lint(tmp_path / "a.ksplat")}
+    assert {"zero-quats": 1, found: 5} == findings
+    scales = csplat.read(tmp_path / "a.ksplat").scales
+    np.testing.assert_allclose(-4 if found == "log-scales" else np.log(0.5), scales, rtol=1e-6)

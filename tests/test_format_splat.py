@@ -1,13 +1,15 @@
 """.splat: rows of 32 bytes, read and written."""
 
+import gzip
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import open_scene
+from csplat.formats import insisting, lint, open_scene
 from csplat.scene import BLOCK
 
 ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
@@ -63,3 +65,62 @@ def test_a_cut_row_is_refused(tmp_path):
     (tmp_path / "a.splat").write_bytes(ROW[:-1])
     with pytest.raises(InputError, match=r"a\.splat has 31 bytes, wanted a multiple of 32"):
         csplat.read(tmp_path / "a.splat")
+
+
+def plausible(rows):
+    """Rows as a scene might have them, and one for each index of `rows` with what is given."""
+    table = np.zeros(20, [("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
+    table["means"], table["scales"] = np.random.default_rng(0).normal(0, 5, (2, 20, 3))
+    table["scales"] = np.abs(table["scales"]) / 100
+    table["quats"] = [128, 0, 128, 128]
+    for name, values in rows.items():
+        table[name] = values
+    return table.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (b"<!DOCTYPE html><html>" + b"a" * 3083, "is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
+        (b'{"message": "Not Found"}'.ljust(64), "is JSON"),
+        (gzip.compress(bytes(100), mtime=0).ljust(64), "gunzip"),
+        (b"what somebody wrote down, in many words of English".ljust(96), "hardly .splat: .* at byte 0 lies at"),
+        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: 9.% of 40 rows are no splats"),
+        (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
+    ],
+)
+def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, says):
+    (tmp_path / "a.splat").write_bytes(data)
+    with pytest.raises(InputError, match=says):
+        csplat.read(tmp_path / "a.splat")
+    if len(data) % 32 == 0:
+        with insisting("splat"), open_scene(tmp_path / "a.splat") as scene:
+            assert "splat" == scene.format
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("count", [1, 2, 30])
+def test_scenes_of_any_size_are_no_doubt(tmp_path, make_model, size, count):
+    model = make_model(count, 0)
+    means, scales = model.means * np.float32(size) + np.float32(size), model.scales + np.float32(np.log(size))
+    csplat.write(tmp_path / "a.splat", replace(model, means=means, scales=scales, means_double=None))
+    assert count == len(csplat.read(tmp_path / "a.splat"))
+    csplat.write(tmp_path / "a.splat", replace(model, means=np.zeros((count, 3), np.float32), means_double=None))
+    assert count == len(csplat.read(tmp_path / "a.splat"))
+
+
+def test_forbidden_values_are_told(tmp_path):
+    path = tmp_path / "a.splat"
+    scales = np.full((20, 3), 0.1)
+    scales[3, 1] = -0.1
+    path.write_bytes(plausible({"scales": scales}))
+    (finding,) = lint(path)
+    assert ("negative-scales", 1, "repair") == (finding.id, finding.count, finding.kind)
+    assert "scale of splat 3 is -0.1" in finding.text
+    np.testing.assert_allclose(np.log(0.1), csplat.read(path).scales, rtol=1e-6)
+    path.write_bytes(plausible({"scales": np.full((20, 3), -3.0)}))
+    assert [("log-scales", 20)] == [(one.id, one.count) for one in lint(path)]
+    assert (csplat.read(path).scales == -3).all()
+    path.write_bytes(plausible({"quats": 128}))
+    assert [("zero-quats", 20)] == [(one.id, one.count) for one in lint(path)]

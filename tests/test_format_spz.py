@@ -236,7 +236,7 @@ def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_mode
 
 #: Tests of SPZ's repository that fail on csplat, by the beginning of their names, and why.
 FAIL_ON_CSPLAT = {
-    # SH of degree 4 is refused
+    # the fourth band of SH is left out
     "test_cross_family_round_trip[4-", "test_sh_degree_4_", "test_sh_rotation_higher_bands_orthogonal[3]",
     "test_sh_rotation_higher_bands_four_cycle[4]", "test_spz_version_3_or_higher_sh_degree_4",
     "test_version_3_or_higher_with_all_features",

@@ -8,7 +8,8 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import formats, open_scene, write_scene
+from csplat.formats import formats, insisting, open_scene, write_scene
+from csplat.formats import lint as formats_lint
 from csplat.ply import read_ply, write_ply
 from csplat.scene import BLOCK, Scene, scene_of
 
@@ -78,7 +79,7 @@ def test_what_a_format_has_no_place_for_is_told(make_model):
     model = make_model(10, 2, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     (ply,) = (one for one in formats() if one.name == "ply")
     assert () == ply.losses(model)
-    bare = type(ply)("bare", "Bare", (".bare",), lambda _path, _head: False, degree=0)
+    bare = type(ply)("splat", degree=0)
     assert ("SH bands 1 and 2", "that it is antialiased", "the origin", "metadata") == bare.losses(model)
 
 
@@ -96,12 +97,69 @@ def test_each_format_has_a_name_of_its_own():
         ("a.ply", b"hello, this is no scene", "not a PLY"),
         ("a.spx", b"hello", "gsbox"),
         ("a.gz", b"\x1f\x8b\x08\x00hello", "gunzip"),
+        ("a.glb", b"b3dm\1\0\0\0", "3D Tiles"),
+        ("a.ply", b"\x89PNG\r\n\x1a\n", "is a PNG, an image"),
+        ("a.json", b'{"cameras": []}', "is JSON"),
+        ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, as servers"),
+        ("a.ply", b"\xef\xbb\xbf<html>", "a web page"),
     ],
 )
 def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, says):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=says):
         csplat.read(tmp_path / name)
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 63327587\n"
+
+
+def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
+    says = "is a pointer of Git LFS, not the file itself: run `git lfs pull`"
+    ends = [end for one in formats() for end in one.suffixes]
+    for path in [tmp_path / ("a" + end if end.startswith(".") else end) for end in [*ends, ".txt"]]:
+        path.write_bytes(LFS)
+        for read in (csplat.read, read_ply, formats_lint):
+            with pytest.raises(InputError, match=says):
+                read(path)
+    (tmp_path / "meta.json").write_text('{"version": 2, "count": 1}')
+    for decode in (csplat.decode, csplat.open):
+        with pytest.raises(csplat.FormatError, match="git lfs pull"):
+            decode(tmp_path / "a.csplat")
+
+
+def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, make_model):
+    (tmp_path / "sog").mkdir()
+    csplat.write(tmp_path / "sog" / "meta.json", make_model(20, 0))
+    (tmp_path / "sog" / "quats.webp").write_bytes(LFS)
+    with pytest.raises(InputError, match=r"quats\.webp is a pointer of Git LFS"):
+        csplat.read(tmp_path / "sog")
+
+
+def test_a_zip_is_told_by_what_is_in_it(tmp_path):
+    for name, says in (
+        ("x.npy", "NumPy"),
+        ("scene.ply", r"a zip that holds scene\.ply: unzip it"),
+        ("a.usdc", "USD"),
+        ("a/data.pkl", "checkpoint"),
+    ):
+        with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+            archive.writestr(name, "")
+        with pytest.raises(InputError, match=says):
+            csplat.read(tmp_path / "a.sog")
+
+
+def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_model):
+    model = make_model(9, 0)
+    csplat.write(tmp_path / "a.splat", model)
+    csplat.write(tmp_path / "a.ply", model)
+    (tmp_path / "b").write_bytes((tmp_path / "a.splat").read_bytes())
+    with pytest.raises(InputError, match="--from splat reads it"):
+        csplat.read(tmp_path / "b")
+    with insisting("splat"):
+        assert (csplat.read(tmp_path / "b").scales == csplat.read(tmp_path / "a.splat").scales).all()
+        assert len(csplat.read(tmp_path / "a.ply")) == 9
+    with pytest.raises(InputError, match="the format is 'xyz'"), insisting("xyz"):
+        pass
 
 
 def test_names_that_no_format_has_are_refused(tmp_path, make_model):

@@ -403,11 +403,13 @@ def test_what_is_no_splats_is_named(path, names, after, says):
 
 
 def test_columns_of_moving_splats_are_named(path):
-    rows = good_rows(names=[*NAMES, "motion_0", "trbf_center"])
-    path.write_bytes(header(rows) + rows.tobytes())
-    assert "motion_0, trbf_center are no property of splats: dropped; the file holds splats that move" in (
-        found(path)["extra-columns"].text
-    )
+    for names in (["motion_0", "trbf_center"], ["t", "scale_t"]):
+        rows = good_rows(names=[*NAMES, *names])
+        path.write_bytes(header(rows) + rows.tobytes())
+        says = (
+            f"{', '.join(names)} are no property of splats: dropped; the file holds dynamic (4D) splats: their time is"
+        )
+        assert says in found(path)["extra-columns"].text
 
 
 def test_elements_that_move_splats_are_named(path):
@@ -417,11 +419,151 @@ def test_elements_that_move_splats_are_named(path):
     assert 5 == len(read_ply(path))
 
 
-def test_commas_in_numbers_are_named(path):
-    rows = good_rows(2)
-    lines = [" ".join(map(str, row)).replace(".", ",") for row in rows.tolist()]
-    path.write_bytes(header(rows, kind="ascii") + "\n".join(lines).encode() + b"\n")
-    with pytest.raises(InputError, match="row 0 of vertex: malformed input; it has a comma, expected a point"):
+def lines_of(rows):
+    return [" ".join(map(str, row)) for row in rows.tolist()]
+
+
+ROWS = good_rows(4)  # an x of 3.0 in the last row
+
+
+@pytest.mark.parametrize(
+    ("written", "says"),
+    [
+        (lambda lines: "\n".join(lines).replace(".", ","), "decimal commas"),
+        (lambda lines: "\n".join(lines).replace(".", ",").replace(" ", ";"), "decimal commas"),
+        (lambda lines: "\n".join(lines).replace(" ", ", "), "commas or semicolons between numbers"),
+        (lambda lines: "\n" + "\n\n".join(lines) + "\n\n", "blank lines"),
+        (lambda lines: "\n".join(lines).replace("\n3.0 ", "\n3D+00 "), "an exponent as Fortran writes it (1"),
+        (" ".join, "all values in one line"),
+        (lambda lines: "\n".join(lines).replace(" ", "\n"), "4 of vertex in 104 lines"),
+        (lambda lines: "\r".join([" ".join(lines[:2]), " ".join(lines[2:])]), "4 of vertex in 2 lines"),
+    ],
+)
+def test_rows_of_text_are_read_where_they_can_be_meant_in_one_way(path, written, says):
+    path.write_bytes(header(ROWS, kind="ascii") + written(lines_of(ROWS)).encode())
+    assert says in found(path)["unusual-rows"].text
+    model = read_ply(path)
+    assert np.array_equal(model.means[:, 0], ROWS["x"])
+    assert np.array_equal(model.quats[:, 3], ROWS["rot_3"])
+    assert np.array_equal(model.scales[:, 2], ROWS["scale_2"])
+
+
+@pytest.mark.parametrize("word", ["-nan(ind)", "nan(snan)", "-1.#IND", "1.#QNAN0", "-1.#INF00"])
+def test_numbers_that_are_none_are_known_as_other_languages_write_them(path, word):
+    lines = lines_of(ROWS)
+    path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines).replace("3.0", word, 1).encode())
+    assert {"unusual-rows": 1, "nonfinite-rows": 1} == {one.id: one.count for one in lint_ply(path)}
+    assert 3 == len(read_ply(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("\n3.0 ", "\n3,0 ", "row 3 of vertex: x is '3,0', expected a number"),
+        ("\n3.0 ", "\n3.0.0 ", r"row 3 of vertex: x is '3\.0\.0', expected a number"),
+        ("\n3.0 ", "\n", "row 3 of vertex has 25 values, expected 26"),
+        ("\n2.0 ", " 9.0\n", "row 1 of vertex has 27 values, expected 26"),
+    ],
+)
+def test_a_row_that_can_be_meant_in_several_ways_is_quoted(path, old, new, says):
+    path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines_of(ROWS)).replace(old, new, 1).encode())
+    with pytest.raises(InputError, match=says):
+        read_ply(path)
+
+
+def test_numbers_with_thousands_are_quoted(path):
+    lines = [line.replace(".0", "") for line in lines_of(good_rows(2, names=without("nx", "ny", "nz")))]
+    whole = [" ".join("1,000" for _ in line.split()) for line in lines]
+    path.write_bytes(header(good_rows(2, names=without("nx", "ny", "nz")), kind="ascii") + "\n".join(whole).encode())
+    with pytest.raises(InputError, match="x is '1,000', expected a number"):
+        read_ply(path)
+
+
+def test_rows_of_text_end_where_their_number_is_reached(path):
+    text = "\n\n".join(lines_of(ROWS))
+    path.write_bytes(header(ROWS, kind="ascii") + text.encode() + b"\n\nand more")
+    assert 8 == found(path)["trailing-bytes"].count
+    path.write_bytes(header(ROWS, kind="ascii", count=6) + text.encode())
+    assert 2 == found(path)["truncated"].count
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize(
+    ("written", "says"),
+    [
+        (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
+        (lambda head: head.replace(b"element", b"\nelement"), "a blank line"),
+        (lambda head: head.replace(b"end_header", b" \n\nend_header"), "2 blank lines"),
+        (lambda head: head.replace(b"vertex", b"Vertex"), "capitals in Vertex"),
+        (lambda head: head.upper(), "capitals in PLY FORMAT"),
+        (lambda head: head.replace(b"end_header", b"end_header \t"), "spaces next to end_header"),
+        (lambda head: head.replace(b"\n", b"\r\n", 4), "line ends of two kinds"),
+    ],
+)
+def test_headers_are_read_as_other_programs_spell_them(path, kind, written, says):
+    body = ROWS.tobytes() if kind != "ascii" else ("\n".join(lines_of(ROWS)) + "\n").encode()
+    path.write_bytes(written(header(ROWS, kind=kind, before=["comment Made by É"])) + body)
+    assert says in found(path)["unusual-header"].text
+    model = csplat.read(path)
+    assert np.array_equal(model.means[:, 0], ROWS["x"])
+    assert "by ??" in model.metadata["comments"][0].lower()
+    assert np.array_equal(model.scales[:, 2], ROWS["scale_2"])
+
+
+def test_a_carriage_return_alone_ends_the_header(path):
+    rows = good_rows(3)
+    rows["x"] = np.array([0x0A, 1, 2], "<u4").view("<f4")  # the first byte of the rows is a line feed
+    path.write_bytes(header(rows).replace(b"\n", b"\r") + rows.tobytes())
+    assert np.array_equal(read_ply(path, strict=True).means[:, 0], rows["x"])
+
+
+def test_a_ply_in_utf_16_is_named(path):
+    path.write_text((header(ROWS, kind="ascii") + "\n".join(lines_of(ROWS)).encode()).decode(), "utf-16")
+    with pytest.raises(InputError, match="is a PLY in UTF-16, expected ASCII: save it as UTF-8"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_half_floats_in_columns_of_integers_are_read(path, order):
+    rows = good_rows(20)
+    halves = np.zeros(20, [(name, f"{order}u2") for name in NAMES])
+    for name in NAMES:
+        halves[name] = rows[name].astype(f"{order}f2").view(f"{order}u2")
+    kind = "binary_little_endian" if order == "<" else "binary_big_endian"
+    path.write_bytes(header(halves, kind=kind) + halves.tobytes())
+    assert len(NAMES) == found(path)["half-floats"].count
+    model = read_ply(path)
+    assert np.array_equal(model.scales[:, 1], rows["scale_1"])
+    assert np.array_equal(model.means[:, 0], rows["x"])
+
+
+@pytest.mark.parametrize(
+    ("changed", "kind", "says"),
+    [
+        (["opacity"], "u1", "opacity is of type uint8, expected float: export"),
+        (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: call colours of 0 to 255 red"),
+        (["scale_0", "rot_2"], "i4", "scale_0, rot_2 are of type int32, expected float"),
+        (without(*"xyz", "nx", "ny", "nz"), "u2", "are of type uint16, expected float"),  # NaN as halves
+    ],
+)
+def test_integers_in_place_of_floats_are_refused(path, changed, kind, says):
+    rows = np.zeros(5, [(name, kind if name in changed else "<f4") for name in NAMES])
+    for name in changed:
+        rows[name] = 65535 if kind == "u2" else 200
+    path.write_bytes(header(rows) + rows.tobytes())
+    with pytest.raises(InputError, match=f"integer-columns: .*{says}"):
+        read_ply(path)
+
+
+def test_the_camera_of_ml_sharp_is_a_note(path):
+    rows = good_rows()
+    after = ["element image_size 2", "property uint image_size", "element color_space 1", "property uchar color_space"]
+    body = rows.tobytes() + np.array([640, 480], "<u4").tobytes()
+    path.write_bytes(header(rows, after=after) + body + b"\0")
+    assert "image_size, color_space: dropped; they are the camera of ml-sharp" in found(path)["sharp-elements"].text
+    assert 5 == len(read_ply(path, strict=True))
+    path.write_bytes(header(rows, after=after) + body + b"\1")
+    with pytest.raises(InputError, match=r"color_space is 1 \(linear RGB\), expected 0 \(sRGB\)"):
         read_ply(path)
 
 

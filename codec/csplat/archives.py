@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.inputs import stand_in
 
 __all__ = ["DAMAGED", "Archive", "read_archive", "zip_refusal"]
 
@@ -101,6 +102,8 @@ def read_archive(path: str | Path, kind: str) -> Archive:
     """
     nothing = Archive(path, kind, {})
     with Path(path).open("rb") as stream:  # opened here: np.load leaves a damaged file open
+        if instead := stand_in(stream.read(64)):
+            raise InputError(f"{path} is {instead}")
         if not zipfile.is_zipfile(stream):  # of others np.load says that they might be loaded unsafely
             nothing.refuse("it is no .npz file")
         stream.seek(0)

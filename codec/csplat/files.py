@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.inputs import File
+from csplat.inputs import File, stand_in
 
 __all__ = ["BinaryWriter", "atomic_writer", "check_room", "local_file", "opened_for_writing", "read_array", "read_text"]
 
@@ -238,6 +238,9 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
         if most_bytes is not None and Path(path).stat().st_size > most_bytes:
             return np.lib.format.open_memmap(path, mode="r")
         with Path(path).open("rb") as stream:
+            if instead := stand_in(stream.read(64)):
+                raise InputError(f"{path} is {instead}")
+            stream.seek(0)
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     except (
         ValueError,

@@ -1,4 +1,4 @@
-"""What a file may be handed in as, and a file of the disk as bytes."""
+"""What a file may be handed in as, what may come in its place, and a file of the disk as bytes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped"]
+__all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped", "stand_in"]
+
+_LFS_POINTERS = (b"version https://git-lfs.github.com/spec/", b"version https://hawser.github.com/spec/")
+_HTML = (b"<!doctype", b"<html", b"<head", b"<body", b"<script")
+_XML = (b"<?xml", b"<error")
 
 
 class BinaryFile(Protocol):
@@ -38,6 +42,26 @@ def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
             return mmap(stream.fileno(), 0, access=ACCESS_READ)
         except (ValueError, OSError):  # empty, or a pipe
             return stream.read()
+
+
+def stand_in(head: bytes) -> str:
+    """Name what came in place of a file, whatever file was wanted; "" where the content gives no sign of that.
+
+    Args:
+        head: the first bytes of the file, 64 or more where it has them.
+
+    Examples:
+        >>> stand_in(b"version https://git-lfs.github.com/spec/v1")
+        'a pointer of Git LFS, not the file itself: run `git lfs pull`'
+    """
+    if head.startswith(_LFS_POINTERS):
+        return "a pointer of Git LFS, not the file itself: run `git lfs pull`"
+    text = head[:64].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if text.startswith(_HTML):
+        return "a web page (HTML), not the file itself: download it again, and look at the page where that fails"
+    if text.startswith(_XML):
+        return "XML, as servers answer when something is wrong, not the file itself: download it again"
+    return ""
 
 
 class LetGo:

@@ -1,4 +1,4 @@
-"""What is wrong with the columns of a splat PLY, and the repairs that are safe.
+"""What is wrong with the columns of a splat PLY and the values of other formats, and the repairs that are safe.
 
 A finding is one of three things. A *note* is ordinary variation: nothing is lost, nothing looks
 different. A *repair* changes or drops something, safely, and is reported; `strict` refuses it. An
@@ -10,6 +10,8 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `sh-columns` | f_rest columns that are no SH degree, or of a higher one than 3, or not numbered from 0 | error |
 | `ambiguous-columns` | two columns that other programs would both call the same | error |
 | `colour-columns` | red, green and blue that are neither bytes nor 0 to 1 | error |
+| `integer-columns` | integers in place of the floats of a splat | error |
+| `colour-space` | colours of ml-sharp that are not sRGB | error |
 | `truncated` | fewer splats than the header declares | error |
 | `malformed` | a row that is no row | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
@@ -33,9 +35,21 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `opacities-are-alphas` | opacities that all lie in 0 to 1, as after the sigmoid; read as logits | note |
 | `scales-are-linear` | scales that are all above 0, as after the exponential; read as logarithms | note |
 | `colours-are-rgb` | f_dc that are all in 0 to 1 or in 0 to 255, as colours are; read as SH coefficients | note |
+| `half-floats` | columns of 16-bit integers whose bits are those of half floats: read as these | note |
+| `sharp-elements` | what ml-sharp writes besides the splats: dropped | note |
+| `unusual-header` | a byte order mark, blank lines or capitals in the header | note |
+| `unusual-rows` | rows of text with blank lines, decimal commas, NaN of other languages, or in other lines | note |
 | `double-means` | positions in double precision: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
 | `empty` | no splats at all | note |
+| `log-scales` | scales that should be standard deviations, most of them negative: read as logarithms | repair |
+| `negative-scales` | others below 0: the sign is left out, but where a format forbids it | repair, error |
+| `logit-opacities` | opacities that should lie in 0..1, many far outside: read as logits | repair |
+| `out-of-range-opacities` | others: clipped, or an error where they lie beyond -1 and 2 | repair, error |
+| `linear-colours` | colours in linear light (glTF): fitted to sRGB, by so much off | repair |
+| `unclear-scales` | no scale is negative, of a program that wrote logarithms (glTF) | note |
+| `spz-axes` | SPZ in glTF along axes that its extension does not name | note |
+| `short-buffer` | a buffer of glTF that ends before its length, but not before the splats | note |
 """
 
 from __future__ import annotations
@@ -51,7 +65,7 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
-__all__ = ["Columns", "Finding", "dropped_columns", "find_columns", "refuse", "too_many_bands"]
+__all__ = ["Columns", "Finding", "dropped_columns", "find_columns", "float_columns", "refuse", "too_many_bands"]
 
 Kind = Literal["note", "repair", "error"]
 
@@ -72,11 +86,13 @@ _PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 #: By the type of a colour, the value that is 1.
 _COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
-#: Beginnings of the names of columns that change what is seen, of scenes that are more than splats.
+#: Names of columns that change what is seen, of scenes that are more than splats.
 _MEANINGS = {
-    ("motion_", "trbf_", "omega_"): "splats that move, of which one moment is kept",
-    ("f_anchor_feat", "f_offset"): "anchors of Scaffold-GS, of which a network makes the splats",
-    ("sg_axis", "sg_sharpness", "sg_color"): "colours by spherical Gaussians, which are lost",
+    re.compile(r"motion_.*|trbf_.*|omega_.*|scale_t|rot_r_\d"): (
+        "dynamic (4D) splats: their time is lost, and those of all moments are seen at once"
+    ),
+    re.compile(r"f_anchor_feat.*|f_offset.*"): "anchors of Scaffold-GS, of which a network makes the splats",
+    re.compile(r"sg_(axis|sharpness|color).*"): "colours by spherical Gaussians, which are lost",
 }
 _NAMED = 6  # columns that a message names
 _ADVICE = "csplat train makes splats of its images"
@@ -173,6 +189,8 @@ def find_columns(
     every, rest, problem = _find_rest(names, sh_degree)
     if problem is not None:
         findings.append(problem)
+    if integers := _integers(dtype, (() if colour_range else sh0, rest, opacity, scales, quats)):
+        findings.append(integers)
     normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
     filter_3d = "" if flat else names.find((_FILTER,))[0]
     findings += names.findings()
@@ -269,6 +287,27 @@ def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, 
     return largest, Finding("rgb-colours", 3, f"{named} are read as the colours of SH degree 0{steps}", "note")
 
 
+def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
+    """Say that columns hold integers, of which nobody knows what values they stand for."""
+    found = [name for group in groups for name in group if name and dtype[name].kind != "f"]
+    if not found:
+        return None
+    types = " and ".join(sorted({dtype[name].name for name in found}))
+    colours = groups[0] and set(groups[0]) <= set(found)
+    remedy = (
+        "call colours of 0 to 255 red, green and blue" if colours else "export the values before they are quantised"
+    )
+    text = f"{_some(found)} {'is' if len(found) == 1 else 'are'} of type {types}, expected float: {remedy}"
+    return Finding("integer-columns", len(found), text, "error")
+
+
+def float_columns(names: Sequence[str]) -> list[str]:
+    """The columns of a PLY that hold numbers of splats other than positions, however they are called."""
+    wanted = {*_SH0, *_SCALES, *_QUATS, _OPACITY}
+    plain = {name: _PREFIXES.sub("", name.lower(), count=1) for name in names}
+    return [name for name, found in plain.items() if found in wanted or _REST.fullmatch(found)]
+
+
 def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> str:
     """Say which columns are missing, and what the file seems to be."""
     text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
@@ -284,10 +323,8 @@ def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> 
 
 def _meaning(names: Sequence[str]) -> str | None:
     plain = [_PREFIXES.sub("", name.lower(), count=1) for name in names]
-    for beginnings, meaning in _MEANINGS.items():
-        if any(name.startswith(beginnings) for name in plain):
-            return meaning
-    return None
+    found = (meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain)))
+    return next(found, None)
 
 
 def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:

@@ -24,7 +24,7 @@ from csplat.files import local_file
 from csplat.inputs import File
 from csplat.lint import Columns, Finding, find_columns, refuse
 from csplat.model import F32, SplatModel, check_sh_degree
-from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather
+from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather, with_half_floats
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.ply_file import blocks_of, parse
 from csplat.ply_origin import relative_to_origin
@@ -204,7 +204,9 @@ def _opened(
     content = parse(path, findings)
     if content is None:
         return None
-    rows = content.rows
+    rows = with_half_floats(content.rows, findings)
+    if any(not one.repairable for one in findings):
+        return None
     columns, more = find_columns(
         rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
     )  # fmt: skip

@@ -16,10 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import counted
-from csplat.lint import Columns, Finding
+from csplat.lint import Columns, Finding, float_columns
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
-__all__ = ["SH_C0", "Arrays", "Counts", "alpha_of_logits", "findings_of", "gather", "logits_of_alpha"]
+__all__ = [
+    "SH_C0",
+    "Arrays",
+    "Counts",
+    "alpha_of_logits",
+    "findings_of",
+    "gather",
+    "logits_of_alpha",
+    "with_half_floats",
+]
 
 F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
@@ -39,6 +48,7 @@ _HUGE_LOG = 88.0  # standard deviations beyond leave float32
 _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # of rotations: they grow and shrink while a scene is trained
 _LARGEST_COLOUR = 16.0  # of red, green and blue as floats, where 1 is white: beyond they are counted to 255
+_LOOKED_AT = 4096  # rows that tell half floats from integers
 _FEW = 16  # splats: what holds for fewer may hold by chance
 _TINY = 1e-30  # above 0
 _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
@@ -120,6 +130,32 @@ def gather(
     if len(columns.scales) == 2 and at:
         kept.scales[:, 2] = min(kept.scales[:, :2].min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP)
     return kept
+
+
+def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
+    """View rows whose numbers are declared as 16-bit integers as the half floats that they are.
+
+    PLY has no type of two bytes for floats. Rows of other types, or that would hold no finite numbers, stay as they
+    are: integers in place of floats are refused by `csplat.lint`.
+
+    Args:
+        rows: of the file.
+        findings: that they are half floats is appended.
+    """
+    dtype = rows.dtype
+    floats = float_columns(dtype.names or ())
+    halves = [name for name in dtype.names or () if dtype[name].kind in "iu" and dtype[name].itemsize == 2]
+    if not floats or not set(floats) <= set(halves):
+        return rows
+    halves = [name for name in halves if name in floats or name.lower() in ("x", "y", "z", "nx", "ny", "nz")]
+    kinds = {name: f"{dtype[name].str[0]}f2" if name in halves else dtype[name] for name in dtype.names or ()}
+    viewed = rows.view([*kinds.items()])
+    first = viewed[:_LOOKED_AT]
+    if not all(np.isfinite(first[name].astype(np.float32)).all() for name in halves):
+        return rows
+    text = f"{counted(len(halves), 'column')} of 16-bit integers hold the bits of half floats: read as these"
+    findings.append(Finding("half-floats", len(halves), text, "note"))
+    return viewed
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:

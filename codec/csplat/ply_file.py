@@ -7,10 +7,8 @@ do not load it.
 from __future__ import annotations
 
 import io
-import re
 import warnings
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -18,17 +16,20 @@ import numpy as np
 import plyfile
 
 from csplat.errors import InputError, counted
-from csplat.foreign import HEAD_SIZE, refuse_folder, refuse_foreign, refuse_packed_header
 from csplat.lint import Finding
 from csplat.ply_columns import Rows
+from csplat.ply_header import ELEMENT, Header, read_header
+from csplat.ply_text import regular_rows
 
 __all__ = ["Content", "blocks_of", "parse"]
 
-_ELEMENT = "vertex"
 _FRAME = "delta_vertex_"  # of Brush: what later moments add to the first
-_END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)")
-_MAX_HEADER_SIZE = 1 << 20
+#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and what its programs read alone.
+_SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
+_COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+_EARLY_END = "early end-of-file"  # of plyfile
+_SHOWN = 40  # characters of a word in a message
 
 
 class Content(NamedTuple):
@@ -59,94 +60,96 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
         InputError: not a PLY of splats, or its header cannot be parsed.
         OSError: it cannot be read.
     """
-    header = _header(path)
-    refuse_packed_header(path, header)
-    findings += _header_findings(header, path.stat().st_size)
+    header = read_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    with _open(path, header) as stream:
+    # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an empty
+    # table, which plyfile then refuses.
+    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
+    with _open(path, header) as stream, np.errstate(over="ignore"), quiet:
         try:
-            # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an
-            # empty table, which plyfile then refuses.
-            with np.errstate(over="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)
-                parsed = plyfile.PlyData.read(stream)
+            parsed = plyfile.PlyData.read(stream)
+            end = None if parsed.text else stream.tell()
+            findings += _trailing_findings(path, header.end, end, sum(element.count for element in parsed))
         except plyfile.PlyElementParseError as error:
-            findings.append(_row_finding(error, _has_comma(path, len(header), error.row or 0)))
-            return None
+            parsed = _read_again(path, header, findings, error)
         except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
             raise InputError(f"{path.name}: {error or type(error).__name__}") from None
-        end = None if parsed.text else stream.tell()
-    row_count = sum(element.count for element in parsed)
-    findings += _trailing_findings(path, len(header), end, row_count)
-    if _ELEMENT not in parsed:
-        raise InputError(f"{path.name} has no element {_ELEMENT!r}: not a PLY of splats")
-    others = [element.name for element in parsed if element.name != _ELEMENT]
-    if others:
-        text = f"elements besides {_ELEMENT}: {', '.join(others)}: dropped"
-        if any(name.startswith(_FRAME) for name in others):
-            text += "; they move the splats, of which the first moment is kept"
-        findings.append(Finding("other-elements", len(others), text, "repair"))
-    rows, lists = _scalars(parsed[_ELEMENT].data)
+    if parsed is None:
+        return None
+    if ELEMENT not in parsed:
+        raise InputError(f"{path.name} has no element {ELEMENT!r}: not a PLY of splats")
+    others = [element for element in parsed if element.name != ELEMENT]
+    findings += _other_findings(others)
+    rows, lists = _scalars(parsed[ELEMENT].data)
     if lists:
         text = f"list properties {', '.join(lists)}: dropped"
         findings.append(Finding("list-columns", len(lists), text, "repair"))
     comments = [*parsed.comments, *parsed.obj_info]
     for element in parsed:
         comments += element.comments
-    return Content(rows, comments, others)
+    return Content(rows, comments, [element.name for element in others])
 
 
-def _header(path: Path) -> bytes:
-    """The bytes of a PLY header, up to and including the line `end_header`."""
-    if path.is_dir():
-        refuse_folder(path)
-    with path.open("rb") as stream:
-        refuse_foreign(path, stream.read(HEAD_SIZE), path.stat().st_size)
-        stream.seek(0)
-        start = stream.read(_MAX_HEADER_SIZE)
-    end = _END_OF_HEADER.search(start)
-    if end is None:
-        raise InputError(f"{path.name}: the PLY header has no line end_header")
-    return start[: end.end()]
+def _read_again(path: Path, header: Header, findings: list[Finding], error: Any) -> Any:
+    """Read a file that plyfile could not read as it is; `None`: it is refused, and the findings say why.
 
-
-def _header_findings(header: bytes, size: int) -> list[Finding]:
-    findings = []
-    if not header.isascii():
-        count = sum(byte > 127 for byte in header)
-        text = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
-        findings.append(Finding("non-ascii-header", count, text, "note"))
-    for line in header.splitlines():
-        words = line.split()
-        if words[:1] != [b"element"] or len(words) != 3:
-            continue
-        if words[2].startswith(b"-"):
-            text = f"{words[2].decode('ascii', 'replace')} rows are declared"
-            findings.append(Finding("malformed", 1, text, "error"))
-        elif words[2].isdigit():
-            count = int(words[2])
-            if count > size:  # a row takes a byte at least: do not let anyone allocate for it
-                text = f"{count} rows are declared, the file has {size} bytes"
-                findings.append(Finding("truncated", count, text, "error"))
-    return findings
-
-
-def _has_comma(path: Path, header_size: int, row: int) -> bool:
-    """Return whether a row of an ASCII file has a comma, as numbers of some countries do."""
-    with path.open("rb") as stream:
-        stream.seek(header_size)
-        line = next(islice(stream, row, None), b"")
-    return b"," in line and line.isascii()
-
-
-def _row_finding(error: Any, comma: bool) -> Finding:
-    present, declared = error.row or 0, error.element.count
-    if error.message == "early end-of-file":
+    Args:
+        path: of the file.
+        header: of it.
+        findings: what is noticed is appended.
+        error: what plyfile said.
+    """
+    if not header.is_text or error.message == _EARLY_END:
+        present, declared = error.row or 0, error.element.count
         text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
-        return Finding("truncated", declared - present, text, "error")
-    remedy = "; it has a comma, expected a point in numbers and spaces between them" if comma else ""
-    return Finding("malformed", 1, f"row {present} of {error.element.name}: {error.message}{remedy}", "error")
+        findings.append(Finding("truncated", declared - present, text, "error"))
+        return None
+    with path.open("rb") as stream:
+        stream.seek(header.end)
+        rows, more = regular_rows(stream.read(), header.elements)
+    findings += more
+    if rows is None:
+        return None
+    text = "\n".join([*header.text.decode("ascii").splitlines(), *map(" ".join, rows), ""])
+    try:
+        return plyfile.PlyData.read(io.StringIO(text))
+    except plyfile.PlyElementParseError as second:
+        findings.append(_row_finding(second, rows, header))
+        return None
+
+
+def _row_finding(error: Any, rows: list[list[str]], header: Header) -> Finding:
+    """Say which value of a row of text is wrong."""
+    name, row, said = error.element.name, error.row or 0, error.message
+    at = [element.name for element in header.elements].index(name)
+    element, before = header.elements[at], sum(one.count for one in header.elements[:at])
+    if error.prop is not None and not element.has_lists:
+        word = rows[before + row][element.properties.index(error.prop.name)]
+        kind = np.dtype(error.prop.val_dtype)
+        wanted = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
+        said = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {wanted}"
+    return Finding("malformed", 1, f"row {row} of {name}: {said}", "error")
+
+
+def _other_findings(others: list[Any]) -> list[Finding]:
+    """Say what becomes of elements that are no splats."""
+    if not others:
+        return []
+    names = [element.name for element in others]
+    text = f"elements besides {ELEMENT}: {', '.join(names)}: dropped"
+    if not set(names) <= _SHARP:
+        if any(name.startswith(_FRAME) for name in names):
+            text += "; they move the splats, of which the first moment is kept"
+        return [Finding("other-elements", len(others), text, "repair")]
+    findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
+    for element in others:
+        values = element.data[_COLOUR_SPACE] if element.name == _COLOUR_SPACE == element.properties[0].name else ()
+        said = [value for value in values if value != _SRGB]
+        if said:
+            text = f"{_COLOUR_SPACE} is {said[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
+            findings.append(Finding("colour-space", 1, text, "error"))
+    return findings
 
 
 def _trailing_findings(path: Path, header_size: int, end: int | None, row_count: int) -> list[Finding]:
@@ -199,29 +202,28 @@ def blocks_of(path: Path, rows: Rows, most: int | None = None) -> Iterator[Rows]
             yield block
 
 
-def _open(path: Path, header: bytes) -> IO[Any]:
-    """Open a PLY for plyfile: as text where it is text, and ASCII where plyfile insists on it."""
-    if any(line.split()[:2] == [b"format", b"ascii"] for line in header.splitlines()):
-        return io.TextIOWrapper(_AsciiReader(path, path.stat().st_size), encoding="ascii")
-    return _AsciiReader(path, len(header))
+def _open(path: Path, header: Header) -> IO[Any]:
+    """Open a PLY for plyfile, behind a byte order mark: as text where it is text, with the header that it takes."""
+    stream = _PlyReader(path, header)
+    return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
 
 
-class _AsciiReader(io.BufferedReader):
-    """A file whose first bytes read as ASCII, whatever they are: plyfile stops at others."""
+class _PlyReader(io.BufferedReader):
+    """A file with another header."""
 
-    def __init__(self, path: Path, ascii_size: int) -> None:
+    def __init__(self, path: Path, header: Header) -> None:
         super().__init__(io.FileIO(path))
-        self._ascii_left = ascii_size
+        self.seek(header.start)
+        self._header = header.text
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return self._as_ascii(super().read(size))
+        return self._with_header(super().read(size))
 
     def read1(self, size: int = -1, /) -> bytes:
-        return self._as_ascii(super().read1(size))
+        return self._with_header(super().read1(size))
 
-    def _as_ascii(self, data: bytes) -> bytes:
-        if self._ascii_left <= 0 or data.isascii():
-            self._ascii_left -= len(data)
+    def _with_header(self, data: bytes) -> bytes:
+        if not self._header:
             return data
-        self._ascii_left -= len(data)
-        return bytes(byte if byte < 128 else ord("?") for byte in data)
+        begin, self._header = self._header[: len(data)], self._header[len(data) :]
+        return begin + data[len(begin) :]

@@ -20,7 +20,7 @@ from csplat.scene import Scene
 from csplat.training import VIEW
 from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 
-__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "stretched", "turned"]
+__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "sh_bands", "sphere_lattice", "stretched", "turned"]
 
 F64 = NDArray[np.float64]
 _Rows = TypeVar("_Rows", F32, F64)
@@ -261,11 +261,8 @@ def _product(quat: F64) -> F64:
 
 def _turned_sh(shN: F32, matrix: F64) -> F32:
     """Colours at M v become what they were at v, band by band: bands do not mix."""
-    index = np.arange(_DIRECTIONS) + 0.5
-    height, angle = 1.0 - 2.0 * index / _DIRECTIONS, index * np.pi * (3.0 - np.sqrt(5.0))  # a Fibonacci lattice
-    ring = np.sqrt(1.0 - height * height)
-    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-    there, before = _bands(directions), _bands(directions @ matrix)  # rows: v there is Mᵀ v before
+    directions = sphere_lattice(_DIRECTIONS)
+    there, before = sh_bands(directions), sh_bands(directions @ matrix)  # rows: v there is Mᵀ v before
     out = np.empty_like(shN)
     for band in range(1, sh_degree_of(shN.shape[1]) + 1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)
@@ -282,8 +279,16 @@ def _snapped(matrix: NDArray[Any]) -> F64:
     return snapped
 
 
-def _bands(directions: F64) -> list[F64]:
-    """Values of the basis of bands 1, 2 and 3 in unit directions, in the order and with the signs of INRIA and gsplat.
+def sphere_lattice(count: int) -> F64:
+    """Spread unit vectors [count, 3] evenly over the sphere, on a Fibonacci lattice."""
+    index = np.arange(count) + 0.5
+    height, angle = 1.0 - 2.0 * index / count, index * np.pi * (3.0 - np.sqrt(5.0))
+    ring = np.sqrt(1.0 - height * height)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+
+
+def sh_bands(directions: F64) -> list[F64]:
+    """Compute the basis of bands 1, 2 and 3 in unit directions, in the order and with the signs of INRIA and gsplat.
 
     A factor that all functions of a band have is left out.
     """

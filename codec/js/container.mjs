@@ -19,6 +19,19 @@ export const typeName = (bytes) => String.fromCharCode(...bytes);
 const hex = (value) => `0x${value.toString(16).padStart(8, '0')}`;
 
 /**
+ * Name what servers send in place of a file.
+ *
+ * @param {Uint8Array} bytes the first ones
+ * @returns {string} behind a comma; '' where they give no sign of that
+ */
+function standIn(bytes) {
+  const text = String.fromCharCode(...bytes.subarray(0, spec.HEADER_SIZE));
+  if (/^version https:\/\/(git-lfs|hawser)/.test(text)) return ', but a pointer of Git LFS (git lfs pull)';
+  if (/^(\xef\xbb\xbf)?\s*<(!doctype|html|head|body|script|\?xml|error)/i.test(text)) return ', but a web page or XML';
+  return /^ply[\r\n]/.test(text) ? ', but a PLY' : '';
+}
+
+/**
  * Read and check the header alone. What follows it in `bytes` is not looked at.
  *
  * @param {Uint8Array<ArrayBuffer>} bytes
@@ -32,7 +45,7 @@ export function readFileHeader(bytes) {
       spec.ERROR_MAGIC,
       0,
       clause,
-      `not a csplat file: byte ${wrong} is ${bytes[wrong]}, not ${spec.MAGIC[wrong]}`,
+      `not a csplat file${standIn(bytes)}: byte ${wrong} is ${bytes[wrong]}, not ${spec.MAGIC[wrong]}`,
     );
   }
   if (bytes.length < spec.HEADER_SIZE) {

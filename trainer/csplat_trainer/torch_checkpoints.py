@@ -113,22 +113,8 @@ def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> Spl
     return from_gsplat(splats)
 
 
-def _is_checkpoint(path: Path, head: bytes) -> bool:
-    """Whether a file is a zip as `torch.save` writes it, of which `head` is the beginning."""
-    if not head.startswith(b"PK\x03\x04"):
-        return False
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.endswith("/data.pkl") for name in archive.namelist())
-    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError):
-        return False
-
-
 FORMAT = Format(
     name="checkpoint",
-    title="a checkpoint of gsplat or splatfacto",
-    suffixes=(".pt", ".ckpt"),
-    sniff=_is_checkpoint,
     open=_open,
     open_bands=_open,
     exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),

@@ -14,7 +14,7 @@ from typing import Any
 
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
-from csplat.inputs import File, mapped
+from csplat.inputs import File, mapped, stand_in
 
 __all__ = [
     "Cursor",
@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 _CRC_SIZE = 4
+_STAND_IN_SIZE = 64  # bytes that tell what came in place of the file
 
 
 class Cursor:
@@ -124,7 +125,8 @@ def read_file_header(view: memoryview) -> _spec.Header:
     header = _spec.unpack_header(view)
     places = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
-        detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else ""
+        instead = stand_in(bytes(view[:_STAND_IN_SIZE]))
+        detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     version = (header.version_major, header.version_minor)
     if version != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):

@@ -9,14 +9,15 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 from csplat.decoder import decode
+from csplat.detect import by_content, by_name, head_of, refusal
 from csplat.errors import InputError
 from csplat.files import local_file
-from csplat.foreign import HEAD_SIZE, unknown
 from csplat.formats.format import Format
 from csplat.inputs import File
 from csplat.lint import Finding, refuse
@@ -29,11 +30,13 @@ __all__ = [
     "Format",
     "format_of",
     "formats",
+    "insisting",
     "lint",
     "named",
     "named_by",
     "open_scene",
     "read",
+    "read_all",
     "write",
     "write_scene",
 ]
@@ -51,6 +54,7 @@ _MODULES = (
     "csplat.formats.sog",
     "csplat.formats.gltf",
 )
+_insisted: ContextVar[str | None] = ContextVar("insisted", default=None)  # a command's --from, for all that it reads
 #: Of packages that stand on this one, by their names: nothing here knows them, and they may be absent.
 _ABOVE = ("csplat_trainer.torch_checkpoints",)
 
@@ -101,11 +105,37 @@ def read(
             model = decode(path, sh_degree=sh_degree)
             return model if keep_extra or not model.extra else replace(model, extra={})
         with _opened(found, path, sh_degree=sh_degree) as scene:
-            model = scene.model()
-            if report is not None:
-                report += scene.findings
-            refuse(scene.findings, strict=strict)
+            return read_all(scene, strict=strict, keep_extra=keep_extra, report=report)
+
+
+def read_all(
+    scene: Scene, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
+) -> SplatModel:
+    """Read all splats of a scene that is open; the rest as `read`."""
+    model = scene.model()
+    if report is not None:
+        report += scene.findings
+    refuse(scene.findings, strict=strict)
     return model if keep_extra or not model.extra else replace(model, extra={})
+
+
+@contextmanager
+def insisting(format: str | None) -> Iterator[None]:
+    """Take files for this format, as long as the context lasts, where their content is that of no format that is read.
+
+    Args:
+        format: its name; `None`: their names decide, as usual.
+
+    Raises:
+        InputError: no format that is read has that name.
+    """
+    if format is not None and named(format).open is None:
+        raise InputError(f"the format is {format}, which csplat does not read")
+    token = _insisted.set(format)
+    try:
+        yield
+    finally:
+        _insisted.reset(token)
 
 
 @contextmanager
@@ -148,12 +178,13 @@ def lint(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
     found = _readable(path, None)
     if found.name == _PLY:
         return lint_ply(path, sh_degree=sh_degree)
-    with _opened(found, path, sh_degree=sh_degree) as scene:
-        try:
-            for _ in scene.blocks():
-                pass
-        except InputError as error:
-            return [*scene.findings, Finding("malformed", 1, str(error), "error")]
+    with _opened(found, path, sh_degree=sh_degree, lenient=True) as scene:
+        if all(one.repairable for one in scene.findings):
+            try:
+                for _ in scene.blocks():
+                    pass
+            except InputError as error:
+                return [*scene.findings, Finding("malformed", 1, str(error), "error")]
         return scene.findings
 
 
@@ -187,24 +218,34 @@ def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None =
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file or folder, by its content, else by its name.
+    """Find the format of a file or folder, by its content, else by its name.
 
     Raises:
-        InputError: it is in none that is known; the message says what it may be, and what converts it.
+        InputError: it is in none that is read, or its content makes that of its name hardly possible; the message says
+            what it may be, and what converts it.
         OSError: it cannot be read.
     """
-    head = b""
-    if not path.is_dir():
-        with path.open("rb") as stream:
-            head = stream.read(HEAD_SIZE)
-    for one in formats():
-        if one.sniff(path, head):
-            return one
-    if head or path.is_dir():
-        for one in formats():
-            if path.name.lower().endswith(one.suffixes):
-                return one  # its reader says what is wrong
-    raise unknown(path, head)
+    head, insisted = head_of(path), _insisted.get()
+    known = {one.name: one for one in formats()}
+    try:
+        kind = by_content(path, head)
+    except InputError:
+        if insisted is None:
+            raise
+        kind = None
+    if kind is not None and kind.name in known:
+        return known[kind.name]
+    if insisted is not None:
+        return known[insisted]
+    kind = kind or (by_name(path) if head or path.is_dir() else None)
+    if kind is None or kind.remedy:
+        raise refusal(path, head)
+    if kind.name not in known:
+        raise InputError(f"{path.name} is {kind.title}, which csplat reads where csplat_trainer is installed")
+    doubt = known[kind.name].doubt(path)
+    if doubt:
+        raise InputError(f"{path.name} is hardly {kind.title}: {doubt}; if it is one, read it with --from {kind.name}")
+    return known[kind.name]  # its reader says what is wrong
 
 
 def named_by(path: Path) -> Format:
@@ -229,7 +270,10 @@ def _readable(path: Path, format: str | None) -> Format:
 
 
 @contextmanager
-def _opened(found: Format, path: Path, level: int = 0, sh_degree: int | None = None) -> Iterator[Scene]:
+def _opened(
+    found: Format, path: Path, level: int = 0, sh_degree: int | None = None, *, lenient: bool = False
+) -> Iterator[Scene]:
+    """Open a scene along the usual axes; one with findings that are errors only if `lenient`."""
     assert found.open is not None
     check_sh_degree(sh_degree)
     if level and found.open_level is None:
@@ -241,6 +285,7 @@ def _opened(found: Format, path: Path, level: int = 0, sh_degree: int | None = N
     else:
         opened = found.open(path)
     with opened as every_band:
+        refuse([] if lenient else every_band.findings, strict=False)
         scene = every_band if sh_degree is None else _without_bands(every_band, sh_degree)
         placed = in_axes(scene, USUAL) if found.axes else scene
         yield replace(placed, format=found.name)

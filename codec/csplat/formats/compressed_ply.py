@@ -33,6 +33,7 @@ U32 = NDArray[np.uint32]
 _CHUNK = 256  # splats that share bounds
 _SH_C0 = 0.28209479177387814
 _LARGEST_LOG = 20.0  # log scales beyond are no splat's, and would take all steps of their chunk
+_LARGEST_BOUND = 9e37  # of a colour; its coefficient is 3.5 times that, and float32 ends at 3.4e38
 _MAX_HEADER_SIZE = 1 << 16
 _END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
 _TYPES = {
@@ -62,15 +63,6 @@ class _Element:
         return rows
 
 
-def _is_compressed(path: Path, head: bytes) -> bool:
-    if head[:3] != b"ply" or head[3:4] not in (b"\n", b"\r"):
-        return False
-    if b"end_header" not in head:  # the words come after bounds and comments
-        with path.open("rb") as stream:
-            head = stream.read(_MAX_HEADER_SIZE)
-    return b"packed_position" in head.partition(b"end_header")[0]
-
-
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
     elements, comments = _header(path)
@@ -97,10 +89,15 @@ def _open(path: Path) -> Iterator[Scene]:
         _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
     table = chunk.read(path, 0, chunk.count)
     bounds = np.stack([table[name] for name in names], 1).astype(np.float64).reshape(chunk.count, len(names) // 6, 2, 3)
-    bad = np.argwhere(~np.isfinite(bounds))
+    bad = np.argwhere(~(np.abs(bounds) < _LARGEST_BOUND))
     if len(bad):
         row, kind, end, axis = bad[0]
         raise InputError(f"{path.name}: chunk {row} has no finite {names[kind * 6 + end * 3 + axis]}")
+    bad = np.argwhere(bounds[:, :, 0] > bounds[:, :, 1])
+    if len(bad):
+        row, kind, axis = bad[0]
+        low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
+        raise InputError(f"{path.name}: chunk {row} has {low} above {high}, expected at most that")
     try:
         said = parse_comments(comments)
         facts = SplatModel(
@@ -275,9 +272,6 @@ def _written_header(facts: SplatModel, count: int, rest: int) -> bytes:
 
 FORMAT = Format(
     name="compressed-ply",
-    title="compressed PLY",
-    suffixes=(".compressed.ply",),
-    sniff=_is_compressed,
     open=_open,
     splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,

@@ -1,4 +1,4 @@
-"""What a format of files is: how it is told apart, read and written, and what of a scene it has a place for."""
+"""What a format of files is: how it is read and written, and what of a scene it has a place for."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from csplat.detect import KINDS
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene import Scene
 
@@ -64,14 +65,12 @@ class Format:
     """A format of files.
 
     Attributes:
-        name: as `csplat formats` and `--format` have it: `spz`.
-        title: as people write it: `SPZ 4`.
-        suffixes: of file names, the usual one first; with their dots, in small letters.
-        sniff: whether a file is of this format, by its content: path, and the first bytes of it (none of a folder).
+        name: as `csplat formats` and `--from` have it, a key of `csplat.detect.KINDS`: `spz`.
         open: reads it; `None`: it is not read.
         open_level: reads a level of it; `None`: scenes have one level.
         open_bands: reads it without the SH bands above a degree; `None`: `open` reads all that there may be.
         write: writes it; `None`: it is not written.
+        doubt: of files that only their name tells: why one is hardly of this format, "" where it may well be.
         degree: highest SH degree that it holds.
         axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
             `open` gives the scene along them.
@@ -82,18 +81,26 @@ class Format:
     """
 
     name: str
-    title: str
-    suffixes: tuple[str, ...]
-    sniff: Callable[[Path, bytes], bool]
     open: Reader | None = None
     open_level: LevelReader | None = None
     open_bands: BandReader | None = None
     write: Writer | None = None
+    doubt: Callable[[Path], str] = lambda _path: ""
     degree: int = 3
     axes: str = ""
     exact: frozenset[str] = frozenset()
     splat_bytes: tuple[float, ...] = ()
     carries: frozenset[str] = frozenset()
+
+    @property
+    def title(self) -> str:
+        """As people write it: `SPZ 4`."""
+        return KINDS[self.name].title
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Endings of file names, the usual one first; with their dots, in small letters."""
+        return KINDS[self.name].suffixes
 
     def expected_bytes(self, facts: SplatModel, count: int) -> int | None:
         """About how large a file gets; `None` where that depends on the scene."""

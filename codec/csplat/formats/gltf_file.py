@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat.inputs import mapped
+from csplat.inputs import mapped, stand_in
 from csplat.model import F32
 
 __all__ = ["BIN", "GLB_HEAD", "JSON", "MAGIC", "Accessor", "GltfFile", "Placed", "opened"]
@@ -39,6 +39,7 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MOST_PRIMITIVES = 1 << 14  # that nodes show: a small file may name one mesh very often
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
+_INSTANCING = "EXT_mesh_gpu_instancing"
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,15 @@ class Placed:
         primitive: its JSON.
         place: of that in the file.
         matrix: [4, 4] to the world, of columns.
+        node: the JSON of the node that shows it.
+        node_place: of that in the file.
     """
 
     primitive: dict[str, Any]
     place: Place
     matrix: F64
+    node: dict[str, Any]
+    node_place: Place
 
 
 @dataclass(frozen=True)
@@ -86,11 +91,13 @@ class GltfFile:
         path: of it; buffers in files of their own stand in its folder.
         root: the JSON.
         binary: the chunk BIN, if there is one.
+        short: of buffers that were looked at and are shorter than they say, how much.
     """
 
     path: Path
     root: dict[str, Any]
     binary: memoryview | None
+    short: dict[int, str] = field(default_factory=dict)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
     def wrong(self, place: Place, wrong: str) -> InputError:
@@ -147,9 +154,10 @@ class GltfFile:
         if dtype is None or _WIDTHS.get(kind) != width:
             raise self.wrong(place, f"found {_shown(kind)} of {said['componentType']}, wanted {width} numbers")
         if "sparse" in said or "bufferView" not in said:
-            raise self.wrong(place, "sparse accessors are not read")
+            what = "sparse accessors are not read" if "sparse" in said else "it has no bufferView: an extension has it"
+            raise self.wrong(place, what)
         count, offset = self.whole(said, place, "count"), self.whole(said, place, "byteOffset", 0)
-        data, stride = self._view(said["bufferView"])
+        data, stride = self.view(said["bufferView"])
         size = np.dtype(dtype).itemsize * width
         stride = stride or size
         if stride < size:
@@ -161,15 +169,19 @@ class GltfFile:
             rows = np.ndarray((count, width), dtype, data, offset, (stride, size // width))
         return Accessor(rows, self.get(said, place, "normalized", bool, False))
 
-    def _view(self, index: object) -> tuple[memoryview, int]:
+    def view(self, index: object) -> tuple[memoryview, int]:
         """The bytes of a buffer view, and how far apart its rows are, 0: no further than they are long."""
         said, place = self.item("bufferViews", index), ("bufferViews", _shown(index))
         if said.get("extensions"):
-            raise self.wrong((*place, "extensions"), f"{_names(said['extensions'])}: packed buffers are not read")
+            raise self.wrong(
+                (*place, "extensions"),
+                f"{_names(said['extensions'])}: packed buffers are not read, gltf-transform unpacks them",
+            )
         buffer = self._buffer(self.whole(said, place, "buffer"))
         start, length = self.whole(said, place, "byteOffset", 0), self.whole(said, place, "byteLength")
         if start + length > len(buffer):
-            raise self.wrong(place, f"bytes {start} to {start + length} of a buffer of {len(buffer)}")
+            short = ": the file is truncated" if said["buffer"] in self.short else ""
+            raise self.wrong(place, f"bytes {start} to {start + length} of a buffer of {len(buffer)}{short}")
         return buffer[start : start + length], self.whole(said, place, "byteStride", 0)
 
     def _buffer(self, index: int) -> memoryview:
@@ -182,8 +194,8 @@ class GltfFile:
                 data = self.binary
             else:
                 raise self.wrong(place, "there are no bytes of it")
-            if length > len(data):
-                raise self.wrong(place, f"found {len(data)} bytes, wanted {length}: the file is truncated")
+            if length > len(data):  # what is used of it may be there all the same
+                self.short[index] = f"found {len(data):,} bytes, wanted {length:,}"
             self._buffers[index] = data[:length]
         return self._buffers[index]
 
@@ -206,9 +218,12 @@ class GltfFile:
                 raise self.wrong(place, f"{_shown(uri)} is outside of the folder of {self.path.name}")
             if not target.is_file():
                 raise self.wrong(place, f"there is no file {_shown(uri)}")
-            return memoryview(mapped(target))
+            data = memoryview(mapped(target))
         except (OSError, RuntimeError) as error:  # the latter of links in a circle
             raise self.wrong(place, f"{_shown(uri)} cannot be read: {error}") from None
+        if instead := stand_in(bytes(data[:64])):
+            raise self.wrong(place, f"{_shown(uri)} is {instead}")
+        return data
 
     def size(self) -> int:
         """Bytes of all buffers that were looked at."""
@@ -234,6 +249,8 @@ class GltfFile:
         while stack:
             index, above = stack.pop()
             node, place = self.item("nodes", index), ("nodes", _shown(index))
+            if _extension(node, "KHR_node_visibility").get("visible") is False:
+                continue
             if index in seen:
                 raise self.wrong(place, "it has more than one parent")
             seen.add(index)
@@ -247,7 +264,28 @@ class GltfFile:
                     shown += 1
                     if not isinstance(primitive, dict) or shown > _MOST_PRIMITIVES:
                         raise self.wrong(spot, f"found {_shown(primitive)}, number {shown} of those that are shown")
-                    yield Placed(primitive, spot, matrix)
+                    yield Placed(primitive, spot, matrix, node, place)
+
+    def instances(self, placed: Placed) -> NDArray[np.float64]:
+        """Matrices to the world [I, 4, 4] of a primitive: one, or those of EXT_mesh_gpu_instancing."""
+        said = _extension(placed.node, _INSTANCING)
+        if not said:
+            return placed.matrix[None]
+        place = (*placed.node_place, "extensions", _INSTANCING)
+        attributes = self.get(said, place, "attributes", dict, {})
+        widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
+        counts = {len(one.rows) for one in rows.values()}
+        if len(counts) != 1:
+            raise self.wrong(place, f"its attributes have {sorted(counts)} rows, wanted one number of instances")
+        values = {name: one.values(slice(None)).astype(np.float64) for name, one in rows.items()}
+        matrices = np.tile(np.eye(4), (counts.pop(), 1, 1))
+        for index, quat in enumerate(values.get("ROTATION", ())):
+            matrices[index, :3, :3] = self._rotation(quat.tolist(), (*place, "attributes", "ROTATION"))
+        matrices[:, :3, :3] *= values.get("SCALE", np.ones((len(matrices), 3)))[:, None]
+        matrices[:, :3, 3] = values.get("TRANSLATION", 0.0)
+        found: NDArray[np.float64] = placed.matrix @ matrices
+        return found
 
     def _list(self, holder: dict[str, Any], place: Place, key: str) -> list[Any]:
         values: list[Any] = self.get(holder, place, key, list, [])
@@ -257,19 +295,22 @@ class GltfFile:
         if "matrix" in node:
             return self._numbers(node, place, "matrix", np.eye(4).ravel()).reshape(4, 4).T
         matrix = np.eye(4)
-        x, y, z, w = self._numbers(node, place, "rotation", (0.0, 0.0, 0.0, 1.0))
-        length = math.hypot(x, y, z, w)
+        quat = self._numbers(node, place, "rotation", (0.0, 0.0, 0.0, 1.0)).tolist()
+        matrix[:3, :3] = self._rotation(quat, (*place, "rotation"))
+        matrix[:3, :3] *= self._numbers(node, place, "scale", (1.0, 1.0, 1.0))
+        matrix[:3, 3] = self._numbers(node, place, "translation", _NO_TRANSLATION)
+        return matrix
+
+    def _rotation(self, quat: list[float], place: Place) -> list[list[float]]:
+        length = math.hypot(*quat)
         if not 0.0 < length < math.inf:
-            raise self.wrong((*place, "rotation"), "wanted a unit quaternion")
-        x, y, z, w = x / length, y / length, z / length, w / length
-        matrix[:3, :3] = [
+            raise self.wrong(place, "wanted a unit quaternion")
+        x, y, z, w = (one / length for one in quat)
+        return [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
-        matrix[:3, :3] *= self._numbers(node, place, "scale", (1.0, 1.0, 1.0))
-        matrix[:3, 3] = self._numbers(node, place, "translation", _NO_TRANSLATION)
-        return matrix
 
     def _numbers(self, holder: dict[str, Any], place: Place, key: str, default: Any) -> F64:
         values = holder.get(key, list(default))
@@ -289,7 +330,7 @@ def opened(path: Path) -> GltfFile:
     data = memoryview(mapped(path))
     text, binary = _chunks(path, data) if data[:4] == MAGIC else (data, None)
     try:
-        root = json.loads(bytes(text).decode("utf-8"))
+        root = json.loads(bytes(text))  # of UTF-8, with a mark or without, or UTF-16
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path.name}: its JSON cannot be read: {error}") from None
     if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):
@@ -323,6 +364,13 @@ def _chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None
     if not found or found[0][0] != JSON:
         raise InputError(f"{path.name} does not begin with its JSON")
     return found[0][1], found[1][1] if len(found) > 1 and found[1][0] == BIN else None
+
+
+def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
+    """An extension object, empty where there is none."""
+    extensions = holder.get("extensions")
+    said = extensions.get(name) if isinstance(extensions, dict) else None
+    return said if isinstance(said, dict) else {}
 
 
 def _listed(value: object) -> list[Any]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.formats.format import Format
-from csplat.formats.rows import colours_of_bytes, finite_scene, logs_of_scales
+from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.model import F32, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
@@ -91,8 +91,8 @@ def _open(path: Path) -> Iterator[Scene]:
     if level >= len(_TYPES):
         raise InputError(f"{path.name} has compression level {level}, wanted at most {len(_TYPES) - 1}")
     low, high = low or -_USUAL_SH, high or _USUAL_SH
-    if not (abs(low) < _LARGEST and abs(high) < _LARGEST):
-        raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers")
+    if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
+        raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers, the larger one last")
     sections = list(_sections(path.name, data, level, most))
     total = sum(len(section.rows) for section in sections)
     if total != count:
@@ -103,18 +103,20 @@ def _open(path: Path) -> Iterator[Scene]:
         for section in sections:
             yield from _placed(section)
 
-    def decoded(rows: Rows, corners: F64, steps: F64) -> SplatModel:
+    def decoded(scales: F32, rows: Rows, corners: F64, steps: F64) -> SplatModel:
         return SplatModel(
             means=(rows["means"] * steps + corners).astype(np.float32),
             quats=normalise_quats(rows["quats"].astype(np.float32)),
-            scales=logs_of_scales(rows["scales"]),
+            scales=scales,
             opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
             sh0=colours_of_bytes(rows["colours"][:, :3]),
             shN=_rest(rows["shN"], widest, low, high),
         )
 
     nothing = np.empty(0, _row_type(level, 0))
-    yield finite_scene(blocks, decoded, decoded(nothing, np.zeros((0, 3)), np.zeros((0, 1))))
+    yield finite_scene(
+        blocks, decoded, decoded(np.zeros((0, 3), np.float32), nothing, np.zeros((0, 3)), np.zeros((0, 1)))
+    )
 
 
 def _row_type(level: int, degree: int) -> np.dtype[Any]:
@@ -166,6 +168,8 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
         raise InputError(f"{where}: its buckets hold fewer than its {head.splats:,} splats")
     middles = np.frombuffer(data, "<f4", 3 * head.buckets, centres).reshape(-1, 3).astype(np.float64)
     span = head.span or _USUAL_RANGE
+    if head.block < 0:
+        raise InputError(f"{where}: its blocks are {head.block:g} long, wanted at least 0")
     step = head.block / 2 / span
     if not (np.abs(middles) + 65535 * abs(step) < _LARGEST).all():
         raise InputError(f"{where}: its buckets do not lie at finite places")
@@ -191,15 +195,8 @@ def _rest(coded: Rows, widest: int, low: float, high: float) -> F32:
     return values.reshape(len(coded), widest // 3, 3)
 
 
-def _is_ksplat(_path: Path, head: bytes) -> bool:
-    return head[:4] == b"\0\1\0\0" and len(head) > _HEADER.size and not any(head[_HEADER.size :])
-
-
 FORMAT = Format(
     name="ksplat",
-    title=".ksplat",
-    suffixes=(".ksplat",),
-    sniff=_is_ksplat,
     open=_open,
     degree=2,
 )

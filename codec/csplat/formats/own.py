@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from csplat._spec import MAGIC
 from csplat.decoder import open_tiles
 from csplat.encoder import EncodeOptions
 from csplat.formats.format import Format
@@ -30,9 +29,6 @@ def _write(path: Path, scene: Scene) -> None:
 
 FORMAT = Format(
     name="csplat",
-    title="csplat",
-    suffixes=(".csplat",),
-    sniff=lambda _path, head: head.startswith(MAGIC),
     open=_open,
     write=_write,
     splat_bytes=(7.0, 8.0, 9.0, 10.0),

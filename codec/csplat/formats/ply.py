@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from csplat.formats.format import ARRAYS, Format
 from csplat.ply import open_ply
 from csplat.ply_write import write_scene_ply
@@ -11,15 +9,8 @@ from csplat.ply_write import write_scene_ply
 __all__ = ["FORMAT"]
 
 
-def _is_ply(_path: Path, head: bytes) -> bool:
-    return head[:3] == b"ply" and head[3:4] in (b"\n", b"\r")
-
-
 FORMAT = Format(
     name="ply",
-    title="PLY",
-    suffixes=(".ply",),
-    sniff=_is_ply,
     open=open_ply,
     open_bands=open_ply,
     write=write_scene_ply,

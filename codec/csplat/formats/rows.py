@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.lint import refuse
+from csplat.formats.activations import Spread, read_scales_as
 from csplat.model import F32, SplatModel
 from csplat.ply_columns import SH_C0, Counts, findings_of
 from csplat.scene import Scene
 
-__all__ = ["SH_C0", "colours_of_bytes", "finite_scene", "logs_of_scales"]
+__all__ = ["SH_C0", "colours_of_bytes", "finite_scene"]
 
 Rows = NDArray[Any]
 
@@ -21,30 +21,43 @@ _SMALLEST = np.float32(1e-20)  # what a standard deviation of 0 becomes
 
 
 def finite_scene(
-    blocks: Callable[[], Iterator[tuple[Rows, ...]]], decoded: Callable[..., SplatModel], facts: SplatModel
+    blocks: Callable[[], Iterator[tuple[Rows, ...]]],
+    decoded: Callable[..., SplatModel],
+    facts: SplatModel,
+    *,
+    zero_quat: int = 0,
 ) -> Scene:
-    """A scene of the rows without NaN and infinity; the others are dropped and counted.
+    """Make a scene of the rows without NaN and infinity; the others are dropped and counted.
 
     Args:
         blocks: gives structured rows, at most `BLOCK` at a time, and arrays as long beside them.
-        decoded: makes a model of such a tuple.
+        decoded: makes a model of natural logarithms of scales and such a tuple.
         facts: as of `Scene`.
+        zero_quat: what each component of a rotation of length 0 is stored as.
 
-    Raises:
-        InputError: there are rows, and none is finite.
+    Returns:
+        The scene; where there are rows, and none is finite, its findings hold an error.
     """
-    total = kept = 0
+    total, kept, spread, counts = 0, 0, Spread(), Counts()
     for rows, *_ in blocks():
+        good = _finite(rows)
+        found = rows if good.all() else rows[good]
+        spread.add(np.ascontiguousarray(found["scales"]), total)
+        zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
+        counts.zero_quats += int(np.count_nonzero(zero))
         total += len(rows)
-        kept += int(np.count_nonzero(_finite(rows)))
-    findings = findings_of(Counts(nonfinite=total - kept), total) if kept < total else []
-    refuse(findings, strict=False)
+        kept += len(found)
+    counts.nonfinite = total - kept
+    are_logs, findings = read_scales_as(spread, "scale", strict=False)
+    findings = findings_of(counts, total) + findings
 
     def models() -> Iterator[SplatModel]:
         for parts in blocks():
             good = _finite(parts[0])
             if good.any():
-                yield decoded(*(parts if good.all() else (part[good] for part in parts)))
+                kept = parts if good.all() else tuple(part[good] for part in parts)
+                scales = kept[0]["scales"].astype(np.float32)
+                yield decoded(scales if are_logs else _logs(scales), *kept)
 
     return Scene(kept, facts, models, findings)
 
@@ -60,9 +73,9 @@ def _finite(rows: Rows) -> NDArray[np.bool_]:
     return good
 
 
-def logs_of_scales(scales: Rows) -> F32:
-    """Natural logarithms of standard deviations; the sign of one means nothing, and 0 becomes something tiny."""
-    logs: F32 = np.log(np.maximum(np.abs(scales.astype(np.float32)), _SMALLEST))
+def _logs(scales: F32) -> F32:
+    """Natural logarithms of standard deviations; 0 becomes something tiny."""
+    logs: F32 = np.log(np.maximum(np.abs(scales), _SMALLEST))
     return logs
 
 

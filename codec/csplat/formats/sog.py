@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from csplat.errors import counted
-from csplat.foreign import zip_holds_meta
 from csplat.formats.format import Format
 from csplat.formats.sog_files import Json, Parts, parts_at
 from csplat.formats.sog_read import COEFFICIENTS, Pictures, Unit, degree_of, unit_of
@@ -23,14 +22,6 @@ __all__ = ["FORMAT"]
 
 _MOST = 1 << 40
 _Range = tuple[int, int, int]  # number of a file, first splat and the one behind the last
-
-
-def _is_sog(path: Path, head: bytes) -> bool:
-    if path.is_dir():
-        return any((path / name).is_file() for name in ("meta.json", "lod-meta.json"))
-    if head[:4] == b"PK\x03\x04":
-        return zip_holds_meta(path)
-    return head.lstrip()[:1] == b"{" and path.name.lower().endswith("meta.json")
 
 
 @contextmanager
@@ -174,9 +165,6 @@ def _ranges(parts: Parts, names: list[str], wanted: list[_Range]) -> dict[str, l
 
 FORMAT = Format(
     name="sog",
-    title="SOG",
-    suffixes=(".sog", "meta.json"),
-    sniff=_is_sog,
     open=_open,
     open_level=_open,
     write=write_sog,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from csplat.archives import DAMAGED
 from csplat.errors import InputError, missing
+from csplat.inputs import stand_in
 
 __all__ = ["Json", "Parts", "parts_at", "picture_of"]
 
@@ -71,6 +72,8 @@ class Parts:
             data = stream.read(most + 1)
         if len(data) > most:
             self.refuse(f"{name[:80]} has more than {most:,} bytes")
+        if instead := stand_in(data[:64]):
+            self.refuse(f"{name[:80]} is {instead}")
         return data
 
     def file(self, name: str) -> Path:
@@ -234,6 +237,7 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
         InputError: it is damaged or of another size; or Pillow is absent.
     """
     try:
+        from PIL.Image import DecompressionBombError
         from PIL.WebPImagePlugin import WebPImageFile  # Image.open loads all formats that Pillow knows
     except ModuleNotFoundError as error:
         raise missing(error, "Pillow") from None
@@ -242,5 +246,5 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
             if not fits(*image.size):
                 parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which is not what was declared")
             return np.asarray(image.convert("RGBA"))
-    except DAMAGED as error:
+    except (*DAMAGED, DecompressionBombError) as error:
         parts.refuse(f"{name} is no whole WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")

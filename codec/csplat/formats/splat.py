@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
 from csplat.formats.format import Format
-from csplat.formats.rows import SH_C0, colours_of_bytes, finite_scene, logs_of_scales
+from csplat.formats.rows import SH_C0, colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.model import F32, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
@@ -25,6 +25,10 @@ __all__ = ["FORMAT"]
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 _LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential
+_QUAT_ZERO = 128  # byte of a component of 0; that of 1 would be 256
+_SAMPLE = 4096  # splats that are looked at for a doubt
+_PLACES = (1e-12, 1e12)  # coordinates other than 0, scene units; of any four bytes a third lies there
+_LONGEST_QUAT = 224  # units of 1/128; four bytes of 0 are 256 long
 
 
 @contextmanager
@@ -38,14 +42,37 @@ def _open(path: Path) -> Iterator[Scene]:
         for start in range(0, len(rows), BLOCK):
             yield (rows[start : start + BLOCK],)
 
-    yield finite_scene(blocks, _decoded, _decoded(rows[:0]))
+    yield finite_scene(blocks, _decoded, _decoded(np.zeros((0, 3), np.float32), rows[:0]), zero_quat=_QUAT_ZERO)
 
 
-def _decoded(rows: NDArray[Any]) -> SplatModel:
+def _doubt(path: Path) -> str:
+    """Say why a file has hardly splats in its rows: as `Format.doubt`. Half of a sample has to look like splats."""
+    data = mapped(path)
+    if len(data) % _ROW.itemsize or not len(data):
+        return ""  # its reader says what is wrong
+    rows = np.frombuffer(data, _ROW)
+    step = max(1, len(rows) // _SAMPLE)
+    sample = rows[::step]
+    far = np.abs(sample["means"])
+    placed = ((far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))).all(axis=1)
+    lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
+    finite = np.isfinite(far).all(axis=1)  # of others a finding tells
+    good = ~finite | (placed & (lengths < _LONGEST_QUAT))
+    if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
+        return ""
+    worst = int(np.argmin(good))
+    name, what = ("quats", "has a rotation of the bytes") if placed[worst] else ("means", "lies at")
+    said = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
+    share = np.count_nonzero(~good) / np.count_nonzero(finite)
+    at = worst * step * _ROW.itemsize
+    return f"{share:.0%} of {counted(len(good), 'row')} are no splats; that at byte {at:,} {what} {said}"
+
+
+def _decoded(scales: F32, rows: NDArray[Any]) -> SplatModel:
     return SplatModel(
         means=rows["means"].astype(np.float32),
-        quats=normalise_quats(np.subtract(rows["quats"], 128, dtype=np.float32)),
-        scales=logs_of_scales(rows["scales"]),
+        quats=normalise_quats(np.subtract(rows["quats"], _QUAT_ZERO, dtype=np.float32)),
+        scales=scales,
         opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
         sh0=colours_of_bytes(rows["colours"][:, :3]),
     )
@@ -75,11 +102,9 @@ def _bytes(values: F32) -> NDArray[np.uint8]:
 
 FORMAT = Format(
     name="splat",
-    title=".splat",
-    suffixes=(".splat",),
-    sniff=lambda _path, _head: False,
     open=_open,
     write=_write,
+    doubt=_doubt,
     degree=0,
     splat_bytes=(32.0,),
     exact=frozenset({"means"}),

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.formats.format import Format
 from csplat.formats.packing import all_three, smallest_three
-from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, is_spz, read_packed, write_packed
+from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, read_packed, write_packed
 from csplat.model import F32, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
 from csplat.turning import in_axes
 
-__all__ = ["FORMAT", "write_spz"]
+__all__ = ["FORMAT", "decoded", "means_of", "write_spz"]
 
 U8 = NDArray[np.uint8]
 
@@ -42,14 +42,15 @@ _SH_STEP = 4  # of 256 levels
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    packed = read_packed(path, any_degree=sh_degree is not None)
+    with path.open("rb") as file:
+        packed = read_packed(file, path.name, path.stat().st_size, any_degree=sh_degree is not None)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
     def blocks() -> Iterator[SplatModel]:
         for start in range(0, packed.count, BLOCK):
-            yield _decoded(packed, slice(start, start + BLOCK), degree)
+            yield decoded(packed, slice(start, start + BLOCK), degree)
 
-    yield Scene(packed.count, _decoded(packed, slice(0, 0), degree), blocks)
+    yield Scene(packed.count, decoded(packed, slice(0, 0), degree), blocks)
 
 
 def write_spz(path: Path, scene: Scene, *, version: int) -> None:
@@ -64,13 +65,14 @@ def write_spz(path: Path, scene: Scene, *, version: int) -> None:
     write_packed(path, packed, room)
 
 
-def _decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
+def decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
+    """Decode some splats of a file, along its axes, with its SH up to a degree."""
     _, alphas, colours, scales, rotations, rest = (part[rows] for part in packed.parts)
     coefficients = (degree + 1) ** 2 - 1
     shN = np.subtract(rest[:, : 3 * coefficients], 128, dtype=np.float32)
     shN *= np.float32(1 / 128)
     return SplatModel(
-        means=_means(packed, rows),
+        means=means_of(packed, rows),
         quats=(_smallest_three if packed.version > 2 else _first_three)(rotations),
         scales=np.divide(scales, 16, dtype=np.float32) - np.float32(10),
         opacities=np.divide(alphas[:, 0], 255, dtype=np.float32),
@@ -81,7 +83,8 @@ def _decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
     )
 
 
-def _means(packed: Packed, rows: slice) -> F32:
+def means_of(packed: Packed, rows: slice) -> F32:
+    """Decode the positions of some splats of a file, along its axes."""
     if packed.version == 1:
         return packed.means_half[rows].astype(np.float32)
     part = packed.parts[0][rows]
@@ -155,9 +158,6 @@ def _three_of(quats: F32) -> U8:
 
 FORMAT = Format(
     name="spz",
-    title="SPZ",
-    suffixes=(".spz",),
-    sniff=is_spz,
     open=_open,
     open_bands=_open,
     write=partial(write_spz, version=3),

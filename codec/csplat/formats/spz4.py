@@ -9,4 +9,4 @@ from csplat.formats import spz
 
 __all__ = ["FORMAT"]
 
-FORMAT = replace(spz.FORMAT, name="spz4", title="SPZ 4", suffixes=(".v4.spz",), write=partial(spz.write_spz, version=4))
+FORMAT = replace(spz.FORMAT, name="spz4", write=partial(spz.write_spz, version=4))

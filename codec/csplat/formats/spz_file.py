@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from csplat.files import atomic_writer
 from csplat.lint import too_many_bands
 from csplat.model import MAX_SH_DEGREE
 
-__all__ = ["ANTIALIASED", "AXES", "MOST_BITS", "Packed", "is_spz", "read_packed", "write_packed"]
+__all__ = ["ANTIALIASED", "AXES", "MOST_BITS", "Packed", "read_packed", "write_packed"]
 
 U8 = NDArray[np.uint8]
 
@@ -57,7 +58,7 @@ class Packed:
         name: of the file, for messages.
         version: 1 to 4.
         count: N.
-        degree: of SH.
+        degree: of SH, to 4.
         bits: of the fraction of positions.
         flags: `ANTIALIASED` and others.
         streams: how many version 4 says it has.
@@ -97,84 +98,86 @@ class Packed:
         return self.parts[0].view("<f2")
 
 
-def read_packed(path: Path, *, any_degree: bool = False) -> Packed:
+def read_packed(file: BinaryIO, name: str, size: int, *, any_degree: bool = False) -> Packed:
     """Check a file and unpack it.
 
     Args:
-        path: of the file.
+        file: at its beginning.
+        name: of it, for messages.
+        size: of it, in bytes.
         any_degree: its SH may be of a higher degree than that of models, up to 4.
 
     Raises:
         InputError: it is not whole, or none that csplat reads.
         OSError: it cannot be read.
     """
-    with path.open("rb") as stream:
-        zipped = stream.read(2) == _GZIP
+    zipped = file.read(2) == _GZIP
+    file.seek(0)
     try:
-        with cast(BinaryIO, gzip.open(path) if zipped else path.open("rb")) as stream:
-            packed = _header(path, stream, any_degree=any_degree)
-            (_read_streams if packed.version == 4 else _read_arrays)(packed, path, stream)
+        with cast(BinaryIO, gzip.open(file)) if zipped else nullcontext(file) as stream:
+            packed = _header(name, size, stream, any_degree=any_degree)
+            (_read_streams if packed.version == 4 else _read_arrays)(packed, size, stream)
     except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
-        raise InputError(f"{path.name} is damaged: {str(error) or 'it ends too early'}") from None
+        raise InputError(f"{name} is damaged: {str(error) or 'it ends too early'}") from None
     if packed.version == 1 and not np.isfinite(packed.means_half).all():
-        raise InputError(f"{path.name} has positions that are NaN or infinite")
+        raise InputError(f"{name} has positions that are NaN or infinite")
     return packed
 
 
-def _header(path: Path, stream: BinaryIO, *, any_degree: bool) -> Packed:
-    magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_taken(path.name, stream, _HEADER.size))
+def _header(name: str, size: int, stream: BinaryIO, *, any_degree: bool) -> Packed:
+    magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_taken(name, stream, _HEADER.size))
     if magic != _MAGIC:
-        raise InputError(f"{path.name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
+        raise InputError(f"{name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
     if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
-        raise InputError(f"{path.name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
+        raise InputError(f"{name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
     if degree > _MAX_DEGREE:
-        raise InputError(f"{path.name} has SH degree {degree}, wanted at most {_MAX_DEGREE}")
+        raise InputError(f"{name} has SH degree {degree}, wanted at most {_MAX_DEGREE}")
     if degree > MAX_SH_DEGREE and not any_degree:
-        raise InputError(f"{path.name} has {too_many_bands(degree)}")
+        raise InputError(f"{name} has {too_many_bands(degree)}")
     if version > 1 and bits > MOST_BITS:
-        raise InputError(f"{path.name} has {bits} fractional bits, wanted at most {MOST_BITS}")
+        raise InputError(f"{name} has {bits} fractional bits, wanted at most {MOST_BITS}")
     if flags & _LEVELS:
-        raise InputError(f"{path.name} holds levels of detail of Spark in one list, which csplat does not read")
-    packed = Packed(path.name, version, count, degree, bits, flags, streams)
-    unpacked, size = count * sum(packed.widths), path.stat().st_size
+        raise InputError(f"{name} holds levels of detail of Spark in one list, which csplat does not read")
+    packed = Packed(name, version, count, degree, bits, flags, streams)
+    unpacked = count * sum(packed.widths)
     if unpacked > _RATIO * size:
-        raise InputError(f"{path.name} says it has {count:,} splats, more than its {size:,} bytes can hold")
+        raise InputError(f"{name} says it has {count:,} splats, more than its {size:,} bytes can hold")
     return packed
 
 
-def _read_arrays(packed: Packed, path: Path, stream: BinaryIO) -> None:
+def _read_arrays(packed: Packed, _size: int, stream: BinaryIO) -> None:
     """Versions 1 to 3: one attribute after the other, then extensions."""
-    _fill(path.name, stream, packed.room()[_HEADER.size :])
+    _fill(packed.name, stream, packed.room()[_HEADER.size :])
     tail = stream.read(_EXTENSION_BYTES + 1)  # to the end, where gzip has its checksum
     if len(tail) > _EXTENSION_BYTES:
-        raise InputError(f"{path.name} goes on after its last splat")
+        raise InputError(f"{packed.name} goes on after its last splat")
     _read_extensions(packed, tail)
 
 
-def _read_streams(packed: Packed, path: Path, stream: BinaryIO) -> None:
+def _read_streams(packed: Packed, size: int, stream: BinaryIO) -> None:
     """Version 4: extensions, a table, then each attribute packed by itself; those without bytes are left out."""
-    (table,) = _HEADER_REST.unpack(_taken(path.name, stream, _HEADER_REST.size))
+    (table,) = _HEADER_REST.unpack(_taken(packed.name, stream, _HEADER_REST.size))
     start = _HEADER.size + _HEADER_REST.size
     if not start <= table <= start + _EXTENSION_BYTES:
-        raise InputError(f"{path.name} has its table of streams at byte {table}, wanted {start} or a little more")
-    _read_extensions(packed, _taken(path.name, stream, table - start))
+        raise InputError(f"{packed.name} has its table of streams at byte {table}, wanted {start} or a little more")
+    _read_extensions(packed, _taken(packed.name, stream, table - start))
     sizes = [packed.count * width for width in packed.widths]
     wanted = [size for size in sizes if size]
-    rows = [_STREAM.unpack(_taken(path.name, stream, _STREAM.size)) for _ in range(packed.streams)]
+    rows = [_STREAM.unpack(_taken(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
     if [row[1] for row in rows] != wanted:
-        raise InputError(f"{path.name} has streams of {[row[1] for row in rows]} bytes, wanted {wanted}")
-    found, size = table + _STREAM.size * len(rows) + sum(row[0] for row in rows), path.stat().st_size
+        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, wanted {wanted}")
+    found = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
     if found != size:
-        raise InputError(f"{path.name} has {size:,} bytes, and its table says {found:,}")
+        raise InputError(f"{packed.name} has {size:,} bytes, and its table says {found:,}")
     each = iter(rows)
-    for size, width in zip(sizes, packed.widths, strict=True):
-        data = np.empty(size, np.uint8)
-        if size:
-            whole = _taken(path.name, stream, next(each)[0])
+    for part_size, width in zip(sizes, packed.widths, strict=True):
+        data = np.empty(part_size, np.uint8)
+        if part_size:
+            whole = _taken(packed.name, stream, next(each)[0])
             with zstandard.ZstdDecompressor().stream_reader(whole, read_across_frames=True) as reader:
-                _fill(path.name, reader, data)
+                _fill(packed.name, reader, data)
                 if reader.read(1):
-                    raise InputError(f"{path.name} has a stream that unpacks to more than {size:,} bytes")
+                    raise InputError(f"{packed.name} has a stream that unpacks to more than {part_size:,} bytes")
         packed.parts.append(data.reshape(packed.count, width))
 
 
@@ -229,13 +232,3 @@ def write_packed(path: Path, packed: Packed, room: U8) -> None:
         streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in there]
         rows = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, there, strict=True)]
         stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *rows, *streams])
-
-
-def is_spz(_path: Path, head: bytes) -> bool:
-    """As `Format.sniff`."""
-    if head[:2] == _GZIP:
-        try:
-            head = zlib.decompressobj(wbits=31).decompress(head, len(_MAGIC))
-        except zlib.error:
-            return False
-    return head[:4] == _MAGIC

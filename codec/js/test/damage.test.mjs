@@ -25,6 +25,19 @@ test('flipped bits of the worked example are refused', async () => {
   }
 });
 
+test('what servers send in place of a file is named', async () => {
+  for (const [text, says] of [
+    ['version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n', /pointer of Git LFS/],
+    ['\n<!DOCTYPE html><html><head></head><body>Not Found</body></html>', /web page/],
+    ['ply\nformat binary_little_endian 1.0\nelement vertex 1\n', /a PLY/],
+    ['something else that is long enough for a header', /csplat file: byte 0/],
+  ]) {
+    const { code, message } = await refusal(() => decode(new TextEncoder().encode(text)));
+    assert.equal(code, 'E_MAGIC');
+    assert.match(message, says);
+  }
+});
+
 test('bytes behind the end are refused', async () => {
   const longer = new Uint8Array(example.length + 1);
   longer.set(example);

@@ -50,7 +50,7 @@ class PlyTarget(FileTarget):
 
     name = "ply"
     suffix = ".ply"
-    watched: Sequence[Path] = tuple(sorted([*_PACKAGE.glob("ply*.py"), _PACKAGE / "lint.py", _PACKAGE / "foreign.py"]))
+    watched: Sequence[Path] = tuple(sorted([*_PACKAGE.glob("ply*.py"), _PACKAGE / "lint.py", _PACKAGE / "detect.py"]))
 
     def __init__(self) -> None:
         super().__init__()

@@ -44,7 +44,7 @@ _WORDS = {
 }
 
 
-@command(needs={"split": ("data",), "amplify": ("pictures",)})
+@command(reads=True, needs={"split": ("data",), "amplify": ("pictures",)})
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],

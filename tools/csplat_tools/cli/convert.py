@@ -82,7 +82,7 @@ class _Changes(Group):
         )
 
 
-@command()
+@command(reads=True)
 def convert(
     source: Annotated[str, typer.Argument(metavar="IN", help="A scene in any format that is read; a folder; or -.")],
     output: Annotated[str, typer.Argument(metavar="OUT", help="What to write; its name says the format.")],
@@ -90,9 +90,6 @@ def convert(
     upright: Upright,
     out: Output,
     sh_degree: ShDegree = None,
-    read_as: Annotated[
-        str | None, typer.Option("--from", metavar="FORMAT", hidden=True, help="Of IN, if its content does not say it.")
-    ] = None,
     write_as: Annotated[
         str | None, typer.Option("--to", metavar="FORMAT", hidden=True, help="Of OUT, if its name does not say it.")
     ] = None,
@@ -122,7 +119,7 @@ def convert(
         out.check(str(folder) if made_anew else output, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
-            source, output, read_as=read_as, write_as=write_as, level=level, facts=upright.upright(),
+            source, output, write_as=write_as, level=level, facts=upright.upright(),
             filters=changes.filters(sh_degree), no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.findings(made.findings)

@@ -149,6 +149,7 @@ class Room(Group):
 
 @command(
     beside=".csplat",
+    reads=True,
     one_of=(
         ("prune_unseen", *_RENDERED),
         ("prune_unseen", "max_error"),

@@ -34,6 +34,7 @@ __all__ = ["finetune"]
 
 
 @command(
+    reads=True,
     one_of=(
         ("data", "itself"),
         ("data", "views"),

@@ -23,7 +23,7 @@ from csplat_tools.inspect.words import coding_words, headline, other_metadata, s
 __all__ = ["info"]
 
 
-@command(needs={"beside": ("page",)})
+@command(reads=True, needs={"beside": ("page",)})
 def info(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file; or any other of `csplat formats`.")],
     out: Output,

@@ -20,7 +20,7 @@ from csplat_tools.files.streams import STANDARD_STREAM, check_name, source_path,
 __all__ = ["lint"]
 
 
-@command()
+@command(reads=True)
 def lint(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, a file of `csplat formats`, or -.")],
     out: Output,

@@ -21,6 +21,7 @@ import typer
 from typer.models import OptionInfo
 
 from csplat.errors import InputError
+from csplat.formats import insisting
 from csplat_render import Mode
 from csplat_tools.cli.console import guarded
 from csplat_tools.cli.groups import Group, Output
@@ -89,6 +90,16 @@ _Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE,...", hidden=True, help="Settings that have no option; see below."),
 ]
+_ReadAs = Annotated[
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="FORMAT",
+        hidden=True,
+        help="Read scenes as this one of `csplat formats` where their content does not say what they are.",
+    ),
+]
+_READ_AS = "read_as"
 _MORE = re.compile(r"\n *---\n")  # in a docstring: what follows is for --help-all
 _HELP_ALL = "help_all"
 _ALIAS = "output_option"  # `-o`, beside the argument
@@ -103,6 +114,7 @@ def command(
     settings: Sequence[str] = (),
     serves: bool = False,
     beside: str | None = None,
+    reads: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
 
@@ -115,6 +127,7 @@ def command(
             `settings` of type `Settings`.
         serves: it goes on until it is ended: nobody waits for it.
         beside: without an output it writes one beside the source, with this ending.
+        reads: it reads scenes in any format, and takes `--from`.
     """
 
     def made(function: Callable[..., None]) -> Callable[..., None]:
@@ -130,6 +143,7 @@ def command(
 
         def parsed(**given: Any) -> dict[str, Any]:
             given.pop(_HELP_ALL, None)
+            given.pop(_READ_AS, None)
             _check({name for name in given if given[name] != defaults[name]}, options, exclusive, wanting)
             if settings:
                 given["settings"] = read_settings(given["settings"] or (), settings, options)
@@ -144,11 +158,13 @@ def command(
 
         @functools.wraps(function)
         def run(**given: Any) -> None:
+            read_as = given.pop(_READ_AS, None)
             values = parsed(**given)
             quiet = any(isinstance(group, Output) and group.quiet for group in values.values())
-            with nullcontext() if serves else progress_bar(quiet=quiet):
+            with nullcontext() if serves else progress_bar(quiet=quiet), insisting(read_as):
                 function(**values)
 
+        flat += [_keyword(_READ_AS, None, _ReadAs)] * reads
         flat.append(_help_all(functools.partial(_more_help, function, settings, options)))
         shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}
         told = [_saying_what_excludes_it(one, shown, exclusive) for one in flat]
@@ -193,9 +209,11 @@ def _help_all(more: Callable[[], str]) -> inspect.Parameter:
     option = typer.Option(
         "--help-all", is_eager=True, callback=show, help="Show every option, setting and example, and exit."
     )
-    return inspect.Parameter(
-        _HELP_ALL, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option]
-    )
+    return _keyword(_HELP_ALL, False, Annotated[bool, option])
+
+
+def _keyword(name: str, default: object, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def _more_help(function: Callable[..., None], settings: Sequence[str], options: Mapping[str, str]) -> str:

@@ -49,7 +49,7 @@ class _Views(Views):
     )
 
 
-@command(needs={"up": ("orbit",), "axes": ("orbit",)})
+@command(reads=True, needs={"up": ("orbit",), "axes": ("orbit",)})
 def render(
     source: Scene,
     output: Annotated[

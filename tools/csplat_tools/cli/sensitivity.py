@@ -23,7 +23,7 @@ _PASSES = 4.4
 _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
 
 
-@command()
+@command(reads=True)
 def sensitivity(
     source: Scene,
     output: Annotated[str, typer.Argument(metavar="OUT.npz", help="The file to write.")],

@@ -28,7 +28,7 @@ _PASSES = (20.0, 45.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 
 
-@command(one_of=(("keep", "target_psnr", "max_loss"),), needs={"max_loss": ("data",)}, settings=(_OPTIONS,))
+@command(reads=True, one_of=(("keep", "target_psnr", "max_loss"),), needs={"max_loss": ("data",)}, settings=(_OPTIONS,))
 def simplify(
     source: Scene,
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],

@@ -20,7 +20,7 @@ __all__ = ["tradeoff"]
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 
 
-@command(needs={"background": ("cameras", "data")})
+@command(reads=True, needs={"background": ("cameras", "data")})
 def tradeoff(
     source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
     views: Views,

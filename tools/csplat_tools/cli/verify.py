@@ -18,7 +18,7 @@ from csplat_tools.inspect.verify import Verified, verify_file
 __all__ = ["verify"]
 
 
-@command(needs={"source_index": ("source",), "memory": ("source",)})
+@command(reads=True, needs={"source_index": ("source",), "memory": ("source",)})
 def verify(
     path: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
     out: Output,

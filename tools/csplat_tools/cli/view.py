@@ -29,7 +29,7 @@ _Cameras = Annotated[
 ]
 
 
-@command(serves=True)
+@command(serves=True, reads=True)
 def view(
     source: Scene,
     upright: Upright,
@@ -74,7 +74,7 @@ def view(
                 out.remark("")  # behind the ^C of the terminal
 
 
-@command(beside=".html")
+@command(beside=".html", reads=True)
 def export_html(
     source: Scene,
     output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -; SCENE.html by default.")],

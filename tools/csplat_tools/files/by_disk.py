@@ -8,14 +8,14 @@ from typing import Any
 
 from csplat.encoder import EncodeOptions, EncodeReport
 from csplat.errors import InputError
-from csplat.formats import format_of, open_scene
+from csplat.formats import format_of, open_scene, read_all
 from csplat.large import Needs, encode_scene, needs_of
 from csplat.lint import Finding, dropped_columns, refuse
 from csplat.memory import default_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat_tools.files.console import Progress, note
 from csplat_tools.files.facts import SceneOverrides
-from csplat_tools.files.scenes import size_of
+from csplat_tools.files.scenes import READ_ANEW, LoadedModel, size_of
 from csplat_tools.files.streams import STANDARD_STREAM
 
 __all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected", "read_degree"]
@@ -82,8 +82,8 @@ def encode_by_disk(
     *,
     strict: bool,
     progress: Progress | None,
-) -> ByDisk | None:
-    """Encode a scene by way of the disk; `None` where it fits the memory.
+) -> ByDisk | LoadedModel | None:
+    """Encode a scene by way of the disk, or give it where it fits the memory.
 
     Args:
         local: the scene, in any format.
@@ -94,6 +94,10 @@ def encode_by_disk(
         strict: refuse what would be repaired.
         progress: is told the stages.
 
+    Returns:
+        What was encoded; or the scene, read, as `read_source` has it; `None` where it fits the memory and its format
+        has a reader that is quicker from the beginning.
+
     Raises:
         CsplatError: as of `encode_scene`; or it is too large to go to standard output.
         OSError: likewise.
@@ -103,7 +107,14 @@ def encode_by_disk(
     with open_scene(local, sh_degree=read_degree(options)) as opened:
         in_memory = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
-            return None
+            if opened.format in READ_ANEW:
+                return None
+            findings: list[Finding] = []
+            if progress is not None:
+                progress("reading", 0.0)
+            model = read_all(opened, strict=strict, keep_extra=options.keep_extra, report=findings)
+            model = (facts or SceneOverrides()).applied(model)
+            return LoadedModel(model, size_of(local), name=local.name, findings=tuple(findings))
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
         findings = [*opened.findings]

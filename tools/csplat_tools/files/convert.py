@@ -15,7 +15,7 @@ from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
-from csplat_tools.files.by_disk import Scale, encode_by_disk, read_degree
+from csplat_tools.files.by_disk import ByDisk, Scale, encode_by_disk, read_degree
 from csplat_tools.files.console import Progress
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
@@ -162,16 +162,19 @@ def encode_file(
     """
     start, scale = time.perf_counter(), scale or Scale()
     in_memory = encoder is not None or importance is not None or source_index is not None
+    read: LoadedModel | None = None
     with source_path(source) as local:
         if not in_memory and scale.may_leave_memory(local):
             done = encode_by_disk(local, target, options, facts, scale, strict=strict, progress=progress)
-            if done is not None:
+            if isinstance(done, ByDisk):
                 seconds = time.perf_counter() - start
                 return Encoded(done.facts, done.report, None, done.findings, size_of(local), seconds)
-        read = read_source(
-            local, facts, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
-            progress=progress,
-        )  # fmt: skip
+            read = done
+        if read is None:
+            read = read_source(
+                local, facts, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+                progress=progress,
+            )  # fmt: skip
     model = read.model
     if encoder is not None:
         made = encoder(model, options, progress)

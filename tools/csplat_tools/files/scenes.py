@@ -23,13 +23,15 @@ from csplat_tools.files.console import Progress
 from csplat_tools.files.streams import is_csplat, kept_path, local_path, mapped_csplat, naming
 
 __all__ = [
-    "FOLDER_NAMES", "LoadedModel", "OpenedScene", "SceneLike", "load_model", "opened_scenes", "ply_splat_bytes",
-    "size_of", "watched", "without_bands", "without_extra",
+    "FOLDER_NAMES", "READ_ANEW", "LoadedModel", "OpenedScene", "SceneLike", "load_model", "opened_scenes",
+    "ply_splat_bytes", "size_of", "watched", "without_bands", "without_extra",
 ]  # fmt: skip
 
 #: Files that stand for all that lies beside them: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
+#: Formats that unpack nothing when they are opened, and whose readers take all splats at once in fewer passes.
+READ_ANEW = ("ply", "csplat")
 _SMALL = 1 << 20  # bytes of a file of any format that fits every memory
 #: What comparing takes in memory beside the arrays: the program; of a splat what is drawn and searched.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
@@ -217,18 +219,26 @@ def opened_scenes(
     bound = default_bytes() if memory_bytes is None else memory_bytes
     with ExitStack() as stack:
         local: dict[int, Path] = {}
+        fits: dict[int, LoadedModel] = {}
         for place, one in enumerate(given):
             if not isinstance(one, (SplatModel, LoadedModel, OpenedScene)):
                 with naming(one):
                     local[place] = stack.enter_context(kept_path(one))
         looked_at = memory_bytes is not None or any(size_of(path) > _SMALL for path in local.values())
         if len(local) == len(given) and looked_at:
-            found = [_opened(stack, given[place], path, bound) for place, path in local.items()]
+            opening = stack.enter_context(ExitStack())
+            found = [_opened(opening, given[place], path, bound) for place, path in local.items()]
             if _together_bytes(found) > bound:
                 yield found
                 return
+            fits = {place: _in_memory(one) for place, one in enumerate(found) if one.scene.format not in READ_ANEW}
+            opening.close()
+            del found
         loaded = []
         for place, one in enumerate(given):
+            if place in fits:
+                loaded.append(fits[place])
+                continue
             if isinstance(one, (SplatModel, LoadedModel)):
                 loaded.append(load_model(one))
                 continue
@@ -246,6 +256,11 @@ def _opened(stack: ExitStack, given: object, path: Path, bound: int) -> OpenedSc
             yield from scene.blocks()
 
     return OpenedScene(replace(scene, blocks=blocks), size_of(path), path, bound)
+
+
+def _in_memory(opened: OpenedScene) -> LoadedModel:
+    model = formats.read_all(opened.scene)
+    return LoadedModel(model, opened.size_bytes, name=opened.path.name, findings=tuple(opened.findings))
 
 
 def _together_bytes(found: Sequence[OpenedScene]) -> float:

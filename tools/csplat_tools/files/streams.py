@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
+from csplat.detect import HEAD_SIZE, by_content, by_name, head_of, refusal
 from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
-from csplat.foreign import HEAD_SIZE, foreign_name, refuse_known
 from csplat.formats import formats
 from csplat.inputs import File, mapped
 from csplat.model import SplatModel
@@ -55,6 +55,7 @@ __all__ = [
 
 STANDARD_STREAM = "-"
 
+_OURS = ("ply", "csplat")  # names of formats
 _PLY_MAGICS = (b"ply\n", b"ply\r")
 
 #: By the endings of input and output, `*` for any, the command that makes one of the other.
@@ -148,9 +149,10 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
         return
-    others = [one for one in formats() if one.write is not None and one.name not in ("ply", "csplat")]
+    others = [one for one in formats() if one.write is not None and one.name not in _OURS]
     converts = any(target.name.lower().endswith(one.suffixes) for one in others)
-    known = None if converts else foreign_name(target)
+    kind = None if converts else by_name(target)
+    known = None if kind is None or kind.name in _OURS or not kind.is_scene else kind.title
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
     if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
         return
@@ -202,6 +204,7 @@ def source_path(file: File) -> Iterator[Path]:
     """
     with local_path(file) as local:
         if is_csplat(local):
+            _refuse_others(local.name, head_of(local))
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
                 " `csplat info` describes it"
@@ -336,15 +339,10 @@ def is_one_way(path: str) -> bool:
 
 
 def _refuse_others(name: str, data: bytes) -> None:
-    if data[:4] in _PLY_MAGICS:
-        raise InputError(f"{name} is a PLY, wanted a .csplat file: `csplat encode` makes one")
-    if not data.startswith(MAGIC) and Path(name).suffix.lower() != ".csplat":
-        try:
-            refuse_known(Path(name), data[:HEAD_SIZE])
-        except InputError:
-            raise InputError(
-                f"{name} is a scene in another format: `csplat encode` makes a .csplat file of it"
-            ) from None
+    head = data[:HEAD_SIZE]
+    kind = by_content(Path(name), head) or by_name(Path(name))
+    if kind is not None and kind.name != "csplat":
+        raise refusal(Path(name), head, wanted="csplat")
 
 
 def _close(data: mmap) -> None:

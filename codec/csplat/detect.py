@@ -1,0 +1,259 @@
+"""Tell what a file is: one table of formats, those that csplat reads and others that users hand over.
+
+The content decides, then the name. `csplat.formats` takes the reader of what is found here, and the refusals of all
+commands name it with what helps. Only the first bytes and the names in a zip are looked at; nothing is parsed.
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from csplat._spec import MAGIC
+from csplat.archives import zip_refusal
+from csplat.errors import InputError
+from csplat.inputs import stand_in
+
+__all__ = ["HEAD_SIZE", "KINDS", "Kind", "by_content", "by_name", "head_of", "is_ply", "refusal"]
+
+#: Bytes of the beginning of a file that are looked at.
+HEAD_SIZE = 512
+
+_SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
+_NOT_READ = "which csplat does not read: convert it to PLY first, with"
+_NO_SPLATS = "no scene of splats"
+_PLY_HEADER_SIZE = 1 << 16  # bytes in which the words of a compressed PLY stand
+_KSPLAT_HEAD = 44  # bytes of its header that say something; the others are 0
+_SPLAT_ROW_SIZE = 32
+_MANIFESTS = {"meta.json", "lod-meta.json"}  # of SOG
+_PLY, _CSPLAT = "ply", "csplat"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes:
+        name: of the format, as `csplat formats` has it; of what csplat does not read, any other.
+        title: as people write it: `SPZ 4`.
+        suffixes: of file names, the usual one first; with their dots, in small letters.
+        matches: whether a file is one by its content: its path, and its first bytes (none of a folder).
+        remedy: what helps, in words that follow the title and a comma; "" where csplat has a reader.
+    """
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...] = ()
+    matches: Callable[[Path, bytes], bool] = lambda _path, _head: False
+    remedy: str = ""
+
+    @property
+    def is_scene(self) -> bool:
+        """Whether it holds splats, read by csplat or not."""
+        return not self.remedy or self.remedy.startswith(_NOT_READ)
+
+
+def by_content(path: Path, head: bytes) -> Kind | None:
+    """Find what a file or folder is by its content; `None`: nothing that is known.
+
+    Args:
+        path: the file, of which a zip, a folder and a PLY are looked into.
+        head: its first `HEAD_SIZE` bytes, or all of them; none of a folder.
+
+    Raises:
+        InputError: it is a pointer of Git LFS, or a web page: no file of any kind.
+    """
+    instead = stand_in(head)
+    if instead:
+        raise InputError(f"{path.name} is {instead}")
+    return next((kind for kind in KINDS.values() if kind.matches(path, head)), None)
+
+
+def by_name(path: Path) -> Kind | None:
+    """Find what a file of that name would be; `None`: nothing that is known."""
+    name = path.name.lower()
+    found = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
+    return max(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def head_of(path: Path) -> bytes:
+    """Read what `by_content` looks at.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    if path.is_dir():
+        return b""
+    with path.open("rb") as stream:
+        return stream.read(HEAD_SIZE)
+
+
+def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
+    """Build the error for a file that a reader does not take: what it is, and what helps.
+
+    Args:
+        path: of it.
+        head: as of `by_content`.
+        wanted: name of the only format that the reader takes; "": it takes all that csplat reads.
+    """
+    if path.is_dir() and wanted and not by_content(path, head):
+        return InputError(f"{path.name} is a folder, wanted a {KINDS[wanted].title}")
+    if path.is_dir() and not wanted:
+        return InputError(f"{path} is a folder, and no scene")
+    if not (head or path.is_dir()):
+        return InputError(f"{path.name} is empty" + (f", wanted a {KINDS[wanted].title}" if wanted else ""))
+    try:
+        kind = by_content(path, head) or by_name(path)
+    except InputError as error:
+        return error
+    if kind is not None and kind.name == "zip":
+        return InputError(zip_refusal(path))
+    begin = f"it begins with {head[:8]!r}"
+    if kind is not None and kind.remedy:
+        return InputError(f"{path.name} is {kind.title}, {kind.remedy}")
+    if kind is None or kind.name == wanted:
+        if path.stat().st_size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
+            tool = "convert it to PLY first, with `csplat convert --from splat`" if wanted else "--from splat reads it"
+            begin = f"its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that of a .splat file: if it is one, {tool}"
+        what = f"not a {KINDS[wanted].title}" if wanted else "in no format that csplat knows"
+        return InputError(f"{path.name} is {what}: {begin}" + ("; wanted one of Gaussian splats" if wanted else ""))
+    if wanted == _CSPLAT:
+        title = f"a {kind.title}" if kind.name == _PLY else kind.title
+        return InputError(f"{path} is {title}, wanted a .csplat file: `csplat encode` makes a .csplat file of it")
+    tool = "`csplat decode`" if kind.name == _CSPLAT else "`csplat convert`, or take csplat.read, which reads it"
+    return InputError(f"{path.name} is {kind.title}, not a plain PLY: convert it to PLY first, with {tool}")
+
+
+def _begins(*magics: bytes) -> Callable[[Path, bytes], bool]:
+    return lambda _path, head: head.startswith(magics)
+
+
+def is_ply(head: bytes) -> bool:
+    """Tell whether a file begins as a PLY; a byte order mark, capitals and a space are forgiven."""
+    head = head.removeprefix(b"\xef\xbb\xbf")
+    return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
+
+
+def _is_compressed_ply(path: Path, head: bytes) -> bool:
+    if not is_ply(head):
+        return False
+    if b"end_header" not in head and path.is_file():  # the words come after bounds and comments
+        with path.open("rb") as stream:
+            head = stream.read(_PLY_HEADER_SIZE)
+    return b"packed_position" in head.partition(b"end_header")[0]
+
+
+def _is_spz(_path: Path, head: bytes) -> bool:
+    if head[:2] == b"\x1f\x8b":
+        try:
+            head = zlib.decompressobj(wbits=31).decompress(head, 4)
+        except zlib.error:
+            return False
+    return head[:4] == b"NGSP"
+
+
+def _is_gzip(path: Path, head: bytes) -> bool:
+    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # of that its reader says what is wrong
+
+
+def _is_ksplat(_path: Path, head: bytes) -> bool:
+    return head[:4] == b"\0\1\0\0" and len(head) > _KSPLAT_HEAD and not any(head[_KSPLAT_HEAD:])
+
+
+def _is_sog(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return any((path / name).is_file() for name in _MANIFESTS)
+    if head[:4] == b"PK\x03\x04":
+        names = _names_in_zip(path)
+        return (
+            path.suffix.lower() == ".sog"
+            if names is None
+            else any(_MANIFESTS & {name.rsplit("/", 1)[-1]} for name in names)
+        )
+    return _is_json(path, head) and path.name.lower().endswith("meta.json")
+
+
+def _holds(ending: str) -> Callable[[Path, bytes], bool]:
+    """Recognise a zip by the ending of a name in it."""
+
+    def matches(path: Path, head: bytes) -> bool:
+        return head[:4] == b"PK\x03\x04" and any(name.endswith(ending) for name in _names_in_zip(path) or ())
+
+    return matches
+
+
+def _names_in_zip(path: Path) -> list[str] | None:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # of broken archives
+        return None
+
+
+def _is_gltf(path: Path, head: bytes) -> bool:
+    return head[:4] == b"glTF" or (_is_json(path, head) and (path.suffix.lower() == ".gltf" or b'"asset"' in head))
+
+
+def _is_tileset(path: Path, head: bytes) -> bool:
+    return _is_json(path, head) and (path.name.lower() == "tileset.json" or b'"geometricError"' in head)
+
+
+def _is_json(_path: Path, head: bytes) -> bool:
+    """Whether it is text that begins as JSON; a brace alone may be a byte of anything."""
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return text[:1] in (b"{", b"[") and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
+
+
+def _is_usd(path: Path, head: bytes) -> bool:
+    return head.startswith((b"PXR-USDC", b"#usda")) or _holds(".usdc")(path, head) or _holds(".usda")(path, head)
+
+
+#: All kinds by name. Of several that match a content the first one counts.
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
+        Kind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
+        Kind(_CSPLAT, "csplat", (".csplat",), _begins(MAGIC)),
+        Kind("spz", "SPZ", (".spz",), _is_spz),
+        Kind("spz4", "SPZ 4", (".v4.spz",)),
+        Kind("splat", ".splat", (".splat",)),
+        Kind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
+        Kind("sog", "SOG", (".sog", "meta.json"), _is_sog),
+        Kind(
+            "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
+        ),
+        Kind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
+        Kind("checkpoint", "a checkpoint of gsplat or splatfacto", (".pt", ".ckpt"), _holds("/data.pkl")),
+        Kind("spx", ".spx", (".spx",), _begins(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
+        Kind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
+        Kind("rad", "RAD of Spark", (".rad",), _begins(b"RAD0"), f"{_NOT_READ} Spark, or take the file it was made of"),
+        Kind("usd", "USD", (".usdz", ".usdc", ".usda", ".usd"), _is_usd, f"{_NOT_READ} the program that wrote it"),
+        Kind(
+            "3d-tiles",
+            "a tile of 3D Tiles",
+            (".b3dm", ".i3dm", ".pnts", ".cmpt"),
+            _begins(b"b3dm", b"i3dm", b"pnts", b"cmpt"),
+            "which csplat does not read: tiles of splats are .glb files",
+        ),
+        Kind("gzip", "gzip", (".gz",), _is_gzip, "convert it to PLY first, with gunzip"),
+        Kind("npz", "an archive of NumPy arrays", (".npz",), _holds(".npy"), _NO_SPLATS),
+        Kind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
+        Kind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
+        Kind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),
+        Kind("zstd", "zstd", (".zst",), _begins(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
+        Kind("tar", "tar", (".tar",), lambda _path, head: head[257:262] == b"ustar", "unpack it first"),
+        Kind("png", "a PNG", (".png",), _begins(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
+        Kind("jpeg", "a JPEG", (".jpg", ".jpeg"), _begins(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
+        Kind("pdf", "a PDF", (".pdf",), _begins(b"%PDF-"), _NO_SPLATS),
+        Kind("las", "LAS", (".las", ".laz"), _begins(b"LASF"), f"a point cloud, {_NO_SPLATS}"),
+        Kind("e57", "E57", (".e57",), _begins(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
+        Kind("obj", "OBJ", (".obj",), remedy=f"a mesh, {_NO_SPLATS}"),
+        Kind("fbx", "FBX", (".fbx",), _begins(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
+        Kind("json", "JSON", (), _is_json, _NO_SPLATS),
+    )
+}

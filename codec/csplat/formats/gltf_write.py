@@ -1,0 +1,151 @@
+"""Write glTF 2.0 with the extension KHR_gaussian_splatting, as one .glb."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.formats.gltf_file import BIN, GLB_HEAD, JSON, MAGIC
+from csplat.formats.gltf_read import AXES, COLOURS, EXTENSION, sh_names
+from csplat.model import F32, SplatModel
+from csplat.ply_comments import format_comments
+from csplat.scene import Scene
+from csplat.turning import in_axes, scaled
+
+__all__ = ["write_gltf"]
+
+F64 = NDArray[np.float64]
+
+_SH_C0 = 0.28209479177387814
+_FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
+_LARGEST_FILE = (1 << 32) - 1  # of a .glb: its length is a u32
+
+
+def write_gltf(path: Path, scene: Scene) -> None:
+    """Write a scene as `csplat.formats.format.Writer` does."""
+    if path.suffix.lower() == ".gltf":
+        raise InputError(f"{path.name}: glTF is written as one file, name it {path.with_suffix('.glb').name}")
+    if not scene.count:
+        raise InputError(f"{path.name}: the scene has no splats, and glTF has no empty meshes")
+    unit = scene.facts.unit_metres
+    if unit not in (None, 1.0):
+        before, metres = scene, float(unit)
+        scene = Scene(
+            scene.count, scaled(scene.facts, metres), lambda: (scaled(one, metres) for one in before.blocks())
+        )
+    scene = in_axes(scene, AXES)
+    columns = _columns(scene.facts.sh_degree)
+    lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
+    for block in scene.blocks():
+        lowest = np.minimum(lowest, block.means.min(axis=0, initial=np.inf))
+        highest = np.maximum(highest, block.means.max(axis=0, initial=-np.inf))
+    offsets = np.cumsum([0, *(column.row_size * scene.count for column in columns)]).tolist()
+    text = json.dumps(_json(scene, columns, offsets, (lowest, highest)), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    start = GLB_HEAD.size + 8 + len(text) + 8
+    if start + offsets[-1] > _LARGEST_FILE:
+        raise InputError(
+            f"{path.name} would have {start + offsets[-1]:,} bytes, and a .glb has at most {_LARGEST_FILE:,}:"
+            f" write fewer splats, or fewer SH bands"
+        )
+    with atomic_writer(path) as stream:
+        stream.write(GLB_HEAD.pack(MAGIC, 2, start + offsets[-1]) + struct.pack("<I4s", len(text), JSON) + text)
+        stream.write(struct.pack("<I4s", offsets[-1], BIN))
+        done = 0
+        for block in scene.blocks():
+            rows = _rows(block)
+            for column, offset in zip(columns, offsets, strict=False):
+                stream.seek(start + offset + done * column.row_size)
+                stream.write(np.ascontiguousarray(rows[column.name]).view(np.uint8).data)
+            done += len(block)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """One attribute as it is written."""
+
+    name: str
+    width: int
+    component: int = _FLOAT
+
+    @property
+    def row_size(self) -> int:
+        return self.width * (4 if self.component == _FLOAT else 1)
+
+
+def _columns(degree: int) -> list[_Column]:
+    names = [name for band in range(degree + 1) for name in sh_names(band)]
+    first = [_Column("POSITION", 3), _Column("ROTATION", 4), _Column("SCALE", 3), _Column("OPACITY", 1)]
+    return [*first, _Column("COLOR_0", 4, _BYTE), *(_Column(name, 3) for name in names)]
+
+
+def _rows(model: SplatModel) -> dict[str, NDArray[Any]]:
+    """All attributes of some splats."""
+    with np.errstate(over="ignore", under="ignore"):
+        scales = np.exp(model.scales.astype(np.float64))
+    names = [name for band in range(1, model.sh_degree + 1) for name in sh_names(band)]
+    return {
+        "POSITION": model.means.astype("<f4"),
+        "ROTATION": model.quats[:, [1, 2, 3, 0]].astype("<f4"),
+        "SCALE": np.minimum(scales, np.finfo(np.float32).max).astype("<f4"),
+        "OPACITY": model.opacities.astype("<f4"),
+        "COLOR_0": _point_colours(model),
+        "SH_DEGREE_0_COEF_0": model.sh0.astype("<f4"),
+        **{name: model.shN[:, index].astype("<f4") for index, name in enumerate(names)},
+    }
+
+
+def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
+    """What programs show that know points alone: linear colour, alpha."""
+    srgb = np.clip(model.sh0 * np.float32(_SH_C0) + np.float32(0.5), 0.0, 1.0)
+    linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)
+
+
+def _json(scene: Scene, columns: list[_Column], offsets: list[int], bounds: tuple[F64, F64]) -> dict[str, Any]:
+    facts = scene.facts
+    asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
+    lines = format_comments(facts, absolute=False)
+    licence = facts.metadata.get("licence")
+    if isinstance(licence, str):
+        asset["copyright"] = licence
+    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": index, "componentType": column.component, "count": scene.count, "type": kinds[column.width]}
+        for index, column in enumerate(columns)
+    ]
+    accessors[0] |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
+    plain = ("POSITION", "COLOR_0")
+    for index, column in enumerate(columns):
+        if column.component == _BYTE:
+            accessors[index]["normalized"] = True
+    names = [column.name if column.name in plain else f"{EXTENSION}:{column.name}" for column in columns]
+    splats = {"kernel": "ellipse", "colorSpace": COLOURS}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(names)},
+        "mode": 0,
+        "extensions": {EXTENSION: splats},
+    }
+    return {
+        "asset": {**asset, "extras": {"csplat": lines}},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **({"translation": list(facts.origin)} if any(facts.origin) else {})}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": stop - start, "target": _ARRAY_BUFFER}
+            for start, stop in pairwise(offsets)
+        ],
+        "buffers": [{"byteLength": offsets[-1]}],
+    }
