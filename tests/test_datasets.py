@@ -220,7 +220,7 @@ def test_points_of_colmap_may_be_a_ply(colmap_set):
     (model / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n1 2 3\n")
     data = load(colmap_set)
     assert [[1.0, 2.0, 3.0]] == data.points.tolist()
-    assert [[0.5, 0.5, 0.5]] == data.points_rgb.tolist()
+    assert data.points_rgb is None
 
 
 def test_images_txt_may_leave_out_the_lines_of_keypoints(tmp_path):

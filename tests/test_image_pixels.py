@@ -156,7 +156,7 @@ REFUSED = {
     "Radiance": ("a.hdr", lambda p: p.write_bytes(b"#?RADIANCE\n" + bytes(60)), "is a Radiance HDR file"),
     "HEIC": ("a.heic", lambda p: p.write_bytes(b"\0\0\0\x18ftypheic" + bytes(60)), "is a HEIC file"),
     "raw": ("a.dng", lambda p: Image.fromarray(RGB).save(p, "TIFF"), "a camera's raw file"),
-    "a web page": ("a.jpg", lambda p: p.write_text("<html>"), "is not an image that can be read"),
+    "a web page": ("a.jpg", lambda p: p.write_text("<html>"), "is a web page"),
 }
 
 

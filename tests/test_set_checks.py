@@ -17,6 +17,7 @@ from posed_sets import H, W, cameras, change_transforms, to_opengl, write_colmap
 from tables import failures
 
 from csplat_trainer.data import load
+from csplat_trainer.starting import scene_of, starting_splats
 
 POSE = np.array(to_opengl(cameras(10)[0]))
 SHEARED = POSE @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
@@ -203,4 +204,47 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
     assert any("all 9 cameras stand at one place" in line for line in report)
     inverse = [replace(shot, viewmat=np.linalg.inv(shot.viewmat)) for shot in shots]
     write_colmap(tmp_path / "sparse" / "0", inverse)
-    assert any("9 of 9 cameras (im 001.png, …) see none of the points" in line for line in load(tmp_path).report)
+    line = "9 of 9 cameras (im 001.png, …) see none of the points: with inverted poses they would: the file holds"
+    assert any(line in said for said in load(tmp_path).report)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda pose: pose, None),
+        (np.linalg.inv, "the cameras look past each other, and with inverted poses all at one point"),
+        (lambda pose: pose @ np.diag([1, -1, -1, 1]), "all cameras look away from what they stand around"),
+    ],
+)
+def test_poses_of_other_conventions_are_reported(tmp_path, change, says):
+    write_transforms(tmp_path)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    for frame in frames:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    change_transforms(tmp_path, frames=frames)
+    found = [line for line in load(tmp_path).report if "cameras look" in line]
+    assert [] == found if says is None else says in found[0]
+
+
+def test_points_of_one_colour_get_those_of_the_images(tmp_path):
+    write_colmap_set(tmp_path, text=True)
+    file = tmp_path / "sparse" / "0" / "points3D.txt"
+    file.write_text("1 0 0 0 0 0 0 1\n2 0.4 0.1 0.2 0 0 0 1\n")
+    data = load(tmp_path)
+    assert data.points_rgb is None
+    assert "all points have the colour 0 0 0: splats start with the colours of the images there" in data.report
+    splats = starting_splats(data.train, scene_of(data.train), 2, 0, np.random.default_rng(0), points=data.points)
+    colours = 0.5 + 0.28209479177387814 * splats["sh0"][np.argsort(splats["means"][:, 0])]
+    assert colours[1, 1] > 0.1  # a green dot lies there, on black
+    assert np.allclose(0.0, colours[1, [0, 2]], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["images/im 003.png", "sparse/0/images.bin", "test.txt"])
+def test_pointers_of_git_lfs_are_named(tmp_path, name):
+    write_colmap_set(tmp_path)
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(InputError, match=r"is a pointer of Git LFS, not the file itself: run `git lfs pull`"):
+        load(tmp_path).read()
+    (tmp_path / name).write_text("<!DOCTYPE html><html>")
+    with pytest.raises(InputError, match=r"is a web page \(HTML\)"):
+        load(tmp_path).read()

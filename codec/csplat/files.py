@@ -60,6 +60,9 @@ def read_text(path: str | os.PathLike[str]) -> str:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: {error.strerror or error}") from error
+    instead = stand_in(data[:64])
+    if instead:
+        raise InputError(f"{os.fspath(path)} is {instead}")
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "utf-8")
     try:
         text = data.decode(encoding)

@@ -97,7 +97,7 @@ def starting_splats(
         rng: chooses.
         init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
         points: [P, 3], points of the scene, where the data set has any.
-        colours: [P, 3] in 0..1, their colours.
+        colours: [P, 3] in 0..1, their colours; `None`: those of the pictures there.
 
     Raises:
         InputError: there are no points, or no masks, to start from; or points that are not finite.
@@ -118,6 +118,8 @@ def starting_splats(
                 f"no camera sees any of the data set's {len(points)} points, expected both in the same coordinates:"
                 " --set init=box starts without points"
             )
+        if colours is None:
+            colours = _look(pictures, points.astype(np.float64))[2].astype(np.float32)
         means, colour = _at_points(points, colours, count, scene, rng)
     else:
         masked = have_masks and init in ("hull", "auto")
@@ -125,12 +127,12 @@ def starting_splats(
     return _splats(means, colour, sh_degree, scene, rng)
 
 
-def _at_points(points: F32, colours: F32 | None, count: int, scene: StartingScene, rng: Generator) -> tuple[F64, F64]:
+def _at_points(points: F32, colours: F32, count: int, scene: StartingScene, rng: Generator) -> tuple[F64, F64]:
     """Some of the points, or all of them and more beside them where more are wanted."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
-    colour = np.full((len(points), 3), 0.5) if colours is None else np.asarray(colours, np.float64)
+    colour = np.asarray(colours, np.float64)
     beside = np.arange(len(chosen)) >= len(points)
     if beside.any():
         spread = _neighbour_distances(points.astype(np.float64), scene)[chosen[beside]]

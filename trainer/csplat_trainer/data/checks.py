@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat_render.camera_forms import check_intrinsics
+from csplat_render.cameras import nearest_point
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
@@ -24,6 +26,9 @@ _NEARLY = 0.02  # relative, of scales across and down: beyond it an image is tur
 _MIDDLE = (0.25, 0.75)  # of the image: principal points elsewhere are reported
 _SMALL_RANGE = 1.0 / 8.0  # of what 16 bits hold: images of 12 bits are as dark as that
 _SAME = 1e-9  # relative, of places; coordinates of maps are a million times the distance of cameras
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's
+_FEW = 4  # cameras; fewer need not look anywhere in common
+_AIMED, _AIMLESS = 0.95, 0.5  # median cosines; see `_gaze`
 _SHOTS, _POINTS = 64, 4096  # of a set, at most, that are looked at to see whether they belong together
 
 
@@ -121,7 +126,7 @@ def notes_on_lenses(shots: Sequence[Shot]) -> list[str]:
 
 
 def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
-    """Report cameras that all stand at one place, and cameras that see none of the points.
+    """Report cameras that all stand at one place, see none of the points, or look as inverted poses do.
 
     Args:
         shots: all that teach or judge.
@@ -136,11 +141,41 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
         some_shots, some_points = shots[:: -(-len(shots) // _SHOTS)], points[:: -(-len(points) // _POINTS)]
         blind = [shot for shot in some_shots if not _sees_any(shot, some_points)]
         if 2 * len(blind) > len(some_shots):
-            notes.append(
-                f"{len(blind)} of {len(some_shots)} cameras ({blind[0].name}, …) see none of the points: are their "
-                "poses camera to world, or are the points of another scene?"
-            )
+            inverted = [replace(shot, viewmat=np.asarray(np.linalg.inv(shot.viewmat))) for shot in blind]
+            cause = "are the poses and the points of one scene?"
+            if 2 * sum(_sees_any(shot, some_points) for shot in inverted) > len(blind):
+                cause = "with inverted poses they would: the file holds the inverse of what it should"
+            what = f"{len(blind)} of {len(some_shots)} cameras ({blind[0].name}, …) see none of the points"
+            return [*notes, f"{what}: {cause}"]
+    if len(shots) < _FEW:
+        return notes
+    viewmats = np.stack([shot.viewmat for shot in shots])
+    gaze, inverse = _gaze(viewmats), np.asarray(np.linalg.inv(viewmats), np.float64)
+    if gaze < -_AIMED:
+        notes.append(
+            "all cameras look away from what they stand around, as in a panorama: if that is wrong, the poses have "
+            "other axes than files of this kind"
+        )
+    # What a file holds may be the inverse as COLMAP has it, or of either custom of axes as transforms.json is read.
+    elif abs(gaze) < _AIMLESS and max(map(_gaze, (inverse, inverse @ _FLIP, _FLIP @ inverse @ _FLIP))) > _AIMED:
+        notes.append(
+            "the cameras look past each other, and with inverted poses all at one point: does the file hold the "
+            "inverse of what it should?"
+        )
     return notes
+
+
+def _gaze(viewmats: NDArray[np.float64]) -> float:
+    """Return the median cosine between where cameras look and where the point lies that is nearest to all their lines.
+
+    1 of cameras that look at one thing from all around, -1 of those that look away from their middle.
+    """
+    axes = viewmats[:, 2, :3]
+    positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    positions = positions - positions.mean(axis=0)
+    towards = nearest_point(positions, axes) - positions
+    lengths = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(np.float64).tiny)
+    return float(np.median(np.einsum("ni,ni->n", axes, towards) / lengths))
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
+from csplat.inputs import stand_in
 from csplat_trainer.data.image_files import shown
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import finite_points
@@ -195,6 +196,9 @@ class _Bytes:
             self._data = path.read_bytes()
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from error
+        instead = stand_in(self._data[:64])
+        if instead:
+            raise InputError(f"{path} is {instead}")
         self._path = path
         self._at = 0
 

@@ -36,7 +36,7 @@ class DataSet:
         train: pictures to learn from, at least one.
         test: pictures that were held out; none if the set is too small or names none.
         points: [P, 3] float32, points of the scene, relative to `origin`; `None` where the set has none.
-        points_rgb: [P, 3] float32 in 0..1, their colours.
+        points_rgb: [P, 3] float32 in 0..1, their colours; `None` where they have none of their own.
         report: what was found, left out and changed, a line each.
         coordinate_system: as in `SplatModel`, where the kind of set has a custom.
         up: which direction is up; `None` where neither the kind of set nor its cameras say it.

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 from csplat.errors import InputError
+from csplat.inputs import stand_in
 
 __all__ = [
     "COUNTS",
@@ -52,7 +53,7 @@ _FLOAT = "F"
 _DEEP = ";16"  # in pillow's names of raw data of which it keeps the upper 8 bits
 _FLOAT_TOLERANCE = 1e-3  # of a range of 0 to 1, for files that were resampled
 _WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
-_HEAD_SIZE = 32
+_HEAD_SIZE = 64
 
 # By the first bytes and where they lie: what people have images in and pillow does not open.
 _UNREAD = (
@@ -117,9 +118,8 @@ def opened_image(path: Path) -> Iterator[Image.Image]:
         with Image.open(path) as image:
             yield image
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        name = _unread_kind(path) if isinstance(error, UnidentifiedImageError) else None
-        if name is not None:
-            raise InputError(f"{path} is {name}: convert it to PNG or JPEG") from error
+        if isinstance(error, UnidentifiedImageError):
+            _refuse_by_name(path)
         raise InputError(f"{path} is not an image that can be read: {error}") from error
 
 
@@ -281,11 +281,16 @@ def _grey_mask(image: Image.Image, path: Path) -> U8:
     return np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
 
 
-def _unread_kind(path: Path) -> str | None:
-    """Recognise an image by its first bytes where pillow does not open it."""
+def _refuse_by_name(path: Path) -> None:
+    """Refuse a file that pillow does not know, if its first bytes tell what it is."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_SIZE)
     except OSError:
-        return None
-    return next((name for at, magic, name in _UNREAD if head[at:].startswith(magic)), None)
+        return
+    instead = "empty" if not head else stand_in(head)
+    if instead:
+        raise InputError(f"{path} is {instead}")
+    name = next((name for at, magic, name in _UNREAD if head[at:].startswith(magic)), None)
+    if name is not None:
+        raise InputError(f"{path} is {name}: convert it to PNG or JPEG")

@@ -67,6 +67,7 @@ def load(
     found = _find(path, size, images, test_every)
     if not found.train:
         raise InputError(f"{path} leaves no images to train on")
+    doubts = notes_on_poses([*found.train, *found.test], found.points)
     found, origin = centre(found)
     shots = [*found.train, *found.test]
     heads = {shot.path: read_head(shot.path) for shot in (*shots, *found.val)}
@@ -90,14 +91,19 @@ def load(
         report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
     if opaque:
         report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
-    report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *notes_on_poses(shots, found.points)]
+    report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *doubts]
+    colours = found.points_rgb
+    if colours is not None and len(colours) and (colours == colours[0]).all():
+        shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())
+        report.append(f"all points have the colour {shade}: splats start with the colours of the images there")
+        colours = None
     axes, up, said = _upright(found.coordinate_system, shots)
     data = DataSet(
         name,
         train,
         test,
         None if found.points is None else found.points.astype(np.float32),
-        found.points_rgb,
+        colours,
         tuple(line for line in (*report, said) if line),
         axes,
         up,

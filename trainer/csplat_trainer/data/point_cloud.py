@@ -35,7 +35,7 @@ def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:
 
 
 def read_point_cloud(path: Path) -> tuple[F64, F32]:
-    """Read the points of a PLY, with or without colours; grey are those without.
+    """Read the points of a PLY, with or without colours; without, all are grey.
 
     Args:
         path: the file: columns x, y, z; red, green, blue as bytes, 16-bit integers, or floats from 0 to 1.
