@@ -284,6 +284,20 @@ def test_frames_that_are_no_use_are_left_out(tmp_path, change, words, count):
     assert not words or f"transforms.json: {words}" in data.report
 
 
+def test_intrinsics_of_other_programs(ngp):
+    document = json.loads((ngp / "transforms.json").read_text())
+    matrix = [[60.0, 0, 25.0, 0], [0, 61.0, 17.0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    change_transforms(ngp, frames=[{**frame, "intrinsic_matrix": matrix} for frame in document["frames"]])
+    assert [[60.0, 0, 25.0], [0, 61.0, 17.0], [0, 0, 1]] == load(ngp).train[0].camera.K.tolist()
+    bare = {name: value for name, value in document.items() if name not in ("fl_x", "fl_y")}
+    (ngp / "transforms.json").write_text(json.dumps({**bare, "x_fov": 50.0}))
+    assert np.isclose(document["fl_x"], load(ngp).train[0].camera.K[0, 0])
+    poses = [{"file_path": one["file_path"], "transform_matrix_start": 1} for one in document["frames"]]
+    change_transforms(ngp, frames=poses)
+    with pytest.raises(InputError, match="rolling shutters are not read"):
+        load(ngp)
+
+
 def test_a_frame_that_is_there_twice_is_read_once(ngp):
     frames = json.loads((ngp / "transforms.json").read_text())["frames"]
     change_transforms(ngp, frames=[*frames, {**frames[3], "file_path": "./images//0003.png"}])
@@ -318,6 +332,7 @@ def test_a_blender_set_may_have_no_test_frames(blender):
         ("val.txt", "images/0003\n", (8, 1, 0)),
         ("train.txt", "images/0003.png\nimages/0005.png\n", (2, 0, 0)),
         ("train.txt", "other.png\n", (9, 0, 0)),
+        ("train_test_lists.json", '{"train": ["images/0001.png"], "test": ["0003.png"]}', (1, 0, 1)),
     ],
 )
 def test_lists_of_images_may_lie_next_to_transforms_json(ngp, name, text, split):

@@ -39,7 +39,8 @@ NAMES = {
     "another ending": ("1.JPG", ["1.png"], "1.png", "with another ending"),
     "a version is no ending": ("v1.3", ["v1.png", "v1.2.png"], None, None),
     "a stem is no name": ("10", ["1.png", "100.png"], None, None),
-    "backslashes": ("a\\1.png", ["a/1.png"], "a/1.png", "with / for \\"),
+    "backslashes": ("a\\1.png", ["a/1.png"], "a/1.png", "with / for \\, without spaces around it"),
+    "a space at the end": ("a/1.png ", ["a/1.png"], "a/1.png", "with / for \\, without spaces around it"),
     "a backslash in a name": ("a\\1.png", ["a\\1.png", "a/1.png"], "a\\1.png", None),
     "another case": ("img_1.png", ["IMG_1.PNG"], "IMG_1.PNG", "in another case"),
     "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "fits 2 names", None),
@@ -216,7 +217,20 @@ def test_masks_are_found_as_images_are(transforms):
     change_transforms(transforms, frames=frames)
     data = load(transforms)
     assert "masks hide parts of 10 images: they do not count" in data.report
-    assert any("10 names of transforms.json found with / for \\" in line for line in data.report)
+    assert any(
+        "10 names of transforms.json found with / for \\, without spaces around it" in line for line in data.report
+    )
+
+
+def test_a_link_to_nowhere_is_a_missing_image(colmap_set):
+    (colmap_set / "images" / "im 003.png").unlink()
+    (colmap_set / "images" / "im 003.png").symlink_to(colmap_set / "absent.png")
+    assert "images.bin: 1 of 9 images are missing and left out: im 003.png" in load(colmap_set).report
+
+
+def test_masks_next_to_the_images_are_reported(colmap_set):
+    write_picture(colmap_set / "images" / "im 003_mask.png", cameras(9)[3])
+    assert any("masks next to the images, such as im 003_mask.png" in line for line in load(colmap_set).report)
 
 
 def test_masks_that_fit_no_image_are_reported(colmap_set):

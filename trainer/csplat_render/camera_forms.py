@@ -81,11 +81,29 @@ def foreign_cameras(document: object, where: str, report: list[str]) -> list[Cam
 
 def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
     """Join what a transforms.json states for all frames with what one of them states: its own counts."""
-    values = {**document, **frame}
+    own = {**frame, **_intrinsics_of_matrix(frame)}
+    values = {**document, **own}
     for axis in "xy":
-        if f"fl_{axis}" in frame and f"camera_angle_{axis}" not in frame:
+        if f"fl_{axis}" in own and f"camera_angle_{axis}" not in own:
             values.pop(f"camera_angle_{axis}", None)
+        degrees = values.get(f"{axis}_fov")  # of instant-ngp
+        if isinstance(degrees, int | float) and not {f"fl_{axis}", f"camera_angle_{axis}"} & set(values):
+            values[f"camera_angle_{axis}"] = math.radians(degrees)
     return values
+
+
+def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a frame's `intrinsic_matrix` states, as NeuS2 has it, in the words of the others."""
+    if "intrinsic_matrix" not in frame or "fl_x" in frame:
+        return {}
+    try:
+        matrix = np.array(frame["intrinsic_matrix"], np.float64)
+    except (TypeError, ValueError):
+        return {}
+    if matrix.ndim != 2 or min(matrix.shape) < 3:
+        return {}
+    places = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+    return {name: float(matrix[place]) for name, place in places.items()}
 
 
 def check_intrinsics(

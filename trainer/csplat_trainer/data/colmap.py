@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError, counted
 from csplat_trainer.data.colmap_files import ColmapImage, count_images, read_cameras, read_images, read_points
 from csplat_trainer.data.dataset import Found, Shot
-from csplat_trainer.data.image_files import find_images, find_masks, missing_images
+from csplat_trainer.data.image_files import find_images, find_masks, masks_among, missing_images
 from csplat_trainer.data.lens import Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import lists_next_to, split_every, split_listed
@@ -89,7 +89,7 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
     report.append("images from " + ("the folder itself" if found.folder == folder else _relative(found.folder, folder)))
     report += found.notes
     report += missing_images([name for name in names if name not in found.files], len(names), images_path.name)
-    masks = _masks(folder, list(found.files), report)
+    masks = _masks(folder, found.files, report)
     shots = [
         Shot(image.name, found.files[image.name], cameras[image.camera], image.viewmat, masks.get(image.name))
         for image in registered
@@ -168,10 +168,12 @@ def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
     return len(cameras) == len(others) and np.allclose(numbers(cameras), numbers(others), rtol=1e-4)
 
 
-def _masks(folder: Path, names: list[str], report: list[str]) -> dict[str, Path]:
+def _masks(folder: Path, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
     """Find the masks of images; a folder of masks that fit none, or not all, is reported."""
+    names = list(images)
     masks = find_masks(folder, names)
     if masks is None:
+        report += masks_among(list(images.values()))
         return {}
     report += masks.notes
     without = [name for name in names if name not in masks.files]

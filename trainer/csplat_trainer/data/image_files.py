@@ -5,7 +5,7 @@ endings, case and folders. A name is looked for exactly as it is written. Only i
 one rule after the other, and every rule that was needed is reported:
 
 1. as written;
-2. `\` as `/`, without a drive letter;
+2. `\` as `/`, without a drive letter and spaces around it;
 3. as a URL: without `file:`, `%20` as a space;
 4. with another ending of images, or with one if there is none (Blender's names);
 5. in another case or Unicode form, perhaps with another ending;
@@ -69,8 +69,8 @@ class FoundImages:
 
 
 def plain(name: str) -> str:
-    """Return a path with `/` between its parts, without `.`, empty parts and a drive letter."""
-    return PurePosixPath(re.sub(r"^[A-Za-z]:(?=[\\/])", "", name).replace("\\", "/")).as_posix()
+    """Return a path with `/` between its parts, without `.`, empty parts, spaces around it and a drive letter."""
+    return PurePosixPath(re.sub(r"^[A-Za-z]:(?=[\\/])", "", name.strip()).replace("\\", "/")).as_posix()
 
 
 def missing_images(missing: Sequence[str], count: int, where: str) -> list[str]:
@@ -139,6 +139,16 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
         matched, notes = match_names(left, shorter, where)
         matched = {name: shorter[to] for name, to in matched.items()}
     return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
+
+
+def masks_among(images: Sequence[Path]) -> list[str]:
+    """Report masks that lie next to the images: a line, or none if there are none."""
+    stems = {path.stem: path for path in images}
+    for name in _below(images[0].parent) if images else ():
+        stem = PurePosixPath(_without_affix(name)).stem
+        if stem != PurePosixPath(name).stem and stem in stems:
+            return [f"there are masks next to the images, such as {name}: they are read from a folder masks alone"]
+    return []
 
 
 def _without_affix(name: str) -> str:
@@ -214,7 +224,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
         return lambda name: "/".join(parts(name)[-count:])
 
     yield "", [(_as_written, _as_written)]
-    yield "with / for \\", [(plain, plain)]
+    yield "with / for \\, without spaces around it", [(plain, plain)]
     yield "as a URL", [(decoded, plain)]
     yield "with another ending", [(unended, unended)]
     yield "in another case", in_any_case(plain, plain)
@@ -300,5 +310,6 @@ def _below(folder: Path) -> Iterator[str]:
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):
-            if name.lower().endswith(_ENDINGS) and not name.startswith("."):
+            is_image = name.lower().endswith(_ENDINGS) and not name.startswith(".")
+            if is_image and Path(place, name).exists():  # no link to nowhere
                 yield Path(place, name).relative_to(folder).as_posix()

@@ -92,6 +92,8 @@ def load(
     if opaque:
         report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
     report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *doubts]
+    if found.points is None and not any(picture.has_alpha for picture in train):
+        report.append("there are no points: splats start anywhere in view")
     colours = found.points_rgb
     if colours is not None and len(colours) and (colours == colours[0]).all():
         shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,12 +13,16 @@ from csplat_trainer.data.image_files import match_names, shown
 
 __all__ = ["ROLES", "lists_next_to", "split_every", "split_listed"]
 
+_SCANNET = "train_test_lists.json"  # of ScanNet++
+
 #: Names of lists, and what each is for.
 ROLES = {"train": "training", "val": "validation", "test": "test"}
 
 
 def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
-    """Read the text files that list images, a name a line: `test.txt` or `test_list.txt`, and for `val` and `train`.
+    """Read the files that list images: ScanNet++'s `train_test_lists.json`, or text with a name a line.
+
+    Text files are called `test.txt` or `test_list.txt`, and so for `val` and `train`.
 
     Args:
         folders: to look in; the first that has any counts.
@@ -29,11 +34,26 @@ def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
         InputError: a file is not UTF-8 text.
     """
     for folder in folders:
+        document = folder / _SCANNET
+        if document.is_file():
+            return _json_lists(document), document.name
         files = {role: path for role in ROLES for path in _files(folder, role)[:1]}
         if files:
             lists = {role: _names(read_text(path)) for role, path in files.items()}
             return lists, ", ".join(path.name for path in files.values())
     return {}, ""
+
+
+def _json_lists(path: Path) -> dict[str, list[str]]:
+    try:
+        document = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a JSON file: {error}") from error
+    lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
+    found = {role: names for role, names in lists.items() if isinstance(names, list)}
+    if not found or not all(isinstance(name, str) for names in found.values() for name in names):
+        raise InputError(f"{path} holds no lists of names, expected train, val or test")
+    return found
 
 
 def _files(folder: Path, role: str) -> list[Path]:

@@ -166,6 +166,11 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
             bad.append(name)
         elif _is_lost(frame):
             lost.append(name)
+        elif "transform_matrix" not in frame and "transform_matrix_start" in frame:
+            raise InputError(
+                f"{path}, frame {number} has no transform_matrix but two, of the start and the end of its exposure: "
+                "rolling shutters are not read"
+            )
         elif key not in good:
             good[key] = _Frame(name, number, frame)
         elif good[key].values.get("transform_matrix") == frame.get("transform_matrix"):
@@ -283,7 +288,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
     """Intrinsics: focal lengths or angles of view, for the size named or the file's own; and the distortion."""
-    model = str(values.get("camera_model") or "")
+    model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
     if not fisheye and model.upper() not in PERSPECTIVES:
         raise InputError(
