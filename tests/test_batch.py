@@ -19,7 +19,7 @@ import csplat_tools
 from csplat.errors import InputError, LimitError
 from csplat_tools.batches import running
 from csplat_tools.batches.budget import Budget
-from csplat_tools.batches.finding import find_tasks
+from csplat_tools.batches.finding import find_tasks, starting_points
 from csplat_tools.batches.looking import RENDERER_BYTES, Look, content_hash, expect, look
 from csplat_tools.batches.page import make_page
 from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
@@ -73,6 +73,20 @@ def test_a_folder_that_is_a_scene_gives_it_its_name(scenes):
     (scenes / "statue").mkdir()
     (scenes / "statue" / "meta.json").write_text("{}")
     assert "statue.csplat" in names(find_tasks(str(scenes), "encode", ".csplat"))
+
+
+def test_points_and_parts_of_what_trainers_write_are_no_scenes(scenes):
+    (scenes / "inria" / "point_cloud" / "iteration_30000").mkdir(parents=True)
+    for name in ("inria/input.ply", "inria/point_cloud/iteration_30000/point_cloud.ply", "sub/input.ply"):
+        (scenes / name).write_bytes(b"")
+    for rank in (0, 1, 12):
+        (scenes / f"ckpt_29_rank{rank}.pt").write_bytes(b"")
+    (scenes / "ckpt_6_rank1.pt").write_bytes(b"")
+    found = names(find_tasks(str(scenes), "encode", ".csplat"))
+    assert {"inria/point_cloud/iteration_30000/point_cloud.csplat", "sub/input.csplat"} <= set(found)
+    assert ["ckpt_29_rank0.csplat", "ckpt_6_rank1.csplat"] == [one for one in found if "rank" in one]
+    assert "inria/input.csplat" not in found
+    assert ["inria/input.ply"] == starting_points(scenes)
 
 
 def test_encode_leaves_its_own_files_out_and_decode_takes_no_others(scenes):

@@ -16,9 +16,10 @@ Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
 COUNT = 5
 
 
-def webp(pixels):
+def webp(pixels, *, lossless=True):
     buffer = io.BytesIO()
-    Image.fromarray(pixels, "RGBA" if pixels.shape[2] == 4 else "RGB").save(buffer, "WEBP", lossless=True, exact=True)
+    image = Image.fromarray(pixels, "RGBA" if pixels.shape[2] == 4 else "RGB")
+    image.save(buffer, "WEBP", lossless=lossless, exact=True)
     return buffer.getvalue()
 
 
@@ -219,6 +220,35 @@ def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
     assert 13 == len(csplat.read(folder / "lod-meta.json"))
 
 
+def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
+    files = files_of(*splats())
+    expected = csplat.read(zipped(tmp_path / "a.sog", files))
+    loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
+    for name, found, folder, says in (
+        ("b.zip", files, "scene\\", "backslashes in the names of the zip, read as slashes"),
+        ("c.sog", loud, "", "META.JSON is read as meta.json"),
+        ("d.zip", loud, "scene/", "META.JSON is read as meta.json"),
+    ):
+        report = []
+        model = csplat.read(zipped(tmp_path / name, found, folder), report=report)
+        assert np.array_equal(expected.means, model.means)
+        assert [("zip-names", "note", says)] == [(one.id, one.kind, one.text) for one in report]
+    with pytest.raises(InputError, match="2 scenes"):
+        csplat.read(zipped(tmp_path / "e.sog", {**files, "META.JSON": files["meta.json"]}))
+    two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
+    with pytest.raises(InputError, match=r"SH0\.webp and Sh0\.webp would both be sh0\.webp"):
+        csplat.read(zipped(tmp_path / "f.sog", two))
+
+
+def test_a_meta_json_of_another_program_is_no_sog(tmp_path):
+    files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
+    says = "meta.json is not that of SOG, which has means, quats, scales, sh0; .*"
+    with pytest.raises(InputError, match=says + r"a zip that holds room\.ply: unzip it"):
+        csplat.read(zipped(tmp_path / "a.zip", files))
+    with pytest.raises(InputError, match=says + r"a folder, and no scene: name room\.ply"):
+        csplat.read(foldered(tmp_path / "a", files))
+
+
 def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
     path = levels(tmp_path, filenames=["0_0.sog", "0_1/meta.json", "1_0/meta.json"])
     (path / "0_0" / "meta.json").unlink()
@@ -283,6 +313,10 @@ BAD = {
     "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
     "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
     "a text for a picture": (changed([], 0, means_l=b"no picture"), "no whole WebP"),
+    "a lossy picture": (
+        changed([], 0, scales=webp(pixels(3), lossless=False)),
+        "scales.webp is a lossy WebP, expected",
+    ),
     "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "no whole WebP"),
     "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "too many brackets"),
     "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),

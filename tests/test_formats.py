@@ -187,6 +187,22 @@ def test_scenes_in_a_zip_are_named(tmp_path):
     (tmp_path / "b.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-30])
     with pytest.raises(InputError, match=r"b\.zip is a zip, and damaged"):
         csplat.read(tmp_path / "b.zip")
+    np.savez(tmp_path / "c.npz", means=np.zeros((2, 3)), quats=np.zeros((2, 4)))
+    with pytest.raises(InputError, match=r"c\.npz is an archive of NumPy arrays \(means, quats\), no scene"):
+        csplat.read(tmp_path / "c.npz")
+
+
+def test_of_a_folder_that_a_trainer_wrote_the_newest_scene_is_named(tmp_path):
+    for name in ("input.ply", *(f"point_cloud/iteration_{count}/point_cloud.ply" for count in (7000, 30000))):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    says = r"is a folder, and no scene: name point_cloud/iteration_30000/point_cloud\.ply, the last of 2 scenes in it"
+    with pytest.raises(InputError, match=says):
+        csplat.read(tmp_path)
+    (tmp_path / "splat").mkdir()
+    (tmp_path / "splat" / "a.spz").write_bytes(b"")
+    with pytest.raises(InputError, match=r"splat is a folder, and no scene: name a\.spz$"):
+        csplat.read(tmp_path / "splat")
 
 
 def test_fewer_bands_are_read_of_any_format(tmp_path, make_model):

@@ -1,4 +1,4 @@
-"""Checkpoints of gsplat and splatfacto as scenes; without torch they are an error that names the extra.
+"""Checkpoints of gsplat, splatfacto and INRIA as scenes; without torch they are an error that names the extra.
 
 `checkpoints/` holds one of each, five splats of SH degree 1, as torch 2.13 saved them. What is made of their tensors
 is tested without torch, for which `load_plainly` stands in; what torch makes of other files is in the area `torch`.
@@ -145,6 +145,7 @@ def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
     for said, says in (
         ([1], "it holds a list"),
+        (([1, 2], 3), "it holds a tuple"),
         ({"model": 3}, "it holds model: neither"),
         ({"splats": {**splats, "means": many}}, "means is no tensor that the file can hold"),
         ({"splats": {**splats, "means": "many"}}, "means is no tensor"),
@@ -155,6 +156,68 @@ def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model)
         no_torch(lambda *_, said=said, **__: said)
         with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{says}"):
             csplat.read(STORED["gsplat.pt"])
+
+
+def renamed(splats, prefix):
+    """The tensors of splatfacto under other names."""
+    return {
+        name.replace("_model.gauss_params.", prefix): one for name, one in of_splatfacto(splats)["pipeline"].items()
+    }
+
+
+def of_inria(splats):
+    """What `GaussianModel.capture` of INRIA's trainer returns, and the iteration."""
+    arrays = (splats[name] for name in ("means", "sh0", "shN", "scales", "quats"))
+    return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
+
+
+def test_checkpoints_of_other_programs_and_versions_are_the_same_scene(no_torch, make_model):
+    splats = made_splats(make_model, 3)
+    no_torch(lambda *_, **__: {"splats": splats})
+    expected = csplat.read(STORED["gsplat.pt"])
+    for said in (
+        {"step": 1, "pipeline": renamed(splats, "_model.")},  # nerfstudio before 1.1
+        {"step": 1, "pipeline": renamed(splats, "module._model.gauss_params.")},
+        {"state_dict": renamed(splats, "gauss_params.")},
+        renamed(splats, "_model."),
+        splats,
+        of_inria(splats),
+    ):
+        no_torch(lambda *_, said=said, **__: said)
+        read = csplat.read(STORED["gsplat.pt"])
+        assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
+
+
+def test_several_models_in_one_checkpoint_are_refused_by_name(no_torch, make_model):
+    splats = made_splats(make_model, 1)
+    few = {name: values[:2] for name, values in splats.items()}
+    pipeline = {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}
+    no_torch(lambda *_, **__: {"pipeline": pipeline})
+    says = r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2 s"
+    with pytest.raises(InputError, match=says):
+        csplat.read(STORED["gsplat.pt"])
+
+
+def test_the_files_of_all_gpus_are_one_scene(no_torch, make_model, tmp_path):
+    splats = made_splats(make_model, 1)
+    paths = [tmp_path / f"ckpt_29_rank{rank}.pt" for rank in range(3)]
+    for path in [*paths, tmp_path / "ckpt_6_rank7.pt"]:
+        path.write_bytes(STORED["gsplat.pt"].read_bytes())
+    no_torch(lambda path, **_: {"splats": {name: one[int(path.stem[-1]) :: 3] for name, one in splats.items()}})
+    report = []
+    model = csplat.read(paths[1], report=report)
+    assert np.array_equal(model.means, splats["means"][[0, 3, 1, 4, 2]])
+    assert ["the splats of 3 GPUs, from ckpt_29_rank0.pt, ckpt_29_rank1.pt, ckpt_29_rank2.pt"] == [
+        one.text for one in report
+    ]
+    paths[1].unlink()
+    with pytest.raises(
+        InputError, match=r"ckpt_29_rank2\.pt has the splats of one GPU of several, .*: no ckpt_29_rank1"
+    ):
+        csplat.read(paths[2])
+    paths[2].unlink()
+    assert 2 == len(csplat.read(paths[0], report=report))
+    assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
 
 
 def test_what_torch_cannot_load_is_refused_in_one_line(no_torch):
@@ -195,6 +258,8 @@ def test_a_scene_comes_out_of_either(torch, make_model, degree):
     splats = {name: torch.nn.Parameter(torch.from_numpy(array)) for name, array in to_gsplat(model).items()}
     loose = {**splats, "quats": splats["quats"] * 3.0}  # they are normalised where they are used
     own = csplat.read(saved(torch, {"step": 7, "splats": loose}))
+    inria = csplat.read(saved(torch, of_inria(loose)))
+    assert all(np.array_equal(getattr(own, name), getattr(inria, name)) for name in ARRAYS)
     theirs = csplat.read(saved(torch, of_splatfacto(loose)))
     for name in ARRAYS if degree else ARRAYS[:-2]:
         assert np.allclose(getattr(model, name), getattr(own, name), atol=1e-6), name

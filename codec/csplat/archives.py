@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import lzma
+import re
 import struct
 import textwrap
 import tokenize
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
-__all__ = ["DAMAGED", "Archive", "read_archive", "zip_refusal"]
+__all__ = ["DAMAGED", "Archive", "folder_refusal", "read_archive", "zip_refusal"]
 
 #: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
 #: sizes that no array has, OSError for places outside the file and broken bz2.
@@ -29,7 +30,10 @@ DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeErr
 
 
 #: Endings of the files of scenes, which somebody may have put into a zip.
-_SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt")
+_SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt", ".pth")
+#: Where they lie in the folder of a trainer's outputs: INRIA's, gsplat's, nerfstudio's.
+_PLACES = ("*", "iteration_*/*", "point_cloud/iteration_*/*", "ply/*", "ckpts/*", "nerfstudio_models/*")
+_POINTS = "input.ply"  # of INRIA's trainer: what it began with
 _NAMED = 5  # of them, that a message names
 
 
@@ -40,11 +44,26 @@ def zip_refusal(path: Path) -> str:
             names = [name for name in archive.namelist() if not name.startswith("__MACOSX/")]
     except DAMAGED:
         return f"{path.name} is a zip, and damaged: copy or download it again"
+    if names and all(name.endswith(".npy") for name in names):
+        arrays = textwrap.shorten(", ".join(name.removesuffix(".npy") for name in names), 120)
+        what = f"an archive of NumPy arrays ({arrays}), no scene"
+        return f"{path.name} is {what}: csplat.from_gsplat makes one of arrays under gsplat's names"
     scenes = [name for name in names if name.lower().endswith(_SCENES)]
     if not scenes:
         return f"{path.name} is a zip that holds no scene: {textwrap.shorten(', '.join(names), 120) or 'nothing'}"
     shown = ", ".join(scenes[:_NAMED]) + (f" and {len(scenes) - _NAMED} more" if len(scenes) > _NAMED else "")
     return f"{path.name} is a zip that holds {shown}: unzip it, and name the scene"
+
+
+def folder_refusal(path: Path) -> str:
+    """Say of a folder that is no scene itself which scenes lie in it, as trainers leave them."""
+    found = {one for place in _PLACES for one in path.glob(place) if one.name.lower().endswith(_SCENES)}
+    scenes = sorted(one.relative_to(path).as_posix() for one in found if one.name != _POINTS)
+    if not scenes:
+        return f"{path} is a folder, and no scene"
+    newest = max(scenes, key=lambda name: [int(number) for number in re.findall(r"\d+", name)])
+    count = f", the last of {len(scenes)} scenes in it" if len(scenes) > 1 else ""
+    return f"{path} is a folder, and no scene: name {newest}{count}"
 
 
 class Archive(dict[str, NDArray[Any]]):

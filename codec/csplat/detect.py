@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from csplat._spec import MAGIC
-from csplat.archives import zip_refusal
+from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
@@ -103,7 +103,7 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
     if path.is_dir() and wanted and not by_content(path, head):
         return InputError(f"{path.name} is a folder, wanted a {KINDS[wanted].title}")
     if path.is_dir() and not wanted:
-        return InputError(f"{path} is a folder, and no scene")
+        return InputError(folder_refusal(path))
     if not (head or path.is_dir()):
         return InputError(f"{path.name} is empty" + (f", wanted a {KINDS[wanted].title}" if wanted else ""))
     try:
@@ -169,11 +169,9 @@ def _is_sog(path: Path, head: bytes) -> bool:
         return any((path / name).is_file() for name in _MANIFESTS)
     if head[:4] == b"PK\x03\x04":
         names = _names_in_zip(path)
-        return (
-            path.suffix.lower() == ".sog"
-            if names is None
-            else any(_MANIFESTS & {name.rsplit("/", 1)[-1]} for name in names)
-        )
+        if names is None:
+            return path.suffix.lower() == ".sog"
+        return any(name.replace("\\", "/").rsplit("/", 1)[-1].lower() in _MANIFESTS for name in names)
     return _is_json(path, head) and path.name.lower().endswith("meta.json")
 
 
@@ -228,7 +226,7 @@ KINDS: dict[str, Kind] = {
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
         ),
         Kind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
-        Kind("checkpoint", "a checkpoint of gsplat or splatfacto", (".pt", ".ckpt"), _holds("/data.pkl")),
+        Kind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _holds("/data.pkl")),
         Kind("spx", ".spx", (".spx",), _begins(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
         Kind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
         Kind("rad", "RAD of Spark", (".rad",), _begins(b"RAD0"), f"{_NOT_READ} Spark, or take the file it was made of"),
@@ -241,7 +239,6 @@ KINDS: dict[str, Kind] = {
             "which csplat does not read: tiles of splats are .glb files",
         ),
         Kind("gzip", "gzip", (".gz",), _is_gzip, "convert it to PLY first, with gunzip"),
-        Kind("npz", "an archive of NumPy arrays", (".npz",), _holds(".npy"), _NO_SPLATS),
         Kind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
         Kind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
         Kind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),

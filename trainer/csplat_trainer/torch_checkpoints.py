@@ -1,8 +1,8 @@
 # torch may be absent:
 # pyright: reportMissingImports=false
-"""Checkpoints of gsplat's simple_trainer and of nerfstudio's splatfacto, read as scenes.
+"""Checkpoints of gsplat's simple_trainer, of nerfstudio's splatfacto and of INRIA's trainer, read as scenes.
 
-Both are pickles of torch; nothing in them is run: `weights_only` admits tensors, containers and plain numbers alone.
+All are pickles of torch; nothing in them is run: `weights_only` admits tensors, containers and plain numbers alone.
 What they do not say, such as whether a scene was trained antialiased, stands in the files of their trainers.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -21,16 +22,21 @@ from typing import Any
 import numpy as np
 
 from csplat.bridges import from_gsplat
-from csplat.errors import InputError, missing
+from csplat.errors import InputError, counted, missing
 from csplat.formats import Format
-from csplat.lint import too_many_bands
+from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.scene import Scene, scene_of
+from csplat.scene import Scene, joined, scene_of
 
 __all__ = ["FORMAT"]
 
+_NAMED = 5  # names in a message
 _SH_C0 = 0.28209479177387814
-_SPLATFACTO = "gauss_params."  # in the names of splatfacto's tensors, after those of what holds the model
+#: What INRIA's `GaussianModel.capture` returns, behind the SH degree in use (scene/gaussian_model.py).
+_INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
+_HOLDERS = ("pipeline", "state_dict", "model")  # what has the tensors of splatfacto, where it is not the file itself
+#: gsplat writes a file for each GPU, which has a part of the splats (simple_trainer.py).
+_RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _NAMES = {
     "means": "means",
     "quats": "quats",
@@ -43,7 +49,40 @@ _NAMES = {
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    yield scene_of(_read(path, sh_degree))
+    paths, findings = _parts(path)
+    models = [_read(one, sh_degree) for one in paths]
+    degrees = sorted({one.sh_degree for one in models})
+    if len(degrees) > 1:
+        raise InputError(f"{path.name}: files of other GPUs beside it are of SH degree {degrees[0]} and {degrees[1]}")
+    yield replace(scene_of(joined(models[0], models)), findings=findings)
+
+
+def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
+    """The files of all GPUs of a run of gsplat, of which one is named.
+
+    Raises:
+        InputError: one is missing.
+    """
+    named = _RANK.fullmatch(path.name)
+    if named is None:
+        return [path], []
+    found = {}
+    for one in path.parent.iterdir():
+        match = _RANK.fullmatch(one.name)
+        if match and (match["run"], match["ending"]) == (named["run"], named["ending"]):
+            found[int(match["rank"])] = one
+    absent = sorted(set(range(max(found))) - set(found))
+    if absent:
+        missing = ", ".join(f"{named['run']}{rank}{named['ending']}" for rank in absent[:_NAMED])
+        raise InputError(
+            f"{path.name} has the splats of one GPU of several, expected those of the others beside it: no {missing}"
+        )
+    paths = [found[rank] for rank in sorted(found)]
+    if len(paths) == 1:
+        text = "the splats of GPU 0: all there are, if no other trained"
+        return paths, [Finding("ranks", 1, text, "note", usual=True)]
+    text = f"the splats of {len(paths)} GPUs, from {', '.join(one.name for one in paths)}"
+    return paths, [Finding("ranks", len(paths), text, "note")]
 
 
 def _read(path: Path, sh_degree: int | None) -> SplatModel:
@@ -79,22 +118,51 @@ def _plain_numbers(torch: Any) -> Any:
 
 
 def _model_of(said: object, size: int, sh_degree: int | None) -> SplatModel:
+    inria = _of_inria(said)
+    if inria is not None:
+        return _bounded(inria, size, sh_degree)
     if not isinstance(said, Mapping):
-        raise InputError(f"it holds a {type(said).__name__}, wanted a checkpoint of gsplat or splatfacto")
+        raise InputError(f"it holds a {type(said).__name__}, wanted a checkpoint of gsplat, splatfacto or INRIA")
     if isinstance(said.get("splats"), Mapping):
         return _bounded(said["splats"], size, sh_degree)
-    pipeline = said.get("pipeline")
-    parts = pipeline.items() if isinstance(pipeline, Mapping) else ()
-    found = {str(name).rpartition(_SPLATFACTO)[2]: value for name, value in parts if _SPLATFACTO in str(name)}
-    if not found:
-        names = ", ".join(map(str, list(said)[:5]))
+    holder = next((said[name] for name in _HOLDERS if isinstance(said.get(name), Mapping)), said)
+    named = {str(name): value for name, value in holder.items()}
+    models = _models_in(named)
+    if len(models) > 1:
+        shown = ", ".join(f"{prefix}* ({_count(named[prefix + 'means'])})" for prefix in models[:_NAMED])
+        raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save one of them alone")
+    if not models:
+        names = ", ".join(map(str, list(said)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
+    found = {name.removeprefix(models[0]): value for name, value in named.items() if name.startswith(models[0])}
     model = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
     if model.sh_degree or "features_rest" not in found:
         return model
     # Without SH splatfacto trains logits of colours.
     colours = 1.0 / (1.0 + np.exp(-model.sh0.astype(np.float64)))
     return replace(model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32))
+
+
+def _of_inria(said: object) -> dict[str, Any] | None:
+    """The splats of a checkpoint of INRIA's trainer: what `capture` returned, and the iteration."""
+    captured = said[0] if isinstance(said, tuple) and len(said) == 2 else None
+    if not isinstance(captured, tuple) or len(captured) <= len(_INRIA) or not hasattr(captured[1], "numel"):
+        return None
+    return dict(zip(_INRIA, captured[1:], strict=False))
+
+
+def _models_in(named: Mapping[str, Any]) -> list[str]:
+    """What stands before the names of the tensors of each model of splats.
+
+    That is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and nothing in a state_dict alone.
+    """
+    prefixes = [name.removesuffix("means") for name in named if name == "means" or name.endswith(".means")]
+    return [one for one in prefixes if f"{one}scales" in named or f"{one}quats" in named]
+
+
+def _count(means: Any) -> str:
+    shape = getattr(means, "shape", None)
+    return counted(shape[0], "splat") if shape else "no tensor"
 
 
 def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> SplatModel:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import counted
 from csplat.formats.format import Format
 from csplat.formats.sog_files import Json, Parts, parts_at
@@ -21,6 +22,14 @@ from csplat.scene import Scene
 __all__ = ["FORMAT"]
 
 _MOST = 1 << 40
+_NAMES = (
+    "means",
+    "quats",
+    "scales",
+    "sh0",
+    "lodLevels",
+    "tree",
+)  # of which the JSON of one scene, or of levels, has some
 _Range = tuple[int, int, int]  # number of a file, first splat and the one behind the last
 
 
@@ -28,8 +37,13 @@ _Range = tuple[int, int, int]  # number of a file, first splat and the one behin
 def _open(path: Path, level: int = 0) -> Iterator[Scene]:
     parts, name = parts_at(path)
     meta = parts.json(name)
+    if isinstance(meta.value, dict) and not any(one in meta for one in _NAMES):
+        where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
+        parts.refuse(f"{name} is not that of SOG, which has {', '.join(_NAMES[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
-        yield _streamed(parts, meta, level)
+        scene = _streamed(parts, meta, level)
+        scene.findings.extend(_name_findings(parts))
+        yield scene
         return
     if level:
         parts.refuse(f"it has no levels, and level {level} is wanted")
@@ -42,7 +56,7 @@ def _open(path: Path, level: int = 0) -> Iterator[Scene]:
         for arrays in pictures.blocks(degree):
             yield replace(facts, **arrays)
 
-    yield Scene(unit.count, facts, blocks, _findings(pictures))
+    yield Scene(unit.count, facts, blocks, _name_findings(parts) + _findings(pictures))
 
 
 def _facts(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
@@ -57,6 +71,10 @@ def _facts(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
         antialiased=antialiased,
         flat=flat,
     )
+
+
+def _name_findings(parts: Parts) -> list[Finding]:
+    return [Finding("zip-names", 1, parts.oddity, "note")] if parts.oddity else []
 
 
 def _findings(pictures: Pictures) -> list[Finding]:

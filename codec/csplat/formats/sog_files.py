@@ -38,11 +38,13 @@ class Parts:
         path: the folder, or the zip.
         title: for messages.
         folder: inside of the zip; `None`: there is none.
+        oddity: what is unusual about the names in the zip; "": nothing.
     """
 
     path: Path
     title: str
     folder: PurePosixPath | None = None
+    oddity: str = ""
 
     def inner(self, name: str) -> tuple[Parts, str]:
         """Find the parts of a SOG that is a part of this one, and the name of its JSON, as `parts_at` does.
@@ -92,14 +94,23 @@ class Parts:
     def _unzipped(self, name: str, most: int) -> bytes:
         try:
             with zipfile.ZipFile(self.path) as archive:
-                info = archive.getinfo(name)
+                info = self._member(archive, name)
                 if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
                     self.refuse(f"{name} of {info.compress_size:,} bytes says that {info.file_size:,} come out of it")
                 return archive.read(info)
-        except KeyError:
-            self.refuse(f"there is no {name[:80]}")
         except DAMAGED as error:
             self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
+
+    def _member(self, archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
+        """Find a part of a zip: by its name, else with the backslashes of Windows, else with capitals or without."""
+        found: list[zipfile.ZipInfo] = []
+        for same in (str, _with_slashes, lambda one: _with_slashes(one).casefold()):
+            found = found or [info for info in archive.infolist() if same(info.filename) == same(name)]
+        if not found:
+            self.refuse(f"there is no {name[:80]}")
+        if len({info.filename for info in found}) > 1:
+            self.refuse(f"{' and '.join(info.filename[:80] for info in found[:2])} would both be {name[:80]}")
+        return found[-1]
 
     def json(self, name: str) -> Json:
         """What a part of JSON says."""
@@ -185,17 +196,24 @@ def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
         return Parts(path.parent, title), path.name
     try:
         with zipfile.ZipFile(path) as archive:
-            found = [one for one in map(PurePosixPath, archive.namelist()) if _is_manifest(one)]
+            names = archive.namelist()
     except DAMAGED as error:
         Parts(path, title).refuse(f"a damaged zip: {' '.join(str(error).split())[:120] or type(error).__name__}")
+    found = [one for one in map(PurePosixPath, map(_with_slashes, names)) if _is_manifest(one)]
     if not found:
         Parts(path, title).refuse(f"a zip without {_ONE}, no SOG")
     only = _only_scene(Parts(path, title, PurePosixPath()), found)
-    return Parts(path, title, only.parent), only.name
+    oddities = ["backslashes in the names of the zip, read as slashes"] if any("\\" in name for name in names) else []
+    oddities += [f"{only.name} is read as {only.name.lower()}"] if only.name != only.name.lower() else []
+    return Parts(path, title, only.parent, "; ".join(oddities)), only.name
 
 
 def _is_manifest(place: PurePosixPath) -> bool:
-    return place.name in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
+    return place.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
+
+
+def _with_slashes(name: str) -> str:
+    return name.replace("\\", "/")
 
 
 def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
@@ -207,7 +225,7 @@ def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
     """
     inside: set[PurePosixPath] = set()
     for one in found if len(found) > 1 else ():
-        if one.name == _LEVELS:
+        if one.name.lower() == _LEVELS:
             said = parts.json(str(one)).value
             named = said.get("filenames") if isinstance(said, dict) else None
             names = [*named, said.get("environment")] if isinstance(named, list) else []
@@ -234,13 +252,17 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
         fits: is asked whether width and height are wanted, before there are pixels.
 
     Raises:
-        InputError: it is damaged or of another size; or Pillow is absent.
+        InputError: it is damaged, of another size, or compressed with loss; or Pillow is absent.
     """
     try:
         from PIL.Image import DecompressionBombError
         from PIL.WebPImagePlugin import WebPImageFile  # Image.open loads all formats that Pillow knows
     except ModuleNotFoundError as error:
         raise missing(error, "Pillow") from None
+    if _is_lossy(data):
+        parts.refuse(
+            f"{name} is a lossy WebP, expected a lossless one: its codes are changed; take the file as exported"
+        )
     try:
         with WebPImageFile(io.BytesIO(data)) as image:
             if not fits(*image.size):
@@ -248,3 +270,14 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
             return np.asarray(image.convert("RGBA"))
     except (*DAMAGED, DecompressionBombError) as error:
         parts.refuse(f"{name} is no whole WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
+
+
+def _is_lossy(data: bytes) -> bool:
+    """Return whether a WebP has a chunk of lossy pixels (RFC 9649, 2.5)."""
+    at = 12
+    while len(data) >= at + 8:
+        if data[at : at + 4] == b"VP8 ":
+            return True
+        size = int.from_bytes(data[at + 4 : at + 8], "little")
+        at += 8 + size + size % 2
+    return False

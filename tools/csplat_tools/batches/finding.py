@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,12 +19,15 @@ from csplat.remote import is_url
 from csplat.system import split_words
 from csplat_tools.files.scenes import FOLDER_NAMES
 
-__all__ = ["Task", "find_tasks"]
+__all__ = ["Task", "find_tasks", "starting_points"]
 
 _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")
 _ONE_LEVEL, _LEVELS = FOLDER_NAMES
 _OWN = ".csplat"
+#: What INRIA's trainer writes next to its scenes: the points that it began with.
+_POINTS, _SCENES = "input.ply", "point_cloud"
+_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of the first GPU
 #: What a command takes of a folder, where that is not everything: by name, whether it wants this project's own files.
 _WANTS_OWN = {"encode": False, "decode": True, "extract": True}
 
@@ -55,7 +59,8 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
     """The scenes of a folder, sorted, or of a manifest in its order.
 
     Args:
-        scenes: a folder, searched with all that are in it for names that `csplat formats` lists; or a manifest: lines
+        scenes: a folder, searched with all that are in it for names that `csplat formats` lists, without the input.ply
+            of INRIA's trainer; or a manifest: lines
             of JSON (.jsonl), or of path, output and options with commas between them, or as spreadsheets write it
             semicolons or tabs (.csv, .txt).
         command: what is done with them: `encode` leaves .csplat files out, `decode` takes no others.
@@ -99,12 +104,30 @@ def _names(folder: Path, command: str, match: str, without: Path | None) -> list
         ours = without is not None and one.resolve().is_relative_to(without.resolve())
         if not hidden and not ours and (fnmatch(relative, match) or fnmatch(one.name, match)):
             names.append(relative)
-    return [name for name in names if not _is_part(name, names)]
+    points = starting_points(folder, names)
+    return [name for name in names if name not in points and not _is_part(name, names)]
+
+
+def starting_points(folder: Path, names: Sequence[str] | None = None) -> list[str]:
+    """List the files of a folder that are no scenes, but points that INRIA's trainer began with.
+
+    Args:
+        folder: that is searched.
+        names: of files in it, with slashes; `None`: all.
+    """
+    found = [one.relative_to(folder).as_posix() for one in folder.rglob(_POINTS)] if names is None else names
+    return [
+        one
+        for one in sorted(found)
+        if PurePosixPath(one).name == _POINTS and (folder / one).with_name(_SCENES).is_dir()
+    ]
 
 
 def _is_part(name: str, names: Sequence[str]) -> bool:
-    """Whether a file belongs to a scene whose levels are folders beneath it."""
+    """Whether a file belongs to a scene whose levels are folders beneath it, or to that of another GPU."""
     path = PurePosixPath(name)
+    if (gpu := _OTHER_GPU.search(name)) and f"{name[: gpu.start()]}_rank0.pt" in names:
+        return True
     return path.name == _ONE_LEVEL and any(str(above / _LEVELS) in names for above in path.parents)
 
 

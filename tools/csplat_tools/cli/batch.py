@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from csplat.errors import counted
+from csplat_tools.batches.finding import starting_points
 from csplat_tools.batches.page import PAGE
 from csplat_tools.batches.records import JOURNAL
 from csplat_tools.batches.running import Batch, CommandLineError, Step, plan
@@ -72,6 +74,9 @@ def batch(
     """
     words = tuple(line or ("encode",))
     out.check(inputs=(scenes,))
+    points = starting_points(Path(scenes)) if Path(scenes).is_dir() else []
+    if points:
+        note(f"left out: {', '.join(points[:_SHOWN_MAX])}: the points that training began with, no scenes")
     try:
         if dry_run:
             planned = plan(scenes, folder, words, ending=ending, match=match, workers=workers)
