@@ -106,6 +106,7 @@ def test_encode_leaves_its_own_files_out_and_decode_takes_no_others(scenes):
         ("list.txt", "# two\na.ply, , --preset fast\nsub/b.spz, x/y.csplat\n"),
         ("list.csv", "path;output;options\r\na.ply;;--preset fast\r\nsub/b.spz;x/y.csplat;\r\n"),
         ("list.csv", "sep=;\na.ply;;--preset fast\nsub\\b.spz;x\\y.csplat\n"),
+        ("list.csv", "Output,Path,Options\n,a.ply,--preset fast\nx/y.csplat,sub/b.spz,\n"),
         ("list.txt", "path\toutput\toptions\na.ply\t\t--preset fast\nsub/b.spz\tx/y.csplat\n"),
     ],
 )

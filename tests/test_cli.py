@@ -615,6 +615,12 @@ def test_a_name_that_contradicts_the_command_is_refused_with_the_one_meant(
     assert {"scene.ply", "scene.csplat", "index.npy"} == {path.name for path in tmp_path.iterdir()}
 
 
+def test_a_url_in_the_place_of_a_file_is_told(tmp_path):
+    for words in (["info"], ["lint"], ["encode", "-o", tmp_path / "c.csplat"]):
+        line = refused(words[0], "https://example.com/a/b.ply", *words[1:])
+        assert line.startswith("error: https://example.com/a/b.ply is a URL, expected a file: download it first")
+
+
 def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
     path = damaged_ply(tmp_path / "bad.ply", make_model)
     path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))

@@ -185,7 +185,9 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
     (path.parent / "lfs.bin").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     with pytest.raises(InputError, match=r"lfs\.bin' is a pointer of Git LFS"):
         read_from("lfs.bin")
-    for uri in ("a%20b.bin", "data:application/octet-stream;base64," + base64.b64encode(data).decode()):
+    with pytest.raises(InputError, match=r"there is no file 'LFS\.bin', but 'lfs\.bin': rename it"):
+        read_from("LFS.bin")
+    for uri in (".\\a%20b.bin", "a%20b.bin", "data:application/octet-stream;base64," + base64.b64encode(data).decode()):
         assert TWO["POSITION"].tolist() == read_from(uri).means.tolist()
     for uri in ("../out.bin", "link.bin", str(tmp_path / "out.bin"), "http://a/b.bin", "no.bin", "", ".", "a\0b",
                 "%2e%2e/out.bin", "data:,xx", "data:;base64,?", "x" * 5000):  # fmt: skip

@@ -208,8 +208,10 @@ class GltfFile:
                 return memoryview(base64.b64decode(text, validate=True))
             except (binascii.Error, ValueError) as error:
                 raise self.wrong(place, f"no base64: {error}") from None
-        name = unquote(uri)
         folder = self.path.resolve().parent
+        name = unquote(uri)
+        if "\\" in name and not (folder / name).exists():  # written on Windows
+            name = name.replace("\\", "/")
         if not name.isprintable() or ":" in name or "\\" in name:
             raise self.wrong(place, f"found {_shown(uri)}, wanted a file beside it")
         try:
@@ -217,7 +219,9 @@ class GltfFile:
             if not target.is_relative_to(folder):  # neither .., nor absolute, nor by a link
                 raise self.wrong(place, f"{_shown(uri)} is outside of the folder of {self.path.name}")
             if not target.is_file():
-                raise self.wrong(place, f"there is no file {_shown(uri)}")
+                same = [path.name for path in folder.iterdir() if path.name.casefold() == target.name.casefold()]
+                hint = f", but {_shown(same[0])}: rename it" if same else ""
+                raise self.wrong(place, f"there is no file {_shown(uri)}{hint}")
             data = memoryview(mapped(target))
         except (OSError, RuntimeError) as error:  # the latter of links in a circle
             raise self.wrong(place, f"{_shown(uri)} cannot be read: {error}") from None

@@ -166,11 +166,18 @@ def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]
 
 
 def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Give the rows of a table with their cells by column; a heading may name the columns in another order."""
     rows = csv.reader(text.splitlines(), skipinitialspace=True, delimiter=_separator(text))
+    columns: Sequence[str] = _COLUMNS
     for row in rows:
         cells = [cell.strip() for cell in row]
-        if any(cells) and not cells[0].startswith(("#", "sep=")) and tuple(cells) != _COLUMNS[: len(cells)]:
-            yield rows.line_num, dict(zip(_COLUMNS, cells, strict=False))
+        if not any(cells) or cells[0].startswith(("#", "sep=")):
+            continue
+        heading = [cell.casefold() for cell in cells]
+        if "path" in heading and set(heading) <= {*_COLUMNS, ""}:
+            columns = heading
+        else:
+            yield rows.line_num, dict(zip(columns, cells, strict=False))
 
 
 def _separator(text: str) -> str:

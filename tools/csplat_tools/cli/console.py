@@ -41,6 +41,7 @@ _WORDS = {
         "`csplat decode` and `csplat verify` take scenes of any size",
     ),
 }
+_LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # as a path has it, which drops a slash
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
@@ -120,6 +121,8 @@ def _os_error(error: OSError) -> str:
     code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
     if error.filename is None:
         return (f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason) + code
+    if number == errno.ENOENT and (url := _LOST_URL.match(str(error.filename))):
+        return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs" + code
     return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
 
 
