@@ -226,6 +226,16 @@ def test_poses_of_other_conventions_are_reported(tmp_path, change, says):
     assert [] == found if says is None else says in found[0]
 
 
+def test_one_camera_far_away_does_not_make_the_others_look_inverted(tmp_path):
+    write_transforms(tmp_path)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames[2]["transform_matrix"][0][3] += 5000.0
+    change_transforms(tmp_path, frames=frames)
+    report = load(tmp_path).report
+    assert not any("cameras look" in line for line in report)
+    assert any("the camera of images/0002.png stands 4,9" in line or "stands 5,0" in line for line in report)
+
+
 def test_points_of_one_colour_get_those_of_the_images(tmp_path):
     write_colmap_set(tmp_path, text=True)
     file = tmp_path / "sparse" / "0" / "points3D.txt"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat_render.camera_forms import check_intrinsics
-from csplat_render.cameras import nearest_point
+from csplat_render.cameras import camera_outliers, nearest_point
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
@@ -150,6 +150,7 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
     if len(shots) < _FEW:
         return notes
     viewmats = np.stack([shot.viewmat for shot in shots])
+    viewmats = viewmats[~camera_outliers(viewmats, points)]
     gaze, inverse = _gaze(viewmats), np.asarray(np.linalg.inv(viewmats), np.float64)
     if gaze < -_AIMED:
         notes.append(
