@@ -712,6 +712,44 @@ def test_refuses_text_that_is_no_json(tmp_path):
         load(tmp_path)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "write", [write_blender, write_transforms, write_colmap_set, partial(write_colmap_set, text=True)]
+)
+def test_a_damaged_set_is_read_or_refused_in_a_line(tmp_path, write):
+    write(tmp_path)
+    (tmp_path / "test.txt").write_text("im 002.png\n0003.png\n")
+    files = sorted(path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".png")
+    rng = Random(0)
+    for _ in range(150):
+        file = rng.choice(files)
+        data = file.read_bytes()
+        file.write_bytes(damaged(data, rng))
+        try:
+            assert all("\n" not in line for line in load(tmp_path).report)
+        except InputError as error:
+            assert "\n" not in str(error)
+        file.write_bytes(data)
+
+
+def damaged(data, rng):
+    """Change bytes, cut some out, or put in words that readers may stumble over."""
+    words = (b"nan", b"-nan(ind)", b"1e400", b"null", b"[]", b"..", b"\\", b"\xff", b"\0", b"\n", b"#", b"9" * 12, b'"')
+    result = bytearray(data)
+    for _ in range(rng.choice((1, 1, 3))):
+        at, kind = rng.randrange(len(result) + 1), rng.randrange(4)
+        if kind == 0:
+            result[at : at + 8] = rng.randbytes(8)
+        elif kind == 1:
+            del result[at : at + rng.choice((1, 4, 40, 10**6))]
+        elif kind == 2:
+            result[at:at] = rng.choice(words)
+        else:
+            word = rng.choice(words)
+            result[at : at + len(word)] = word
+    return bytes(result)
+
+
 def test_every_prefix_of_colmap_files_is_refused(tmp_path):
     write_colmap(tmp_path, cameras(2))
     for name, read in (("images.bin", read_images), ("points3D.bin", read_points)):
