@@ -705,3 +705,9 @@ def test_what_is_said_of_no_splats_is_looked_at_too(path):
     path.write_bytes(header(good_rows(0), before=("comment csplat unit_metres -1",)))
     with pytest.raises(InputError, match="unit_metres is -1"):
         lint_ply(path)
+
+
+def test_an_element_without_properties_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n")
+    with pytest.raises(InputError, match="face"):
+        read_ply(tmp_path / "a.ply")

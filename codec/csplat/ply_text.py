@@ -97,6 +97,8 @@ def _laid_out(lines: Rows, elements: Sequence[Element]) -> tuple[Rows, list[str]
     at = 0
     for element in elements:
         width = len(element.properties)
+        if not width:
+            raise _RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
         if element.has_lists or all(len(line) == width for line in lines[at : at + element.count]):
             taken = lines[at : at + element.count]
             if len(taken) < element.count:
