@@ -1,4 +1,4 @@
-"""What a block of a tile holds once its streams are read: integers, not yet values.
+"""Blocks of a tile once their streams are read: integers, not yet values.
 
 Two kinds of block, one interface: `rows(start, stop, dtype)` gives the lattice integers or
 levels of a run of splats, `bound` the largest magnitude that can occur on the way to them.
@@ -23,13 +23,13 @@ _RUN_SPLATS = 1 << 14
 
 @dataclass(frozen=True)
 class Columns:
-    """A block whose integers stand in the stream: offset plus element.
+    """A block whose integers are in the stream: offset plus element.
 
     Attributes:
         elements: [C, n], as narrow as they came.
         offsets: C summands, one per column.
         exponent: the block's lattice is coarser by 2^exponent.
-        at: where the stream begins in the file.
+        at: offset in the file where the stream begins.
         lows: smallest integer of each column, offset included.
         highs: largest integer of each column.
         bound: largest magnitude of an offset, an element or a sum.
@@ -88,7 +88,7 @@ class Indices:
 
     Attributes:
         book: the codebook.
-        attribute: of the first block.
+        attribute: attribute id of the first block.
         places: [n], which entry; the size of the codebook where none serves.
         escaped: places of the splats that no entry serves, ascending.
     """
@@ -104,11 +104,11 @@ class Coded:
     """A block coded CODEBOOK: the integers are entries, in scales plus a summand (spec 6.4.5).
 
     Attributes:
-        indices: which entries.
+        indices: the entry of each splat.
         entries: [size, C], the columns of this block's attribute.
         escapes: the integers of the escaped splats.
-        summand: of scales: one column, added to all three.
-        at: where the block begins in the file.
+        summand: for scales, one column that is added to all three.
+        at: offset in the file where the block begins.
         exponent: 0; blocks coded CODEBOOK are on the file's lattice.
         bound: largest magnitude of an integer, or of a part of a sum.
     """
@@ -145,8 +145,8 @@ class Sparse:
     """A block coded SPARSE: the integers of some splats, those of the others are 0 (spec 6.4.7).
 
     Attributes:
-        values: of the splats that the mask names.
-        places: of these splats, ascending.
+        values: integers of the splats that the mask names.
+        places: indices of these splats, ascending.
     """
 
     values: Columns
@@ -154,7 +154,7 @@ class Sparse:
 
     @property
     def at(self) -> int:
-        """Where the stream of the values begins in the file."""
+        """Offset in the file where the stream of the values begins."""
         return self.values.at
 
     @property

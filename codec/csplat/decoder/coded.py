@@ -30,7 +30,7 @@ _WIDE = np.dtype(np.int64)
 
 @dataclass
 class TileContext:
-    """What the blocks of one tile may refer to.
+    """Everything that the blocks of one tile may refer to.
 
     Attributes:
         header: the scene.
@@ -71,12 +71,12 @@ def read_coded(cursor: Cursor, context: TileContext, attribute: int, at: int) ->
     layer = _spec.ATTRIBUTE_LAYER[attribute]
     block = Coded(indices, book.entries[layer][:, columns], escapes, summand, at)
     if summand is not None:
-        _check_sums(block, context)  # of other blocks CBK-7 has looked at the entries
+        _check_sums(block, context)  # in other blocks, CBK-7 has already checked the entries
     return block
 
 
 def leads(book: _spec.CodebookRecord, attribute: int) -> bool:
-    """Whether the block of that attribute has the indices of a codebook, which its other blocks use."""
+    """Return True if the block of that attribute holds the indices of a codebook, which its other blocks use."""
     if book.kind == _spec.CODEBOOK_KIND_SH:
         return attribute == _spec.ATTRIBUTE_SH0 + book.band_first
     return _spec.ATTRIBUTE_NAMES[attribute] == _spec.CODEBOOK_KIND_ATTRIBUTES[book.kind][0]
@@ -144,7 +144,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
 
 
 def _check_sums(block: Coded, context: TileContext) -> None:
-    """CBK-6: the sums of scales obey what LAT-4 asks of integers that stand in a stream."""
+    """CBK-6: the sums of scales obey what LAT-4 requires of integers in a stream."""
     if block.bound <= _spec.COLUMN_MAX:
         return
     record = context.header.attribute(_spec.ATTRIBUTE_SCALES)

@@ -1,4 +1,4 @@
-"""What header and index say of a scene, as plain values."""
+"""Contents of header and index, as plain values."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Tile:
         """Corners of the box around its centres (spec 4.3.5), scene units.
 
         Args:
-            step: of the record of the means.
+            step: step in the record of the means.
         """
         scaled = math.ldexp(step, self.exponent)
         low = [corner * scaled for corner in self.corner]
@@ -77,7 +77,7 @@ class SceneHeader:
         flat: splats are discs, the smallest scale means nothing.
         coordinate_system: as in `SplatModel`.
         unit_metres: metres per scene unit, `None` where unknown.
-        origin: what the means are relative to.
+        origin: the point that the means are relative to.
         attributes: attribute records in the order of their ids.
         codebooks: codebook records in the order of their ids.
         extras: extra columns.

@@ -31,7 +31,7 @@ _RECORD_SIZES: Final = {
 
 
 def read_header(data: File) -> SceneHeader:
-    """Read what a file's header and index say; the first HEADER_SIZE + index_size bytes suffice.
+    """Read a file's header and index; the first HEADER_SIZE + index_size bytes suffice.
 
     The header's and the index's CRC are checked, chunks are not looked at.
 
@@ -223,7 +223,7 @@ def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -
 
 
 def _is_single(step: float) -> bool:
-    """Whether a step > 0 is a normal binary32 value."""
+    """Return True if a step > 0 is exactly a normal binary32 value."""
     if not SINGLE_MIN <= step <= SINGLE_MAX:
         return False
     (nearest,) = struct.unpack("<f", struct.pack("<f", step))

@@ -1,4 +1,4 @@
-"""A file and what is wanted of it: what every way of decoding begins with."""
+"""A file and what to decode of it: the first step of every way of decoding."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _Texts = tuple[Mapping[str, Any], Sequence[Mapping[str, Any]] | None]
 
 @dataclass(frozen=True)
 class Job:
-    """A file and what is wanted of it.
+    """A file and what to decode of it.
 
     Attributes:
         view: the whole file.
         header: header and index, checked.
-        tiles: those that are wanted, in the order wanted.
-        degree: highest SH band wanted.
-        limits: what it may take.
-        whole: all tiles and bands are wanted.
+        tiles: tiles to decode, in the order requested.
+        degree: highest SH band to decode.
+        limits: limits on what decoding may take.
+        whole: True if all tiles and bands are decoded.
     """
 
     view: memoryview
@@ -92,7 +92,7 @@ def read_texts(job: Job) -> _Texts:
 
 
 def thread_count(threads: int | None, task_count: int) -> int:
-    """How many threads decode so many tiles; `None`: as many as there are processors."""
+    """Return the number of threads for `task_count` tiles; `None` allows one per processor, up to `_THREADS_MAX`."""
     if threads is None:
         threads = min(os.cpu_count() or 1, _THREADS_MAX)
     if threads < 1:
@@ -103,8 +103,8 @@ def thread_count(threads: int | None, task_count: int) -> int:
 def model_of(header: SceneHeader, arrays: Arrays, texts: _Texts) -> SplatModel:
     """Build the model without its constructor's passes over all values.
 
-    The clauses of section 7 have just been checked, and they say more than the constructor
-    does: its look at each value would cost an eighth of the decode.
+    The clauses of section 7 have just been checked, and they are stricter than the constructor,
+    whose check of each value would cost an eighth of the decode.
     """
     model: SplatModel = object.__new__(SplatModel)
     metadata, cameras = texts

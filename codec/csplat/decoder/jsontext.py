@@ -19,7 +19,7 @@ _INT_DIGITS = 300  # longer ones are read as binary64, far beyond any integer th
 
 
 class _RefusedError(ValueError):
-    """What the JSON module accepts and JSN-1 does not."""
+    """JSON that the `json` module accepts and JSN-1 forbids."""
 
 
 def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
@@ -51,7 +51,7 @@ def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> 
     Args:
         text: UTF-8.
         kind: `dict`, or `list` for an array of objects.
-        at: where its stream begins in the file, for errors.
+        at: offset in the file where its stream begins, for errors.
     """
     try:
         if text.startswith(_BOM):

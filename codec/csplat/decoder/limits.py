@@ -1,4 +1,4 @@
-"""What a caller allows a file to take (LIM-1), asked of the index before anything is allocated."""
+"""Limits that a caller sets on a file (LIM-1), checked against the index before anything is allocated."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ def check_budget(
 
     Args:
         header: the scene.
-        tiles: what is to be decoded.
-        degree: highest SH band wanted.
+        tiles: the tiles to decode.
+        degree: highest SH band to decode.
         splat_bytes: bytes that one splat takes in the result.
-        limits: what the caller allows.
-        whole: all of the file is to be decoded, and so every codebook read.
+        limits: limits set by the caller.
+        whole: True if all of the file is decoded, and so every codebook read.
         at_once: all tiles lie in memory together; otherwise one at a time.
 
     Raises:

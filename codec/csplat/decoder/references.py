@@ -1,4 +1,4 @@
-"""Where a tile names its codebooks, found without decoding a stream (spec 5.2, 6.1, 6.4)."""
+"""Find the codebooks that a tile refers to, without decoding a stream (spec 5.2, 6.1, 6.4)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from csplat.errors import FormatError
 __all__ = ["codebook_references"]
 
 _TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
-#: By coding: bytes of its parameters, i32 for each column, streams. CODEBOOK and RAW are told apart by hand.
+#: By coding: bytes of its parameters, i32 for each column, streams. CODEBOOK and RAW are handled by hand.
 _SHAPES = {
     _spec.CODING_LEVELS: (0, False, 1),
     _spec.CODING_MORTON: (_spec.MORTON_PARAMS_SIZE, False, 1),
@@ -34,7 +34,7 @@ def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.Laye
         layer: the chunk's record.
 
     Yields:
-        Byte of the file, and the id that stands there.
+        Offset in the file, and the id stored there.
 
     Raises:
         FormatError: a clause on the chunk's frame or on what is passed is broken; streams are not looked at.

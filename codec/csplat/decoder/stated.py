@@ -26,7 +26,7 @@ _SLACK = 1.0 + 2.0**-20  # SER-2: room for the rounding of both numbers; the pro
 
 @dataclass(frozen=True)
 class StatedError:
-    """What a file states of one measure.
+    """A declared error bound of a file, for one measure.
 
     Attributes:
         measure: name in the registry, `means`.
