@@ -37,7 +37,7 @@ def cut_scene(
     Args:
         model: the scene.
         plan: lattices and tile size.
-        grades: which splats share steps; None: all do.
+        grades: quantisation classes, whose splats share steps; `None`: all splats share them.
         buckets: `bucket_rows` of the model, where they are known.
 
     Returns:
@@ -87,7 +87,7 @@ def _huge(model: SplatModel, plan: Plan) -> Flags | None:
 
 
 def _may_exceed(values: F32, limit: float) -> bool:
-    """Whether a value may reach the limit: one pass over memory, without a mask, by the sum of squares."""
+    """Return True if a value may reach the limit: one pass over memory, without a mask, by the sum of squares."""
     flat: NDArray[Any] = values.reshape(-1) if values.flags.c_contiguous else values
     with np.errstate(over="ignore"):
         axes = "ijk"[: flat.ndim]

@@ -1,8 +1,8 @@
-"""Scenes of many splats: a sample, on which is decided, and buckets of neighbours, of which each is coded alone.
+"""Scenes of many splats: a sample that decisions are made on, and buckets of neighbours that are coded one by one.
 
-Up to `WHOLE` splats a scene is looked at as a whole. Of a larger one the same is done with that many of its splats,
-evenly taken; a curve through these cuts space into buckets, and no more than a bucket has to be in memory at once.
-Neither depends on how much memory there is, so that the file does not.
+A scene of up to `WHOLE` splats is analysed as a whole. From a larger one, `WHOLE` splats, evenly spaced, are analysed
+instead; a curve through them cuts space into buckets, and no more than a bucket has to be in memory at once.
+Neither depends on how much memory there is, so the file does not depend on it either.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 Rows = NDArray[np.intp]
 
-#: Splats that are looked at as a whole: of a bucket at most, and of the sample of a larger scene.
+#: Splats that are analysed as a whole: the most in a bucket, and the size of the sample of a larger scene.
 WHOLE = 1 << 19
 
-_FULL = 0.8  # how full buckets are to be: the sample knows their sizes within a few per cent
-_EDGE = 0.005  # share of the splats on either side that lies beyond the curve's cube
+_FULL = 0.8  # fraction of a bucket to fill: the sample predicts bucket sizes within a few per cent
+_EDGE = 0.005  # fraction of the splats on either side that lies beyond the curve's cube
 _TOP = (1 << 16) - 1  # cells along a side of the cube, less one
 _BLOCK = 1 << 16
-_LOOKED_AT = 16  # buckets that show how neighbours differ
+_LOOKED_AT = 16  # buckets that are examined for how neighbours differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Curve:
     """A Morton curve through space, cut into buckets.
 
     Attributes:
-        corner: [3] float64, of the cube that the curve fills; what lies beyond counts as on its faces.
+        corner: [3] float64, corner of the cube that the curve fills; splats outside count as on its faces.
         scale: cells per scene unit.
         bounds: [B - 1] int64, codes at which the buckets but the first begin, ascending.
     """
@@ -52,8 +52,8 @@ class Curve:
         """Cut the curve so that buckets get about equally many splats.
 
         Args:
-            means: [n, 3] float32, of the sample.
-            count: splats of the scene.
+            means: [n, 3] float32, means of the sample.
+            count: splats in the scene.
         """
         if count <= WHOLE:
             return cls(np.zeros(3), 0.0, np.zeros(0, np.int64))
@@ -69,7 +69,7 @@ class Curve:
 
     @property
     def count(self) -> int:
-        """How many buckets there are."""
+        """Number of buckets."""
         return len(self.bounds) + 1
 
     def bucket_of(self, means: F32) -> Rows:
@@ -87,12 +87,12 @@ class Curve:
 
 
 def sample_rows(count: int) -> I64:
-    """Rows of a scene of more than `WHOLE` splats on which is decided."""
+    """Return the rows of the sample that decisions are made on, for a scene of more than `WHOLE` splats."""
     return np.arange(WHOLE, dtype=np.int64) * count // WHOLE
 
 
 def looked_at(buckets: int) -> list[int]:
-    """Which buckets show how neighbours differ, which a sample does not."""
+    """Return the buckets that are examined for how neighbours differ, which a sample does not show."""
     return sorted({place * buckets // _LOOKED_AT for place in range(_LOOKED_AT)})
 
 

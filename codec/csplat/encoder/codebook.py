@@ -1,4 +1,4 @@
-"""The SH stage: no SH, every splat for itself, or a codebook; whichever the scene wants (spec 6.4.5)."""
+"""The SH stage: no SH, each splat coded directly, or a codebook, whichever suits the scene (spec 6.4.5)."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ _LEAST = 256  # splats for which a codebook may pay
 _MANY = 4096  # entries from which on searching near groups saves more than it loses
 _ENOUGH = 1 << 15  # splats whose share of entries a smaller scene gets too, if it has users for them
 _USERS = 6  # splats per entry below which an entry does not pay for itself
-_TRIED = 4  # times as many splats are tried as escapes as escape
-_IMPORTANT = 0.95  # quantile of the weights from which on a splat is quantised on the full lattice
+_TRIED = 4  # splats tried as escapes, as a multiple of those that escape
+_IMPORTANT = 0.95  # quantile of the weights above which a splat is quantised on the full lattice
 _CODEBOOK_ID = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Service:
-    """How splats are served that a codebook was not trained on.
+    """Rules for assigning splats that a codebook was not trained on.
 
     Attributes:
         entries: [size, 3K] int32, R, G, B of each coefficient.
-        near_groups: as of `assign`.
-        threshold: weighted squared error from which on a splat is coded directly.
+        near_groups: as in `assign`.
+        threshold: weighted squared error above which a splat is coded directly.
     """
 
     entries: I32
@@ -62,7 +62,7 @@ class Service:
 
 @dataclass(frozen=True)
 class Books:
-    """What was decided of SH: what tiles need, what the index says, chunks, and what becomes of other splats."""
+    """Decisions about SH: data for tiles, index records, chunks, and rules for splats not yet assigned."""
 
     tables: ShTables
     records: Sequence[CodebookTable] = ()
@@ -75,10 +75,10 @@ class _Trained:
     """A trained codebook.
 
     Attributes:
-        index: [N] int32; the size says "escaped".
+        index: [N] int32; the codebook's size means "escaped".
         entries: [size, 3K] int32, R, G, B of each coefficient.
         error: weighted mean of the squared error that is left.
-        service: of splats that had no part in it.
+        service: rules for splats that had no part in it.
     """
 
     index: I32
@@ -131,7 +131,7 @@ def _reference(weights: F32 | None) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """How errors weigh: by splat, and where there is a metric by coefficient too."""
+    """Weighting of errors: by splat and, if there is a metric, by coefficient too."""
 
     weights: F32
     metric: Metric | None
@@ -175,19 +175,19 @@ def largest_sh(shN: F32) -> float:
 
 
 def settled(plan: Plan, largest: float) -> Plan:
-    """The plan for a scene whose largest SH coefficient is that: no codebook where it would not fit beside one."""
+    """Return the plan for a scene whose largest SH coefficient is `largest`: no codebook if escapes would not fit."""
     fine = replace(plan, sh_step=plan.codebook_step)
     return replace(plan, sh_coding="scalar") if plan.sh_coding == "auto" and not _fits(largest, fine) else plan
 
 
 def served(books: Books, model: SplatModel, plan: Plan, threads: int) -> ShTables:
-    """What tiles need of splats that nothing was decided on.
+    """Return the tables that tiles need for splats that took no part in the decisions.
 
     Args:
-        books: as decided on a sample of the scene.
-        model: at most a bucket of the scene: what is searched together may depend on that.
-        plan: as decided.
-        threads: of the search; no effect on the result.
+        books: decisions made on a sample of the scene.
+        model: at most a bucket of the scene: the result may depend on which splats are searched together.
+        plan: the plan that was decided on.
+        threads: threads of the search; no effect on the result.
     """
     tables, service = books.tables, books.service
     weights = None if tables.weights is None else splat_weights(model, None)
@@ -231,7 +231,7 @@ def _size(count: int, plan: Plan, options: EncodeOptions) -> int:
 
 
 def _escapes_fit(shN: F32, plan: Plan) -> bool:
-    """Whether every splat could be coded directly beside a codebook, whose lattice no tile makes coarser."""
+    """Return True if every splat could be coded directly next to a codebook, whose lattice no tile makes coarser."""
     return _fits(largest_sh(shN), plan)
 
 
@@ -257,8 +257,8 @@ def _errors(shN: F32, index: I32, entries: I32, plan: Plan, judge: _Judge) -> ND
 def _escapes(shN: F32, errors: NDArray[np.float64], plan: Plan, options: EncodeOptions, judge: _Judge) -> Rows:
     """Return the splats that are coded directly: those with the largest weighted error, and all that were clipped.
 
-    Where weights were measured, those that gain most by it, and none that gains nothing: what weighs most may well lie
-    near its entry, and direct values are coarser than entries.
+    If weights were measured, those that gain most by it, and none that gains nothing: the splat with the largest weight
+    may well lie near its entry, and direct values are coarser than entries.
     """
     fraction = plan.escape_fraction if options.escape_fraction is None else options.escape_fraction
     clipped = int(np.count_nonzero(~np.isfinite(errors)))
@@ -283,7 +283,7 @@ def _books(tables: ShTables, trained: _Trained, plan: Plan) -> Books:
 
 
 def books_of(tables: ShTables, book: ShBook, plan: Plan) -> Books:
-    """What a file says of a codebook."""
+    """Return the tables, the index record and the chunks of a codebook."""
     bands = range(1, plan.sh_degree + 1)
     chunks = []
     for band in bands:

@@ -1,4 +1,4 @@
-"""A scene whose tiles are coded: a file, but for what it is to say of itself."""
+"""A scene whose tiles are coded: a complete file but for the metadata about itself."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Coded", "EncodeReport", "EncodeResult", "notes_on"]
 
-_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of one, that nobody has to be told of
+_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of a tile, below which the user is not warned
 
 
 @dataclass(frozen=True)
 class EncodeReport:
-    """What the encoder chose and what it cost.
+    """Choices of the encoder and what they cost.
 
     Attributes:
-        options: what the caller asked for, and the steps and codings that followed; it stands in the file too.
-        errors: (max, rms) by measure, as the file states them (spec 5.5).
+        options: what the caller asked for, and the steps and codings that followed; the file holds it too.
+        errors: (max, rms) by measure, as the file declares them (spec 5.5).
         splat_count: splats of the file. tile_count: its tiles. size_bytes: its size.
-        notes: what a user should know beside the errors, a sentence each.
+        notes: what a user should know in addition to the errors, a sentence each.
     """
 
     options: dict[str, Any]
@@ -71,7 +71,7 @@ class Coded:
 
     Attributes:
         draft: all that was decided.
-        books: of the whole file.
+        books: codebooks of the whole file.
         tiles: coded.
         errors: that the file states.
     """
@@ -89,9 +89,9 @@ class Coded:
 
         Args:
             draft: everything but SH, whose coding its plan names.
-            books: of SH.
-            errors: to state; `None`: those of the coding.
-            progress: as of `Draft.of`.
+            books: SH codebooks.
+            errors: errors to declare; `None`: those of the coding.
+            progress: as in `Draft.of`.
         """
         tiles = _coded_tiles(draft, books, progress)
         errors = errors or ErrorSums.total(part.errors for part in tiles)
@@ -102,7 +102,7 @@ class Coded:
 
     @property
     def source_index(self) -> NDArray[np.int64]:
-        """Which splat of the source each splat of the file is, [N] in the order of a decoder."""
+        """Index in the source of each splat of the file, [N] in decoding order."""
         rows = np.concatenate([part.rows for part in self.tiles]) if self.tiles else np.zeros(0, np.int64)
         index: NDArray[np.int64] = self.draft.origin.source_index[rows]
         return index

@@ -47,7 +47,7 @@ class ShBook:
 
     Attributes:
         entries: [3, K, size] Y, Co, Cg integers on the file's lattice.
-        index: [N] int32, entry of each splat; `size` says "escaped".
+        index: [N] int32, entry of each splat; `size` means "escaped".
     """
 
     entries: I32
@@ -75,11 +75,11 @@ class ShBook:
 
 @dataclass(frozen=True)
 class ShTables:
-    """What the SH stage decided for the whole file.
+    """Decisions of the SH stage for the whole file.
 
     Attributes:
-        weights: [N] importance, or None where splats are treated alike.
-        reference: weight from which on a splat is quantised on the full lattice.
+        weights: [N] importance, or None if all splats are treated alike.
+        reference: weight above which a splat is quantised on the full lattice.
         book: the codebook, if there is one.
         ids: codebook ids. layers: layers that use them.
         extras: names of the extra columns that are carried.

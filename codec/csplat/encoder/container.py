@@ -34,7 +34,7 @@ class Later:
 
     Attributes:
         size: its bytes.
-        crc: as of `chunk_crc`.
+        crc: as in `chunk_crc`.
         read: gives all of it.
     """
 
@@ -74,7 +74,7 @@ class FileTile:
 
 @dataclass(frozen=True)
 class CodebookTable:
-    """What the index says of a codebook."""
+    """A codebook as the index describes it."""
 
     id: int
     kind: int
@@ -84,7 +84,7 @@ class CodebookTable:
 
 @dataclass(frozen=True)
 class SceneFields:
-    """Everything that a file says about the scene as a whole."""
+    """Everything that a file stores about the scene as a whole."""
 
     sh_degree: int
     scene_flags: int

@@ -1,4 +1,4 @@
-"""What errors of a splat's values add to the squared error of pictures, and what the steps of a plan make of that."""
+"""Squared error of renders caused by errors of a splat's values, and by rounding to the steps of a plan."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class Curvatures:
 
 
 def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
-    """What rounding to the plan's lattices adds to the squared error of pictures, in linear approximation.
+    """Estimate the squared error of renders that rounding to the plan's lattices adds, in linear approximation.
 
     Args:
         model: the scene.
-        curvatures: of its splats.
+        curvatures: curvatures of its splats.
         plan: the lattices.
 
     Returns:
@@ -76,7 +76,7 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
     """
     errors = np.empty((len(model), len(GRADED)))
     squared_levels = float(plan.opacity_levels) ** 2
-    # Of what rounds in Y, Co and Cg the channels see this much, in squared steps.
+    # Squared error that the RGB channels get from rounding Y, Co and Cg, in squared steps.
     seen = COLOUR_PER_SH0**2 * (1.0 + 4.0**plan.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
     # A component of a quaternion errs by half the angle.
     angle = 2.0 / (plan.quat_levels * np.sqrt(2.0))
@@ -95,7 +95,7 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
 
 
 def _shape_curvatures(model: SplatModel, curvatures: Curvatures, part: slice) -> tuple[F64, F64]:
-    """What errors of the three log scales, and of the three angles, add: sums of each three curvatures, [n]."""
+    """Return the summed curvatures of the three log scales and of the three angles, [n] each."""
     axes = [np.stack(axis) for axis in zip(*rotation_rows(model.quats[part].T), strict=True)]
     scales = model.scales[part].T.astype(np.float64)
     variances = np.exp(2.0 * (scales - scales.max(axis=0)))

@@ -5,8 +5,8 @@
     coded = draft.coded()
     coded.write({"fitted": {"psnr": judge(coded.write().data)}})
 
-The encoder has no renderer. Who has one looks at `Draft.scene` before colours are coded, and at the file before it says
-how good its renders are. Who tunes all values takes `Draft.frozen` instead of `Draft.coded`.
+The encoder has no renderer. A caller that has one renders `Draft.scene` before colours are coded, and the file before
+it records its own PSNR. A caller that tunes all values uses `Draft.frozen` instead of `Draft.coded`.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """What a scene stands for: splats of a larger one, or of one that looked different.
+    """The source that a scene was derived from: a larger scene, or one that looked different.
 
     Attributes:
-        source_count: splats of the scene that it was made from.
-        source_index: [N] int64, which of them each splat is.
-        refitted: colours are others than those of the source; the file states no errors of them.
-        adjusted: opacities, rotations or scales are, too.
+        source_count: splats of the source.
+        source_index: [N] int64, index in the source of each splat.
+        refitted: colours differ from those of the source; the file declares no errors for them.
+        adjusted: opacities, rotations or scales differ too.
     """
 
     source_count: int
@@ -75,20 +75,20 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A scene whose geometry is decided: lattices, grades, tiles, codebook of shapes.
+    """A scene whose geometry is decided: lattices, quantisation classes, tiles, codebook of shapes.
 
     Attributes:
         model: the scene, with the colours that are to be coded.
-        options: what was asked.
-        origin: what the scene stands for.
-        importance: how much pictures depend on its splats, as far as the caller knows.
+        options: the caller's options.
+        origin: the source that the scene was derived from.
+        importance: how much renders depend on its splats, as far as the caller knows.
         plan: lattices and codings; that of SH may still be open.
         tiles: which rows of the model, on which lattice.
         extras: records of the extra columns that are carried.
         shapes: the codebook of shapes, if there is one.
-        grades: of the splats, if there are several.
-        sample: of a scene of many splats that nothing but itself says anything of: the draft of its sample, on which
-            is decided.
+        grades: quantisation classes of the splats, if there are several.
+        sample: for a scene of many splats about which nothing else is known: the draft of the sample on which
+            decisions are made.
         buckets: rows of each bucket of such a scene.
     """
 
@@ -122,9 +122,9 @@ class Draft:
             model: the scene.
             options: presets and knobs; the default preset is "balanced".
             importance: [N] weights >= 0 of the splats, in place of opacity × projected area; or more than that.
-            origin: what the scene stands for; `None`: itself.
-            graded: splats may be sorted into grades; otherwise all are of one, whatever is known of them.
-            contrast: of the scene that the model is a sample of (`contrast_of`).
+            origin: the source that the scene was derived from; `None`: the scene itself.
+            graded: allow several quantisation classes; otherwise all splats are in one, whatever is known of them.
+            contrast: contrast of the scene that the model is a sample of (`contrast_of`).
             progress: called with the stage's name and the share done, 0 to 1; from any thread.
 
         Raises:
@@ -199,10 +199,10 @@ class Draft:
 
         Args:
             source: the scene that the origin counts the splats of; `None`: the model itself.
-            progress: as of `of`.
+            progress: as in `of`.
 
         Raises:
-            InputError: there are no splats, or the source has another number of them than the origin says.
+            InputError: there are no splats, or the source has another number of them than the origin records.
         """
         if not len(self.model):
             raise InputError("a scene without splats has nothing to tune")
@@ -220,7 +220,7 @@ class Draft:
         """Decide how SH is coded.
 
         Returns:
-            The plan, complete, and the codebooks, with what they say of each splat.
+            The plan, complete, and the codebooks, with the entry of each splat.
         """
         model, plan, importance = self.model, self.plan, self.importance
         if self.sample is not None:
@@ -231,7 +231,7 @@ class Draft:
         return choose_sh(self, weights, sh_metric(model, weights, importance), sample, progress or _silent)
 
     def _served(self, plan: Plan, books: Books) -> tuple[Plan, Books]:
-        """What was decided on the sample, for all splats."""
+        """Apply the decisions made on the sample to all splats."""
         tables, count = books.tables, len(self.model)
         index = None if tables.book is None else np.empty(count, np.int32)
         weights = None if tables.weights is None else np.empty(count, np.float32)

@@ -1,8 +1,8 @@
 """A scene whose coding is decided and whose values may still move: what fine-tuning tunes is what is written.
 
-`Draft.frozen` lets the encoder decide everything that is decided once: lattices, tiles, codebooks and who uses which
-entry, who bypasses them, who lacks an SH band. `Frozen.seen` then says, for any values, what a decoder of the file will
-see, by the functions that code the tiles; `Frozen.coded` codes these values.
+`Draft.frozen` lets the encoder decide everything that is decided once: lattices, tiles, codebooks, which splats use
+which entry, which bypass the codebooks, which lack an SH band. `Frozen.seen` then returns, for any values, what a
+decoder of the file will return, by the functions that code the tiles; `Frozen.coded` codes these values.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ I64 = NDArray[np.int64]
 
 @dataclass(eq=False)
 class FreeValues:
-    """Values of a frozen scene before they are quantised, float32; whoever tunes them changes them in place.
+    """Values of a frozen scene before they are quantised, float32; fine-tuning changes them in place.
 
     Attributes:
         means: [N, 3].
@@ -67,7 +67,7 @@ class FreeValues:
 
 @dataclass(frozen=True, eq=False)
 class DecodedValues:
-    """What a decoder will see: the arrays of a `SplatModel`, unchecked, SH up to the degree that is kept."""
+    """Values as a decoder will return them: the arrays of a `SplatModel`, unchecked, SH up to the degree kept."""
 
     means: F32
     quats: F32
@@ -79,14 +79,14 @@ class DecodedValues:
 
 @dataclass(frozen=True, eq=False)
 class Frozen:
-    """What the encoder decided.
+    """Decisions of the encoder, fixed while the values are tuned.
 
     Attributes:
-        draft: the scene in the order of its tiles and in its gauge, and all else that does not move.
+        draft: the scene in tile order and canonical axis order, and everything else that does not change.
         tables: how SH is coded.
-        source: the scene that errors are stated against.
+        source: the scene that declared errors are measured against.
         low, high: [N, 3] float32, the box of each splat's tile: centres stay within, for the lattice holds no more.
-        zero: [N, K] bool, SH coefficients that are zero and stay so, where every splat has its own; else None.
+        zero: [N, K] bool, SH coefficients that are zero and stay so, if every splat has its own; else None.
     """
 
     draft: Draft
@@ -98,7 +98,7 @@ class Frozen:
 
     @classmethod
     def of(cls, draft: Draft, tables: ShTables, source: SplatModel) -> Frozen:
-        """What `Draft.frozen` returns, of a draft in that order."""
+        """Build what `Draft.frozen` returns from a draft that is already in that order."""
         means = draft.model.means
         low, high = np.empty_like(means), np.empty_like(means)
         for tile in draft.tiles:
@@ -112,7 +112,7 @@ class Frozen:
 
     @property
     def source_index(self) -> I64:
-        """Which splat of the source each one is, [N]."""
+        """Index in the source of each splat, [N]."""
         return self.draft.origin.source_index
 
     @property
@@ -158,7 +158,7 @@ class Frozen:
 
         Args:
             held: values, constrained.
-            progress: as of `Draft.of`.
+            progress: as in `Draft.of`.
 
         Returns:
             A file that states errors against the source, but none of colours: they were fitted anew.
@@ -180,7 +180,7 @@ class Frozen:
         return Coded.of(replace(self.draft, model=model, shapes=shapes), books, errors=errors, progress=progress)
 
     def seen(self, held: FreeValues) -> DecodedValues:
-        """What a decoder of the file of these values will see, bit for bit, in the order of `held`."""
+        """Return the values that a decoder of the file will return for `held`, bit for bit, in the order of `held`."""
         tiles, plan = self.draft.tiles, self.plan
         if self.draft.options.threads == 1 or len(self.draft.model) < _MANY:
             shN, (quats, scales) = self.seen_sh(held.sh), self._seen_shapes(held)
@@ -238,7 +238,7 @@ class Frozen:
         return quantise_rows(own, self.plan, np.full(len(own), self.plan.escape_coarse, np.int32))[2]
 
     def _shapes(self, held: FreeValues) -> tuple[ShapeTables | None, F32, F32]:
-        """The codebook of shapes with these values, and rotations and scales by splat, which it stands in for."""
+        """Return the codebook of shapes with these values, and the rotations and scales that it replaces, by splat."""
         if self.shapes is None:
             return None, held.quats, held.scales
         plan, size, own = self.plan, self.shapes.size, self.shapes.escaped

@@ -1,13 +1,13 @@
-"""Grades: splats whose errors show alike share tiles, and each grade has steps of its own.
+"""Quantisation classes (grades): splats whose errors are equally visible share tiles, and each class has its own steps.
 
-Where a step is twice as coarse, the squared error of pictures grows fourfold and an integer takes a bit less; so bits
-are spent best where every integer adds as much error as any other. Splats differ in that by orders of magnitude. The
-format knows no steps by splat, but each tile may coarsen the file's lattices by powers of two, and nothing keeps tiles
-from overlapping: as many as there are grades fill the same space. What it costs to say which splat is of which grade
-(centres lie less densely in a tile of fewer) comes back where sizes, opacities and colours of a grade are alike.
+If a step is twice as coarse, the squared error of renders grows fourfold and an integer takes a bit less; so bits
+are spent best if every integer adds as much error as any other. Splats differ in that by orders of magnitude. The
+format has no steps by splat, but each tile may coarsen the file's lattices by powers of two, and tiles may overlap:
+those of all classes fill the same space. Coding the class of each splat has a cost (centres lie less densely in a tile
+of fewer), which is recovered because sizes, opacities and colours within a class are alike.
 
 Splats are assigned as in k-means, by the bytes that they would cost at equal error (the divergence is that of Itakura
-and Saito); the steps of a grade follow from the mean errors of its splats.
+and Saito); the steps of a class follow from the mean errors of its splats.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = ["Grades", "choose_grades", "most_grades"]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-_SPLATS = 2500  # of a grade, about: each tile has Huffman codes of its own
+_SPLATS = 2500  # splats in a class, about: each tile has Huffman codes of its own
 _MOST = 5
-_FEWEST = 500  # splats; a smaller grade joins others
-_SAMPLE = 1 << 15  # splats that the steps of grades are found from
+_FEWEST = 500  # splats; a smaller class joins others
+_SAMPLE = 1 << 15  # splats that the steps of classes are computed from
 _BLOCK = 1 << 16
-_COMMON = 0.999  # share of the splats whose errors are no exception
+_COMMON = 0.999  # fraction of the splats whose errors are not outliers
 _ROUNDS = 30
 _FINER, _COARSER = 4.0, 6.0  # octaves from the plan's steps, at most
-_LARGEST_STEP = 1.0  # of a log scale
-_MOST_LEVELS = 255  # of them, where no knob says more
-_FEWEST_LEVELS = 3  # of opacities and of rotations, about: with 4, bytes jump by 7 % where whole multiples end
+_LARGEST_STEP = 1.0  # in log scale: the coarsest step of scales
+_MOST_LEVELS = 255  # opacity or rotation levels, if no option sets more
+_FEWEST_LEVELS = 3  # opacity or rotation levels, about: with 4, bytes jump by 7 % where whole multiples end
 _ONE_BYTE = {"opacities": 255, "quats": 127}  # levels whose integers fit a byte plane
 _KNOBS = {
     "opacities": ("opacity_levels",),
@@ -54,18 +54,18 @@ _KNOBS = {
 
 @dataclass(frozen=True, eq=False)
 class Grades:
-    """Which grade each splat is of, and by how much its steps are coarser than the file's.
+    """Quantisation class (grade) of each splat, and how much coarser its steps are than the file's.
 
     Attributes:
-        index: [N] uint8; the finest grade, whose tiles come first in a file, is 0.
-        coarse: by grade.
+        index: [N] uint8; the finest class, whose tiles come first in a file, is 0.
+        coarse: how much coarser the steps are, by class.
     """
 
     index: U8
     coarse: Sequence[Coarse]
 
     def as_json(self) -> dict[str, list[int]]:
-        """Say how many splats there are by grade, and by how much their steps are coarser."""
+        """Return the number of splats by class, and how much coarser their steps are."""
         counts = np.bincount(self.index, minlength=len(self.coarse))
         columns = {name: [getattr(one, name) for one in self.coarse] for name in GRADED}
         return {"splats": [int(count) for count in counts], **columns}
@@ -78,7 +78,7 @@ def choose_grades(
 
     Args:
         model: the scene.
-        curvatures: what pictures lose by its splats' errors, if that is known; without it, there is one grade.
+        curvatures: curvatures of the splats, if known; without them, there is one class.
         plan: the lattices.
         options: `grades`, at most; and the knobs: what is set holds for all splats.
 
@@ -92,9 +92,9 @@ def choose_grades(
     errors = step_errors(model, curvatures, plan)[:, [list(GRADED).index(name) for name in free]]
     if not np.isfinite(errors).all():
         return plan, None  # a scene so large or small that float64 does not hold its squares
-    # One splat in front of a camera must not say how precise all others have to be.
+    # One splat in front of a camera must not determine how precise all others have to be.
     errors = np.minimum(errors, np.quantile(errors, _COMMON, axis=0))
-    # Levels that the plan would have finer, if they were not bounded, say nothing of how much error is wanted.
+    # Bounded levels, which the plan would otherwise have made finer, do not show how much error is acceptable.
     bounded = {"opacities": plan.opacity_levels >= _MOST_LEVELS, "quats": plan.quat_levels >= _MOST_LEVELS}
     says = np.array([not bounded.get(name, False) for name in free])
     allowed = errors[:, says].mean(axis=0).sum() / max(1.0, integers[says].sum())
@@ -106,7 +106,7 @@ def choose_grades(
 
 
 def most_grades(count: int, options: EncodeOptions) -> int:
-    """Into how many grades so many splats are sorted at most, where curvatures are known; 1 where into none."""
+    """Return the maximum number of classes for `count` splats with known curvatures; 1: they are not sorted."""
     if options.shape_codebook_size or not _free(options):
         return 1
     asked = options.grades or (1 if options.preset == "fast" else _MOST)
@@ -151,7 +151,7 @@ def _octaves(errors: F64, places: U8, integers: F64) -> F64:
 
 
 def _assigned(errors: F64, integers: F64, octaves: F64) -> U8:
-    """The grade of each splat, [N]: where its bits and its error, worth as many, are fewest."""
+    """Assign each splat to the class, [N], with the smallest sum of its bits and its error, weighted equally."""
     grown, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
     index = np.zeros(len(errors), np.uint8)
     for at in range(0, len(errors), _BLOCK):
@@ -194,7 +194,7 @@ def _as_steps(plan: Plan, index: U8, octaves: F64, free: Sequence[str]) -> tuple
 
 
 def _coarser_levels(levels: int, octaves: F64, one_byte: int) -> tuple[int, list[int]]:
-    """As many levels as the finest grade wants and a byte holds, and multiples of their step for the others."""
+    """Return the levels that the finest class needs and a byte holds, and multiples of their step for the others."""
     most = one_byte if levels <= one_byte else max(levels, _MOST_LEVELS)
     finest = min(max(_FEWEST_LEVELS, round(levels * 2.0 ** -float(octaves.min()))), most)
     coarsest = max(1, finest // _FEWEST_LEVELS)

@@ -1,4 +1,4 @@
-"""How much each splat matters to pictures: given by the caller, or opacity × projected size."""
+"""Importance of each splat for renders: given by the caller, or opacity × projected size."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ __all__ = [
 F32 = NDArray[np.float32]
 
 _BLOCK = 1 << 16
-_RIDGE = 0.2  # share of the plain norm in the metric: other views than those that were measured see other directions
-_SHAPE = 6  # entries of a covariance
+_RIDGE = 0.2  # weight of the plain norm in the metric: unmeasured views see the scene from other directions
+_SHAPE = 6  # distinct entries of a covariance
 _GUESSED = 0.5  # share of what opacity and size suggest that a measured weight has at least
-_COMMON = 0.99  # share of the splats whose size is no exception
-_LARGEST_LOG = 80.0  # log sizes beyond ± this are not told apart: float32 holds the weights
+_COMMON = 0.99  # fraction of the splats whose size is not an outlier
+_LARGEST_LOG = 80.0  # log sizes beyond ± this are treated as equal: float32 holds the weights
 
 
 @dataclass(frozen=True, eq=False)
 class Importance:
-    """What pictures depend on, by attribute: weights of squared errors, of which only ratios matter.
+    """Weights of squared errors by attribute, of which only ratios matter.
 
     Attributes:
-        sh: [N], finite, >= 0, of an SH coefficient.
-        shape: [N], of the covariance divided by its trace; `None`: as `sh`.
+        sh: [N], finite, >= 0, weight of an SH coefficient.
+        shape: [N], weight of the covariance divided by its trace; `None`: as `sh`.
         sh_metric: [N, K (K + 1) / 2], by how much the errors of two coefficients of bands 1 to d weigh together: the
-            upper triangle, row by row, of a matrix that is positive semidefinite, the mean of whose diagonal is 1 for
-            what was seen; `None`: all weigh alike, each for itself.
+            upper triangle, row by row, of a positive semidefinite matrix whose mean diagonal is 1 for splats that were
+            seen; `None`: all weigh alike, each for itself.
         shape_metric: [N, 21], the same for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
-        curvatures: what pictures lose by errors of opacities, shapes, centres and colours, not only in ratios: with
-            it, splats are graded (grades.py).
+        curvatures: squared error of renders per error of opacities, shapes, centres and colours, in absolute terms, not
+            only in ratios: with it, splats are sorted into quantisation classes (grades.py).
     """
 
     sh: NDArray[Any]
@@ -89,7 +89,7 @@ def sh_metric(model: SplatModel, weights: F32 | None, importance: NDArray[Any] |
     Args:
         model: the scene.
         weights: [N], as `splat_weights` returns them.
-        importance: what the caller knows.
+        importance: importance given by the caller.
 
     Raises:
         InputError: matrices of another number or size, or not finite.
@@ -161,8 +161,8 @@ def splat_weights(model: SplatModel, importance: NDArray[Any] | Importance | Non
 def trusted(measured: NDArray[Any], model: SplatModel) -> NDArray[np.float64]:
     """Measured weights of which none is far below what the splat's opacity and size suggest.
 
-    Other views see more of what those that measured hardly saw; and where a splat is hidden or small, a large error
-    does more than the slope at its place says.
+    Other views see more of what the measured views hardly saw; and if a splat is hidden or small, a large error
+    has more effect than the slope at its place suggests.
 
     Args:
         measured: [N] or [N, A], >= 0.

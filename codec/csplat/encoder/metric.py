@@ -31,12 +31,12 @@ I64 = NDArray[np.int64]
 _TRIED = 96  # entries for a point: its own and the nearest to that
 _ROUNDS = 2  # how often entries move
 _BLOCK = 1 << 12
-_RIDGE = 1e-3  # of the mean diagonal: keeps an entry where its points do not say
+_RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
 
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """How errors of points weigh.
+    """Weights and matrices that measure the errors of points.
 
     Attributes:
         weights: [N], >= 0.
@@ -82,7 +82,7 @@ def reassign(points: Floats, metric: Metric, entries: Floats, index: I64, thread
 
     Args:
         points: [N, D, C].
-        metric: of the points.
+        metric: metric of the points.
         entries: [K, D, C].
         index: [N], the entry of each point.
         threads: how many to use; the result does not depend on it.
@@ -100,7 +100,7 @@ def refine(points: Floats, metric: Metric, entries: I32, index: I64, threads: in
 
     Args:
         points: [N, D, C], in lattice steps.
-        metric: of the points.
+        metric: metric of the points.
         entries: [K, D, C] lattice integers.
         index: [N], the entry of each point.
         threads: how many to use; the result does not depend on it.
@@ -199,7 +199,7 @@ def _products(triangles: Floats, points: Floats) -> F64:
 
 
 def _doubled(triangles: Floats) -> F64:
-    """The triangles with what stands twice in the matrix doubled."""
+    """Return the triangles with the entries doubled that occur twice in the matrix."""
     above, beside = np.triu_indices(_order(triangles))
     return np.asarray(triangles * np.where(above == beside, 1.0, 2.0), np.float64)
 

@@ -1,4 +1,4 @@
-"""What a caller may choose, and what a preset chooses where the caller does not."""
+"""Encoder options, and the presets that set those the caller leaves out."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class EncodeOptions:
         deflate_level: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: carry the model's extra columns.
-        seed: of the k-means.
+        seed: seed of the k-means.
         threads: how many to use; `None` takes all cores. The bytes do not depend on it.
 
     Examples:
@@ -115,7 +115,7 @@ class EncodeOptions:
 
     @property
     def thread_count(self) -> int:
-        """`threads`, or as many as there are cores."""
+        """`threads`, or the number of cores."""
         return self.threads or os.cpu_count() or 1
 
     def chosen(self) -> dict[str, Any]:
@@ -129,17 +129,17 @@ class EncodeOptions:
 
 @dataclass(frozen=True)
 class Preset:
-    """What a preset chooses.
+    """Settings of a preset.
 
     Attributes:
-        quality: PSNR in dB that each attribute alone is to keep, for scenes with SH and for scenes without; steps
+        quality: PSNR in dB that each attribute alone keeps, for scenes with SH and for scenes without; steps
             follow from it and from the scene (plan.py).
-        sh_quality: the same for the bands 1 to 3, where bits are dear.
-        sh_coding: as in `EncodeOptions`, "auto" among them.
+        sh_quality: the same for the bands 1 to 3, whose bits are expensive.
+        sh_coding: as in `EncodeOptions`, "auto" included.
         adaptive: as in `EncodeOptions`.
         deflate_level: as in `EncodeOptions`.
         codebook_share: entries of an SH codebook per splat.
-        codebook_most: its entries at most.
+        codebook_most: maximum number of its entries.
         codebook_finer: its lattice is finer than that of scalar coding by 2**codebook_finer.
         escape_fraction: as in `EncodeOptions`.
     """

@@ -1,4 +1,4 @@
-"""What a file says beside its splats: scene fields, metadata, options, stated errors (spec 4.3, 5.4, 5.5)."""
+"""Contents of a file besides its splats: scene fields, metadata, options, declared errors (spec 4.3, 5.4, 5.5)."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def extra_columns(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
 
 
 def stated_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:
-    """Return (max, rms) by measure; those of what was fitted anew say nothing, and are left out."""
+    """Return (max, rms) by measure, without the measures of refitted values, whose errors mean nothing."""
     stated = errors.stated()
     if not origin.refitted:
         return stated
@@ -106,7 +106,7 @@ def file_chunks(draft: Draft, errors: ErrorSums, settings: dict[str, Any]) -> li
 
 
 def file_scene(draft: Draft, books: Books, chunks: Sequence[FileChunk]) -> SceneFields:
-    """Gather what header and index say of the scene."""
+    """Gather the scene fields of header and index."""
     model, plan = draft.model, draft.plan
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)

@@ -1,9 +1,9 @@
-"""The shape stage: shapes for themselves, or a codebook of shapes up to size, where a file gets smaller (spec 6.4.5).
+"""The shape stage: shapes coded directly, or a codebook of shapes up to size if it makes the file smaller (spec 6.4.5).
 
-What is clustered is the covariance divided by its trace, as Niedermayr, Stumpfegger and Westermann ("Compressed 3D
-Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024) do it; the trace stays each splat's own. Means of
-matrices of trace 1 have trace 1, so nothing is to be normalised anew. Who is served and who keeps a shape of its own
-("escapes") is a question of bytes and error: see `_worth_it`.
+The covariance divided by its trace is clustered, as in Niedermayr, Stumpfegger and Westermann ("Compressed 3D Gaussian
+Splatting for Accelerated Novel View Synthesis", CVPR 2024); the trace stays each splat's own. Means of matrices of
+trace 1 have trace 1, so they need no normalisation. Which splats are assigned to the codebook and which keep their own
+shape ("escapes") depends on bytes and error: see `_worth_it`.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ Rows = NDArray[np.intp]
 
 _UNIT = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
 _USERS = 6  # splats per entry below which an entry does not pay for itself
-_ROUNDS = 2  # of clustering; from the second on those that escape have no say
+_ROUNDS = 2  # rounds of clustering; from the second on, escaped splats have no influence
 _METRIC_ROUNDS = 2
-_TRIED = 64  # entries for a splat, where a metric says which is best
-_MOST_RESIZED = 0.7  # how far a summand may leave the trace: beyond, what is linear in the metric is not
-_CLEAR = 30.0  # of log sizes: as wrong as can be
-_ESCAPES = 0.05  # share of the splats, where nothing says what an error costs
-_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry beside the diagonal stands twice
-_DIMENSIONS = 6  # of a shape: a bit per splat takes a factor of 2**(-2/6) off its squared error
-_MOST_STEPS = 2.0**20  # of a log scale: beyond, its tile may be coarser than the file's lattice
-_TABLE_ID = 2  # bytes of a tile's record
+_TRIED = 64  # entries tried for a splat, if a metric ranks them
+_MOST_RESIZED = 0.7  # largest summand of the log scales: beyond it, the metric is no longer linear
+_CLEAR = 30.0  # log sizes are clipped to this: the error is already as large as can be
+_ESCAPES = 0.05  # fraction of the splats, if nothing is known of the cost of an error
+_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice
+_DIMENSIONS = 6  # dimensions of a shape: a bit per splat divides its squared error by 2**(2/6)
+_MOST_STEPS = 2.0**20  # in log scale: above this, its tile may be coarser than the file's lattice
+_TABLE_ID = 2  # bytes of the table id in a tile's record
 _OVERHEAD = 128  # bytes of records, heads and checksums that come with a codebook
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What the stage works on.
+    """Input of the shape stage.
 
     Attributes:
         covariances: [6, N], over their trace. sizes: [N], half the logarithm of the trace. weights: [N].
-        metric: how errors weigh together, if that is known.
-        plain: [N], weighted squared error of the covariance over its trace, coded for itself.
-        fits: [N] bool, whether the file's lattice holds the scales; those of tiles with huge ones are coarser.
-        bits: what a shape that is coded for itself costs, by the entropy of its integers.
+        metric: how the errors of entries weigh together, if known.
+        plain: [N], weighted squared error of the covariance over its trace, coded directly.
+        fits: [N] bool, True if the file's lattice holds the scales; tiles with outliers use a coarser one.
+        bits: cost of a shape that is coded directly, by the entropy of its integers.
     """
 
     covariances: F64
@@ -79,7 +79,7 @@ def choose_shapes(
     model: SplatModel, weights: F32, metric: Metric | None, tiles: Sequence[Tile], plan: Plan, options: EncodeOptions,
     report: Progress,
 ) -> ShapeTables | None:  # fmt: skip
-    """Make the codebook, and find who is served by it.
+    """Make the codebook, and find the splats that are assigned to it.
 
     Args:
         model: the scene.
@@ -172,7 +172,7 @@ def _on_lattices(scene: _Scene, weights: F64, index: I64, plan: Plan) -> tuple[I
     index = np.unique(index, return_inverse=True)[1].reshape(-1)  # entries that serve nobody are gone
     count = int(index.max()) + 1
     total = np.bincount(index, weights, count)
-    weights = np.where(total[index] > 0.0, weights, 1.0)  # splats of no weight stand for themselves
+    weights = np.where(total[index] > 0.0, weights, 1.0)  # splats of no weight represent themselves
     total = np.bincount(index, weights, count)
     sums = np.stack([np.bincount(index, weights * entry, count) for entry in scene.covariances])
     rotation, scales = mean_axes(sums / total)
@@ -204,10 +204,10 @@ def _best_size(wanted: F64, found: F64, metric: Metric) -> F64:
 
 
 def _worth_it(scene: _Scene, errors: F64, index: I64, summand: I32) -> NDArray[np.bool_]:
-    """Who is served: those whose error grows by less than the bits that it saves are worth.
+    """Return True for the splats to assign: those whose error grows by less than the bits that it saves are worth.
 
-    Bits are worth what they buy elsewhere: at the plan's steps one more for every splat would take 2 ln 2 / 6 of their
-    squared error off. What a shape costs is the entropy of its integers, alone or as index and summand.
+    Bits are worth what they buy elsewhere: at the plan's steps, one more for every splat would remove 2 ln 2 / 6 of
+    their squared error. The cost of a shape is the entropy of its integers, alone or as index and summand.
     """
     fits = scene.fits
     if not fits.any():

@@ -24,12 +24,12 @@ SHAPE_BOOK = _spec.SH_DEGREE_MAX + 1
 
 @dataclass(frozen=True, eq=False)
 class ShapePart:
-    """What the codebook says of the splats of a tile.
+    """Codebook entries of the splats of a tile.
 
     Attributes:
-        index: [n] int32, entry of each splat; `size` says "escaped".
+        index: [n] int32, entry of each splat; `size` means "escaped".
         size: entries of the codebook.
-        served: [n] bool, which splats are not escaped.
+        served: [n] bool, True for splats that are not escaped.
         scales: [3, served] int32, their log scales on the file's lattice. quats: [3, served], their rotations.
         summand: [n] int32, the part of the scales that is each splat's own; 0 for the escaped.
     """
@@ -44,11 +44,11 @@ class ShapePart:
 
 @dataclass(frozen=True, eq=False)
 class ShapeTables:
-    """What the shape stage decided for the whole file.
+    """Decisions of the shape stage for the whole file.
 
     Attributes:
         entries: [6, K] int32, log scales up to a summand on the file's lattice, x, y, z of the rotation.
-        index: [N] int32, entry of each splat; K says "escaped". In a tile that does better without, all are.
+        index: [N] int32, entry of each splat; K means "escaped". In a tile that is smaller without, all are.
         summand: [N] int32, in steps of the scales' lattice; 0 for the escaped.
     """
 
@@ -81,7 +81,7 @@ class ShapeTables:
 
 
 def shape_book(tables: ShapeTables, coding: Coding) -> tuple[CodebookTable, FileChunk]:
-    """What index and chunks say of the codebook."""
+    """Return the index record and the chunk of the codebook."""
     head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_BOOK, 0, 0))
     stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), coding)
     record = CodebookTable(SHAPE_BOOK, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)

@@ -1,4 +1,4 @@
-"""What the steps follow: how far a scene reaches, how its colours vary from splat to splat, how large splats are.
+"""Scene statistics that the steps follow: extent, how colours vary from splat to splat, size of splats.
 
 Errors that one step causes in pictures differ from scene to scene by a factor of ten; most of that is explained by
 three numbers. A displaced, turned or resized splat shows as far as its neighbours have another colour; a displacement
@@ -22,12 +22,12 @@ __all__ = ["COLOUR_PER_SH0", "Statistics", "contrast_of", "scene_statistics"]
 #: A channel's colour per coefficient of degree 0.
 COLOUR_PER_SH0 = 0.28209479177387814
 
-_SAMPLE = 1 << 16  # splats that are looked at
-_RUNS = 16  # of neighbours among them
+_SAMPLE = 1 << 16  # splats that are sampled
+_RUNS = 16  # runs of neighbours among the sampled splats
 _APART = 8  # places in Morton order
 _CORE = 0.8  # share of the splats within the scene's reach
 _BITS = 16
-_LARGEST = 1e38  # of float32
+_LARGEST = 1e38  # largest cells per scene unit, within float32
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> Statis
 
     Args:
         model: the scene.
-        contrast: as of `contrast_of`, where the model is a sample itself, whose splats are no neighbours.
+        contrast: as in `contrast_of`, if the model is itself a sample, whose splats are no neighbours.
     """
     if len(model) == 0:
         return Statistics(0.0, 0.2, 0.01)

@@ -18,20 +18,20 @@ __all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsig
 
 Integers = NDArray[Any]
 
-_QUICK_LEVEL = 1  # of DEFLATE: samples decide
-_SHORT_RUN = 1.5  # bytes, of the mean run, from which RUN_LENGTH may save more than it costs decoders
-_LONG_RUN = 32  # bytes, from which it is tried at that level
+_QUICK_LEVEL = 1  # DEFLATE level at which samples decide
+_SHORT_RUN = 1.5  # bytes in the mean run, above which RUN_LENGTH may save more than it costs decoders
+_LONG_RUN = 32  # bytes in the mean run, above which it is tried at that level
 _SAMPLE = 4096  # bytes of each of four samples
-_TRIAL_LEVEL = 6  # of DEFLATE: a tenth of the time of the highest, and seldom of another opinion
-_GAIN = 0.98  # of the bytes, from which runs are worth the time that they cost decoders
+_TRIAL_LEVEL = 6  # DEFLATE level of trials: a tenth of the time of the highest, and rarely a different choice
+_GAIN = 0.98  # fraction of the bytes below which runs are worth the time that they cost decoders
 
 
 @dataclass(frozen=True)
 class Coding:
-    """How hard to try, and with what.
+    """DEFLATE level and library.
 
     Attributes:
-        level: of DEFLATE, 1 to 12 (libdeflate's scale).
+        level: DEFLATE level, 1 to 12 (libdeflate's scale).
         library: "libdeflate" or "zlib".
     """
 
@@ -52,9 +52,9 @@ def unsigned_stream(
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype without differences).
-        coding: what the coder may do.
-        delta: differences from the element before; pays where values ascend.
-        signed_delta: differences that fall as well as rise (DELTA, then ZIGZAG).
+        coding: level and library of DEFLATE.
+        delta: code differences from the element before; pays if values ascend.
+        signed_delta: code differences that fall as well as rise (DELTA, then ZIGZAG).
         fixed_width: bytes of an element; 0 takes as many as the largest needs.
 
     Returns:
@@ -81,7 +81,7 @@ def smooth_stream(values: Integers, coding: Coding) -> bytes:
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
-        coding: what the coder may do; at the lowest level the entropies decide instead of trials.
+        coding: level and library of DEFLATE; at the lowest level the entropies decide instead of trials.
     """
     if coding.level > _QUICK_LEVEL:
         return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
@@ -95,17 +95,17 @@ def signed_stream(values: Integers, coding: Coding) -> bytes:
 
     Args:
         values: [n], n >= 1, signed integers of at most 32 bits.
-        coding: what the coder may do.
+        coding: level and library of DEFLATE.
     """
     folded = _zigzag(values)
     return _finish(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), coding)
 
 
 def deflate_library(wanted: str) -> str:
-    """Resolve "auto" to the library that is used, libdeflate where its package is; it stands in the options chunk.
+    """Resolve "auto" to the library that is used, libdeflate if its package is installed; the options chunk names it.
 
     Raises:
-        InputError: libdeflate is wanted by name and its package is absent.
+        InputError: libdeflate is requested by name and its package is not installed.
     """
     present = importlib.util.find_spec("deflate") is not None
     if wanted == "libdeflate" and not present:
@@ -159,7 +159,7 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
 
 
 def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], coding: Coding) -> bool:
-    """Whether runs take fewer bytes than what they stand for, by a quick trial: both in earnest take too long."""
+    """Return True if runs compress to fewer bytes than the planes they replace, by a quick trial to save time."""
     trial = replace(coding, level=min(coding.level, _TRIAL_LEVEL))
     return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
@@ -174,10 +174,10 @@ def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
 
 
 def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
-    """Return the runs, or None where there are so many that the mean is shorter than `least`, which helps nobody.
+    """Return the runs, or None if their mean length is below `least`, so that they would save nothing.
 
-    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well. Short ones
-    cost it a distance each, and their lengths stand among the bytes: as runs, both have Huffman codes of their own.
+    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well. Short runs
+    cost it a distance each, and their lengths are mixed with the bytes: as runs, both have Huffman codes of their own.
     """
     if len(data) < 64:
         return None
@@ -210,7 +210,7 @@ def _deflate(raw: bytes, coding: Coding) -> bytes:
         return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
     if coding.level <= _QUICK_LEVEL:
         return _quickest(raw)
-    # Where nothing but runs repeats, matches that libdeflate finds by chance cost more than they save.
+    # If nothing but runs repeats, matches that libdeflate finds by chance cost more than they save.
     return min(_libdeflate(raw, coding.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
 
 

@@ -48,7 +48,7 @@ class EncodedTile:
 
 @dataclass
 class _Work:
-    """What the steps of one tile hand to each other."""
+    """Results that the steps of one tile hand to each other."""
 
     plan: Plan
     blocks: list[bytes]
@@ -67,10 +67,10 @@ def encode_tile(
 
     Args:
         model: the whole scene.
-        tile: which rows, on which lattice.
+        tile: the tile's rows and lattice.
         plan: the file's lattices and codings.
-        tables: what the SH stage decided for the whole file.
-        shapes: what the shape stage decided, if it made a codebook.
+        tables: decisions of the SH stage for the whole file.
+        shapes: decisions of the shape stage, if it made a codebook.
 
     Returns:
         The tile; its rows are the model's, in the order in which a decoder returns them.
