@@ -1,4 +1,4 @@
-"""Tell standard deviations from their logarithms, and opacities from their logits, in formats that want neither.
+"""Recognise logarithms of standard deviations, and logits of opacities, in formats that should hold neither.
 
 glTF, .splat and .ksplat hold values after activation: scales of at least 0, opacities from 0 to 1. Some writers forget
 to activate them (splat-transform 2.3.1 in its GLB). One value does not tell; all of them together do.
@@ -25,15 +25,15 @@ _SLIGHTLY = (-1.0, 2.0)  # opacities that are clipped: what a writer without a s
 
 @dataclass
 class Spread:
-    """How values lie about the range that is allowed, to be added to.
+    """Statistics of values relative to the range that is allowed, updated by `add`.
 
     Attributes:
         low, high: the range.
-        count: values.
-        below, above: how many lie on either side of the range.
-        least, most: of all values.
+        count: number of values.
+        below, above: number of values on either side of the range.
+        least, most: smallest and largest of all values.
         rows: splats with a value outside.
-        first: number of the first of these splats, and its value; `None`: there is none.
+        first: index of the first of these splats, and its value; `None`: there is none.
     """
 
     low: float = 0.0
@@ -71,9 +71,9 @@ def read_scales_as(found: Spread, name: str, *, strict: bool, writer: str = "") 
 
     Args:
         found: the scales of a file, with 0 for its lower limit.
-        name: of their column, for messages.
+        name: name of their column, for messages.
         strict: the format forbids negative ones; else the sign means nothing: a covariance has their squares.
-        writer: the program that wrote the file, where it says so.
+        writer: the program that wrote the file, if the file names it.
 
     Returns:
         Whether they are, and what is to be said: an error where they are neither.

@@ -23,8 +23,8 @@ __all__ = ["along_curve"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_STEPS = 1 << 21  # of each axis
-_SAMPLE = 1 << 16  # splats that say where the curve runs
+_STEPS = 1 << 21  # steps along each axis
+_SAMPLE = 1 << 16  # splats that determine where the curve runs
 _IN_MEMORY = 1 << 24  # bytes that need no file
 
 
@@ -33,9 +33,9 @@ def along_curve(scene: Scene, folder: Path) -> Iterator[Scene]:
     """Sort a scene along a Z curve; splats in one place keep their order.
 
     Args:
-        scene: is gone through twice.
-        folder: has room for a file without a name of 56 bytes a splat, and 12 more for each coefficient of SH. Memory
-            is wanted for few blocks only.
+        scene: the scene; its blocks are read twice.
+        folder: has space for an unnamed file of 56 bytes a splat, and 12 more for each coefficient of SH. Memory
+            is needed for few blocks only.
 
     Yields:
         The scene in its new order, without extra columns; all of its blocks but the last are full.
@@ -48,7 +48,7 @@ def along_curve(scene: Scene, folder: Path) -> Iterator[Scene]:
     facts = replace(scene.facts, extra={}, means_double=None)
     dtype = np.dtype([(name, "<f4", getattr(facts, name).shape[1:]) for name in ARRAYS])
     with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(folder)) as spool:
-        runs = []  # of each block that is written: where its parts begin
+        runs = []  # for each block written, where its parts begin
         for model in scene.blocks():
             codes = curve.codes(model.means)
             order = np.argsort(codes, kind="stable")
@@ -120,6 +120,6 @@ class _Curve:
         return replace(curve, splits=codes[np.arange(1, blocks) * len(codes) // blocks])
 
     def codes(self, means: F32) -> I64:
-        """How far along the curve places [N, 3] are."""
+        """Return how far along the curve the places [N, 3] are, as Morton codes."""
         steps = (means - self.low) * (_STEPS / (self.high - self.low))
         return morton_codes(np.clip(steps, 0, _STEPS - 1).astype(np.int64).T)

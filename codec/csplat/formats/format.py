@@ -1,4 +1,4 @@
-"""What a format of files is: how it is read and written, and what of a scene it has a place for."""
+"""A file format: how it is read and written, and which parts of a scene it can store."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LevelReader(Protocol):
 
 
 class BandReader(Protocol):
-    """Opens a file of which not all SH bands are wanted."""
+    """Opens a file without its higher SH bands."""
 
     def __call__(self, path: Path, sh_degree: int, /) -> AbstractContextManager[Scene]:
         """As `Reader`, without the bands above a degree; the file may have more than models have."""
@@ -68,16 +68,16 @@ class Format:
         name: as `csplat formats` and `--from` have it, a key of `csplat.detect.KINDS`: `spz`.
         open: reads it; `None`: it is not read.
         open_level: reads a level of it; `None`: scenes have one level.
-        open_bands: reads it without the SH bands above a degree; `None`: `open` reads all that there may be.
+        open_bands: reads it without the SH bands above a degree; `None`: `open` reads all bands that a model may have.
         write: writes it; `None`: it is not written.
-        doubt: of files that only their name tells: why one is hardly of this format, "" where it may well be.
+        doubt: for formats known by the file name alone: why a file is hardly of this format, "" if it may well be.
         degree: highest SH degree that it holds.
-        axes: which way +x, +y and +z point in every file of this format; "" where a file may say nothing or anything.
+        axes: directions of +x, +y and +z in every file of this format; "" if a file may specify nothing or anything.
             `open` gives the scene along them.
         exact: names of the arrays of a model that come back bit for bit; opacities kept as logits within an ulp.
-        splat_bytes: about how many bytes a splat takes at SH degrees 0 to 3; none where that depends on the scene.
-        carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,
-            `cameras` it has a place for.
+        splat_bytes: about how many bytes a splat takes at SH degrees 0 to 3; empty if that depends on the scene.
+        carries: those of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,
+            `cameras` that it can store.
     """
 
     name: str
@@ -107,10 +107,10 @@ class Format:
         return round(count * self.splat_bytes[min(facts.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, facts: SplatModel) -> tuple[str, ...]:
-        """What of a scene this format has no place for, a few words each; precision is not among them.
+        """List the parts of a scene that this format cannot store, a few words each; precision is not among them.
 
         Args:
-            facts: of a `Scene`, or a model.
+            facts: `facts` of a `Scene`, or a model.
         """
         lost = []
         if facts.sh_degree > self.degree:

@@ -3,7 +3,7 @@
 What else a file has, meshes, materials and what packs them, means nothing for splats and refuses nothing, required or
 not: only what the splats themselves use has to be understood.
 
-The text says of SPZ that it is unpacked along LUF; CesiumJS and the tilesets for it take positions as they are stored.
+The extension's text unpacks SPZ along LUF; CesiumJS and the tilesets for it take positions as they are stored.
 The bounds of POSITION, which every glTF has, tell the two apart.
 """
 
@@ -51,13 +51,13 @@ _SPZ = (
     "KHR_spz_compression",
 )
 _WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # its issue 267, pull request 268
-#: Of primitives, and nothing to splats: materials, and numbers of features.
+#: Extensions of primitives that do not affect splats: materials, and numbers of features.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
-_THINNEST = np.float32(np.finfo(np.float32).tiny)  # what a scale of 0 is read as: its logarithm is finite
+_THINNEST = np.float32(np.finfo(np.float32).tiny)  # value that a scale of 0 is read as: its logarithm is finite
 _FAR = 4096.0  # a translation as large as that stays an origin: float32 would have less than half a thousandth left
-_ALIKE = 0.1  # of the extent of a scene, by which bounds may differ that mean the same
+_ALIKE = 0.1  # fraction of the extent of a scene by which equivalent bounds may differ
 _SAMPLE = 4096  # splats whose colours are measured
-_UNPACKED_RATIO = 1032  # of deflate, at most: several views may name the same bytes
+_UNPACKED_RATIO = 1032  # expansion by deflate, at most: several views may name the same bytes
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class _Part:
         block: makes a model of some of them, along the axes of the primitive; its SH may have fewer bands than the
             scene.
         count: N.
-        linear: what the node does to directions and lengths, [3, 3].
-        translation: where the node is, [3].
+        linear: linear part of the node's transform, for directions and lengths, [3, 3].
+        translation: position of the node, [3].
     """
 
     block: Callable[[slice], SplatModel]
@@ -80,14 +80,14 @@ class _Part:
 
 @dataclass
 class _Reading:
-    """What is found on the way through a file. Owns what was unpacked, and what is to be said.
+    """State of reading a file. Owns the unpacked data and the findings to report.
 
     Attributes:
-        scales, opacities: of all primitives.
-        counts: of rotations.
-        sh_degree: the highest that is wanted; `None`: all, of which there may be three bands.
-        are_logs, are_logits: what the scales and opacities turn out to be.
-        antialiased: what each SPZ says of itself.
+        scales, opacities: statistics of all primitives.
+        counts: counts of rotations.
+        sh_degree: the highest degree to read; `None`: all, up to three bands.
+        are_logs, are_logits: whether scales are logarithms and opacities logits, once that is known.
+        antialiased: the flag of each SPZ.
         light: a sample of each primitive with linear colours.
     """
 
@@ -144,7 +144,7 @@ class _Reading:
             yield _Part(block, count, linear, translation)
 
     def _say(self, finding: Finding) -> None:
-        """Add a finding, to the count of one that says the same of other primitives."""
+        """Add a finding, or add to the count of one with the same text about other primitives."""
         for index, one in enumerate(self.findings):
             if one.text == finding.text:
                 self.findings[index] = replace(one, count=one.count + finding.count)
@@ -230,7 +230,7 @@ class _Reading:
         return block, packed.count
 
     def _lies_as_stored(self, packed: Packed, said: dict[str, Any], rotation: F64, *, draft: bool) -> tuple[bool, str]:
-        """Tell whether positions are those of glTF as they are, and who says so."""
+        """Return True if positions are stored along glTF's axes, and the source of that answer."""
         bounds = [said.get(name) for name in ("min", "max")]
         numbers = [one for each in bounds if isinstance(each, list) for one in each]
         if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
@@ -284,7 +284,7 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
 
 
 def _conclude(reading: _Reading) -> None:
-    """Decide what the values of all primitives are, and say what is to be said of them."""
+    """Decide what the values of all primitives are, and add the findings about them."""
     generator = reading.file.root["asset"].get("generator")
     writer = generator[:60] if isinstance(generator, str) else ""
     reading.are_logs, found = read_scales_as(reading.scales, "SCALE", strict=True, writer=writer)
@@ -324,7 +324,7 @@ def _block(reading: _Reading, arrays: dict[str, Accessor], degree: int, rows: sl
         shN[:, index] = values[name]
     scales, opacities = values["SCALE"], values["OPACITY"][:, 0]
     if not reading.are_logs:
-        with np.errstate(invalid="ignore"):  # of NaN, which a model refuses
+        with np.errstate(invalid="ignore"):  # NaN, which a model refuses
             scales = np.log(np.maximum(scales, _THINNEST))
     return SplatModel(
         means=values["POSITION"],
@@ -359,7 +359,7 @@ def _placed(block: SplatModel, part: _Part, facts: SplatModel) -> SplatModel:
 
 
 def _said(file: GltfFile) -> SceneFacts:
-    """Read what the file says of the scene beyond its splats."""
+    """Read the file's metadata about the scene beyond its splats."""
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):

@@ -27,7 +27,7 @@ F64 = NDArray[np.float64]
 
 _SH_C0 = 0.28209479177387814
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
-_LARGEST_FILE = (1 << 32) - 1  # of a .glb: its length is a u32
+_LARGEST_FILE = (1 << 32) - 1  # bytes of a .glb: its length is a u32
 
 
 def write_gltf(path: Path, scene: Scene) -> None:
@@ -105,7 +105,7 @@ def _rows(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 
 def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
-    """What programs show that know points alone: linear colour, alpha."""
+    """Return the colours for programs that only draw points: linear RGB and alpha, [N, 4] bytes."""
     srgb = np.clip(model.sh0 * np.float32(_SH_C0) + np.float32(0.5), 0.0, 1.0)
     linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)

@@ -1,7 +1,7 @@
 """.ksplat 0.1 of mkkellogg/GaussianSplats3D: sections of rows, in floats or in smaller numbers around bucket centres.
 
 Level 0 has float32 throughout. Levels 1 and 2 have positions of 16 bits in a block around the centre of a bucket of
-splats, everything else as float16, but SH as bytes at level 2. SH go up to degree 2. No file says which way is up.
+splats, everything else as float16, but SH as bytes at level 2. SH go up to degree 2. No file specifies which way is up.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
-_COEFFICIENTS = (0, 9, 24)  # of SH, by degree
+_COEFFICIENTS = (0, 9, 24)  # number of SH coefficients, by degree
 _CENTRE_SIZE = 12
 _USUAL_RANGE = 32767  # units of a position from the centre of its block to its face
 _USUAL_SH = 1.5  # bytes of SH reach from -1.5 to 1.5
@@ -157,8 +157,8 @@ def _sections(name: str, data: Any, level: int, most: int) -> Iterator[_Section]
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
-    """Where they end, where their corners lie, and the step, as in `_Section`. The lengths of those that are not full
-    stand before the centres of all.
+    """Return the buckets' ends and corners, and the step, as in `_Section`. Buckets that are not full have their
+    lengths before the centres of all.
     """
     if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
         raise InputError(f"{where}: {head.full:,} full buckets and {head.partial:,} others, of {head.buckets:,}")

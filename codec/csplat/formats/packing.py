@@ -1,4 +1,4 @@
-"""What formats that pack splats do alike: rotations as three numbers."""
+"""Packing that several formats share: rotations as three numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def smallest_three(quats: F32) -> tuple[NDArray[np.int64], F32]:
-    """Leave out the largest component of each rotation, made positive: the others say it.
+    """Leave out the largest component of each rotation, made positive: the others determine it.
 
     Args:
         quats: [N, 4], unit.

@@ -1,4 +1,4 @@
-"""What formats share whose splats are rows of one type, with plain standard deviations and colours in bytes."""
+"""Scenes from formats whose splats are rows of one type, with plain standard deviations and colours in bytes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def finite_scene(
     """Make a scene of the rows without NaN and infinity; the others are dropped and counted.
 
     Args:
-        blocks: gives structured rows, at most `BLOCK` at a time, and arrays as long beside them.
+        blocks: yields structured rows, at most `BLOCK` at a time, together with arrays of the same length.
         decoded: makes a model of natural logarithms of scales and such a tuple.
-        facts: as of `Scene`.
-        zero_quat: what each component of a rotation of length 0 is stored as.
+        facts: as in `Scene`.
+        zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
         The scene; where there are rows, and none is finite, its findings hold an error.

@@ -1,4 +1,4 @@
-"""SOG: lossless WebPs of what splats are beside a meta.json, in a folder or a zip; or many such, in levels."""
+"""SOG: splat attributes as lossless WebPs next to a meta.json, in a folder or a zip; or many such, in levels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NAMES = (
     "sh0",
     "lodLevels",
     "tree",
-)  # of which the JSON of one scene, or of levels, has some
+)  # keys of the JSON, some of which the JSON of one scene, or of levels, has
 _Range = tuple[int, int, int]  # number of a file, first splat and the one behind the last
 
 
@@ -160,12 +160,12 @@ def _leaves(parts: Parts, meta: Json) -> tuple[list[str], list[dict[int, _Range]
 
 
 def _at(leaf: dict[int, _Range], level: int) -> _Range:
-    """What a part of the scene has at a level; or else at the next coarser one; or at its coarsest."""
+    """Return the range of a part of the scene at a level, else at the next coarser one, else at its coarsest."""
     return leaf[min((one for one in leaf if one >= level), default=max(leaf))]
 
 
 def _ranges(parts: Parts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
-    """Which splats of which file are wanted: ranges that do not overlap, in their order."""
+    """Collect the ranges of splats to read from each file; they do not overlap and are in order."""
     found: dict[str, list[tuple[int, int]] | None] = {}
     before = (-1, 0, 0)
     for one in sorted(one for one in wanted if one[2] > one[1]):

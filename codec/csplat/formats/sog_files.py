@@ -1,4 +1,4 @@
-"""Where the parts of a SOG lie, in a folder or in a zip, and what its JSON says; neither is trusted."""
+"""Find the parts of a SOG, in a folder or in a zip, and read its JSON; neither is trusted."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["Json", "Parts", "parts_at", "picture_of"]
 _LARGEST_JSON = 1 << 25
 _LARGEST_PART = 1 << 30
 _LONGEST_NAME = 200
-_ONE, _LEVELS = "meta.json", "lod-meta.json"  # what says of one scene, and of one in levels, what its parts are
-_OF_MACOS = "__MACOSX"  # a folder in zips that macOS makes, of what belongs to no file
+_ONE, _LEVELS = "meta.json", "lod-meta.json"  # list the parts of one scene, and of a scene in levels
+_OF_MACOS = "__MACOSX"  # folder that macOS adds to zips, with metadata that belongs to no part
 _NAMED = 5  # scenes that a message names
-_EXPANSION = 4  # of a part in a zip: pictures and short texts do not deflate to less
-_FREE = 1 << 20  # bytes that may come out of a zip whatever is in it
+_EXPANSION = 4  # expansion of a part in a zip, at most: images and short texts do not deflate to less
+_FREE = 1 << 20  # bytes that may come out of a zip regardless of its size
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Parts:
 
     Attributes:
         path: the folder, or the zip.
-        title: for messages.
-        folder: inside of the zip; `None`: there is none.
-        oddity: what is unusual about the names in the zip; "": nothing.
+        title: name for messages.
+        folder: folder inside the zip; `None`: there is none.
+        oddity: anything unusual about the names in the zip; "": nothing.
     """
 
     path: Path
@@ -79,7 +79,7 @@ class Parts:
         return data
 
     def file(self, name: str) -> Path:
-        """Where a part of a folder is; the rest as `read`."""
+        """Return the path of a part in a folder; otherwise as `read`."""
         path = self.path / self._inside(name)
         if self.folder is not None or not path.is_file():
             self.refuse(f"there is no {name[:80]}")
@@ -113,7 +113,7 @@ class Parts:
         return found[-1]
 
     def json(self, name: str) -> Json:
-        """What a part of JSON says."""
+        """Parse a part that holds JSON."""
         data = self.read(name, _LARGEST_JSON)
         try:
             value = json.loads(data)
@@ -123,13 +123,13 @@ class Parts:
         return Json(self, name, value)
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise the `InputError` that says what is wrong with it."""
+        """Raise the `InputError` that describes the problem."""
         raise InputError(f"{self.title}: {reason}")
 
 
 @dataclass(frozen=True)
 class Json:
-    """A value of JSON and where it stands; asked for what it is not, it is an `InputError`."""
+    """A JSON value and its place; using it as another type raises an `InputError`."""
 
     parts: Parts
     place: str
@@ -163,7 +163,7 @@ class Json:
         return int(self.value)
 
     def numbers(self, least: int, most: int) -> NDArray[np.float64]:
-        """So many finite numbers; one alone may stand without brackets."""
+        """Return `least` to `most` finite numbers; a single one may come without brackets."""
         values = self.value if isinstance(self.value, list) else [self.value]
         if not least <= len(values) <= most:
             self.parts.refuse(f"{self.place} has {len(values)} numbers, wanted {least if least == most else most}")
@@ -174,11 +174,11 @@ class Json:
 
 
 def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
-    """The parts of a SOG, and the name of the one that says what the others are.
+    """Return the parts of a SOG, and the name of the one that lists the others.
 
     Args:
-        path: of a folder, of a zip, or of the meta.json of a folder.
-        title: for messages; `None`: the name of the path.
+        path: path of a folder, of a zip, or of the meta.json of a folder.
+        title: name for messages; `None`: the name of the path.
 
     Raises:
         InputError: there are no such parts.
@@ -246,10 +246,10 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
     """The pixels of a WebP, [H, W, 4].
 
     Args:
-        parts: where it is from.
-        name: of the part, for messages.
+        parts: the SOG that it is from.
+        name: name of the part, for messages.
         data: its bytes.
-        fits: is asked whether width and height are wanted, before there are pixels.
+        fits: called with width and height before pixels are decoded; True if the size is acceptable.
 
     Raises:
         InputError: it is damaged, of another size, or compressed with loss; or Pillow is absent.

@@ -24,30 +24,30 @@ __all__ = ["COEFFICIENTS", "ENTRIES", "LEAST_TAG", "Pictures", "Unit", "degree_o
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
-COEFFICIENTS = (0, 3, 8, 15)  #: of SH, for each degree
+COEFFICIENTS = (0, 3, 8, 15)  #: number of SH coefficients, for each degree
 ENTRIES = 64  #: palette entries in a row of their picture
-LEAST_TAG = 252  #: the fourth byte of a rotation says which component is left out, from here on
-_MOST = 1 << 28  # splats: no picture of WebP has more pixels
+LEAST_TAG = 252  #: the fourth byte of a rotation tells which component is left out, from here on
+_MOST = 1 << 28  # splats: no WebP image has more pixels
 _PALETTE = 1 << 16
-_FREE = 1 << 20  # splats that may come out of however few bytes
+_FREE = 1 << 20  # splats that may come out of any number of bytes
 _SPLATS_PER_BYTE = 8
-_LARGEST_LOG = 88.0  # of a float32
+_LARGEST_LOG = 88.0  # logarithm whose exponential float32 still holds
 _SPARE = 1 << 16  # pixels beyond four for each splat
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What the JSON of one SOG says, checked; no picture was looked at.
+    """The checked JSON of one SOG; no image has been read.
 
     Attributes:
         count: N.
-        degree: of SH; `None` where the width of a picture will say it.
-        antialiased, flat: as of `SplatModel`.
-        bounds: [2, 3] float64, of the signed logarithms of 1 + means.
-        scales, sh0: [3, 256] float32, NaN where a codebook is shorter.
+        degree: SH degree; `None` if only the width of an image determines it.
+        antialiased, flat: as in `SplatModel`.
+        bounds: [2, 3] float64, bounds of the signed logarithms of 1 + means.
+        scales, sh0: [3, 256] float32, NaN for codes beyond a shorter codebook.
         alpha: [256] float32.
         shN: [256] float32; `None`: no SH.
-        palette: entries; `None` where the height of a picture says it.
+        palette: entries; `None` if only the height of an image determines it.
     """
 
     parts: Parts
@@ -68,7 +68,7 @@ def unit_of(parts: Parts, name: str) -> Unit:
     """Look at the JSON of a SOG.
 
     Raises:
-        InputError: it does not say what it should.
+        InputError: the JSON is not as expected.
         OSError: it cannot be read.
     """
     meta = parts.json(name)
@@ -155,7 +155,7 @@ class Pictures:
         """Take all pictures of a SOG out.
 
         Raises:
-            InputError: one is damaged, has another size, or codes that stand for nothing.
+            InputError: one is damaged, has another size, or codes without a meaning.
             OSError: one cannot be read.
         """
         parts, count = unit.parts, unit.count
@@ -215,7 +215,7 @@ class Pictures:
 
 
 def degree_of(unit: Unit) -> int:
-    """SH degree of a SOG; where its JSON does not say it, its palette does."""
+    """Return the SH degree of a SOG, from its JSON or else from its palette."""
     if unit.degree is not None:
         return unit.degree
     name = _files(unit.meta["shN"], 2)[0]

@@ -34,18 +34,18 @@ _LEAST_WEIGHT = 1e-3
 _LARGEST_SIDE = 16383  # pixels of a WebP
 _CODES = 256
 _LLOYD_STEPS = 40
-_DATE = (1980, 1, 1, 0, 0, 0)  # of the parts of a zip: the same scene is the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # date of the parts of a zip: fixed, so the same scene gives the same bytes
 _NORM = 1000  # lattice steps of a long vector of SH: searches are exact up to twice that
-_NEAR = 4  # groups of palette entries that are searched: of 181 for 60,000 splats
+_NEAR = 4  # groups of palette entries that are searched, out of 181 for 60,000 splats
 _ITERATIONS = 2  # more gain 0.03 dB, in three times the time
 _LARGEST_PALETTE = 1 << 16
-_PIXELS_AT_ONCE = 1 << 23  # of WebPs that are written side by side, each in 70 bytes a pixel
-_SAMPLE = 1 << 20  # splats that codebooks and palette are made of
+_PIXELS_AT_ONCE = 1 << 23  # pixels of WebPs that are written in parallel, each taking 70 bytes a pixel
+_SAMPLE = 1 << 20  # splats that codebooks and palette are computed from
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
 def write_sog(path: Path, scene: Scene) -> None:
-    """Write a zip; or beside a path that ends in meta.json, the parts of a folder.
+    """Write a zip; or, for a path that ends in meta.json, the parts next to it in the folder.
 
     Raises:
         InputError: more splats than a picture has pixels; or Pillow is absent.
@@ -147,7 +147,7 @@ def _area(model: SplatModel) -> F64:
 
 @dataclass(frozen=True)
 class _Weights:
-    """How much of a picture splats may be: opacity times area, which is 1 at the median of the scene."""
+    """Weights of splats by their share of a render: opacity times area, which is 1 at the median of the scene."""
 
     middle: float
 
@@ -158,12 +158,12 @@ class _Weights:
 
 
 def _short(values: F32) -> list[float]:
-    """The shortest decimals that say the same float32."""
+    """Return the shortest decimals that give the same float32."""
     return [float(str(one)) for one in values]
 
 
 def _codebook(columns: F32, weights: F32) -> F32:
-    """256 values that stand for all, by Lloyd's algorithm on the sorted values: exact, and cheap for any number.
+    """Return 256 values that represent all, by Lloyd's algorithm on the sorted values: exact, and cheap for any number.
 
     Args:
         columns: [N, C].
@@ -204,7 +204,7 @@ def _nearest(codebook: F32, columns: F32) -> U8:
 
 
 def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8, U32]:
-    """Vectors of SH that stand for those of all splats.
+    """Return vectors of SH that represent those of all splats.
 
     Returns:
         The codebook of their coefficients; the picture of the palette; the label of each splat.

@@ -1,7 +1,7 @@
 """Splats on disk: a file for each bucket, to which rows are appended, and which is read as a whole.
 
 A file is a row of frames. A frame has the number of its splats, a CRC, and then each array of a model one after the
-other, so that nothing has to be taken apart. Who reads the files wrote them: byte order is the machine's.
+other, so that nothing has to be taken apart. The files are read by the machine that wrote them, in its own byte order.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which arrays a model has, and of what types.
+    """Names and dtypes of a model's arrays.
 
     Attributes:
-        facts: a model of no splats that says everything else.
+        facts: a model without splats that holds everything else.
     """
 
     facts: SplatModel
@@ -68,9 +68,9 @@ class BucketWriter:
 
     Attributes:
         folder: where the files are; it exists, and holds none of them.
-        layout: of the splats.
-        curve: which bucket a splat is in.
-        room_bytes: splats that wait for being written, at most.
+        layout: layout of the splats.
+        curve: the curve that determines a splat's bucket.
+        room_bytes: bytes of splats that wait for being written, at most.
     """
 
     folder: Path
@@ -195,5 +195,5 @@ def _read_frame(stream: Any, path: Path, frame: Sequence[NDArray[Any]]) -> None:
 
 
 def damaged(path: Path) -> InputError:
-    """What is said of a file of the working folder that is not as it was written."""
+    """Return the error for a file of the working folder that is not as it was written."""
     return InputError(f"{path} is damaged: remove {path.parent.name} and begin again")

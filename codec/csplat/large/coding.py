@@ -31,8 +31,8 @@ class Bucket:
     """Splats that are coded together.
 
     Attributes:
-        number: of all buckets.
-        place: whose file they are in. start, stop: which of its rows.
+        number: index among all buckets.
+        place: index of the file that holds its splats. start, stop: its rows in that file.
     """
 
     number: int
@@ -42,17 +42,17 @@ class Bucket:
 
     @property
     def rows(self) -> slice:
-        """Of its file."""
+        """The bucket's rows in its file."""
         return slice(self.start, self.stop)
 
 
 @dataclass(frozen=True, eq=False)
 class Coding:
-    """What all buckets share.
+    """State that all buckets share.
 
     Attributes:
-        layout: of the splats.
-        plan: complete. books: as decided on the sample, without what is said of its splats.
+        layout: layout of the splats.
+        plan: complete. books: as decided on the sample, without its splats' entries.
     """
 
     layout: Layout
@@ -65,8 +65,8 @@ def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
 
     Args:
         folder: the working folder.
-        bucket: which splats.
-        coding: what was decided.
+        bucket: the bucket to code.
+        coding: the decisions that all buckets share.
 
     Raises:
         InputError: values that no lattice can hold, or a damaged file.

@@ -38,21 +38,21 @@ Progress = Callable[[str, float], None]
 
 _MB = 1_000_000
 _PROGRAM = 120 * _MB  # a process that has loaded the encoder
-_PER_ROW = 2.2  # of a bucket or sample in memory, in times of its arrays: what coding takes beside them
-_WHOLE_ROW = 3.0  # the same of a scene that is encoded in memory
+_PER_ROW = 2.2  # memory for coding a bucket or sample beyond its arrays, as a multiple of their size
+_WHOLE_ROW = 3.0  # the same for a scene that is encoded in memory
 _CODED = 0.3  # bytes of a file per byte of its splats, at most
 _ROOM = 96 * _MB  # splats that wait for being written to their buckets
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What an encoding takes.
+    """Resources that an encoding takes.
 
     Attributes:
-        in_memory: whether the scene stays in memory.
+        in_memory: True if the scene stays in memory.
         workers: processes that code buckets.
-        memory_bytes: of all processes together, about.
-        disk_bytes: of the working folder and the file, at most.
+        memory_bytes: memory of all processes together, about.
+        disk_bytes: size of the working folder and the file, at most.
     """
 
     in_memory: bool
@@ -62,13 +62,13 @@ class Needs:
 
 
 def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = None, *, by_disk: bool = False) -> Needs:
-    """Say what the encoding of a scene will take.
+    """Estimate the resources that the encoding of a scene will take.
 
     Args:
-        scene: whose blocks are not looked at.
-        options: of the encoder.
+        scene: the scene; its blocks are not read.
+        options: options of the encoder.
         memory_bytes: a bound; `None`: half of what is free.
-        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
+        by_disk: use buckets on disk for a scene of several buckets, even if it would fit in memory.
 
     Raises:
         InputError: the bound is too low for any way.
@@ -93,7 +93,7 @@ def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = No
 
 
 def _layout(scene: Scene, options: EncodeOptions) -> Layout:
-    """Which arrays of a scene are carried."""
+    """Return the layout of the arrays that are carried."""
     return Layout(scene.facts if options.keep_extra else replace(scene.facts, extra={}))
 
 
@@ -116,9 +116,9 @@ def encode_scene(
 ) -> EncodeReport:
     """Compress a scene that is read some splats at a time, to the bytes that `encode` makes of it.
 
-    A scene that does not fit the memory is sorted into buckets of neighbours in a working folder on the disk, which
-    are coded one by one, by `options.threads` processes. What is done stays there if it is interrupted. Started from
-    a script, the script's own work has to stand under `if __name__ == "__main__":`, as for all worker processes.
+    A scene that does not fit in memory is sorted into buckets of neighbours in a working folder on the disk, which
+    are coded one by one, by `options.threads` processes. Finished work stays there if it is interrupted. In a script,
+    the script's own work has to be under `if __name__ == "__main__":`, as for all worker processes.
 
     Args:
         scene: as `csplat.formats.open_scene` gives it.
@@ -126,12 +126,12 @@ def encode_scene(
         options: presets and knobs.
         memory_bytes: a bound on what all processes take together; `None`: half of what is free. The file does not
             depend on it.
-        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
-        folder: the working folder; `None`: beside the target, its name and `.work`.
-        resume: go on with what an interrupted encoding left in the folder, if it left anything.
+        by_disk: use buckets on disk for a scene of several buckets, even if it would fit in memory.
+        folder: the working folder; `None`: next to the target, with its name and `.work`.
+        resume: continue from what an interrupted encoding left in the folder, if there is anything.
         cluster: address of a Dask scheduler, whose workers see the folder under the same name; they code the buckets.
-        source: what tells this scene from others, JSON-compatible, for `resume`.
-        progress: is told the stage and the share of it that is done, 0 to 1.
+        source: identity of this scene, JSON-compatible, for `resume`.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
 
     Returns:
         What was chosen, and errors, as the file states them.

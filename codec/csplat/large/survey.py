@@ -17,7 +17,7 @@ __all__ = ["Survey", "take_survey"]
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What is known of a scene after one look at each splat.
+    """Results of one pass over all splats of a scene.
 
     Attributes:
         sample: some of its splats, in the scene's order.

@@ -30,9 +30,9 @@ class Work:
     """A working folder.
 
     Attributes:
-        folder: where it is.
-        layout: of the splats in it.
-        state: what is done: `key`, of which scene and with which options; `curve` and `largest` after the first pass;
+        folder: path of the folder.
+        layout: layout of the splats in it.
+        state: progress so far: `key`, the scene and the options; `curve` and `largest` after the first pass;
             `counts`, splats of each bucket, after the second one; then `contrast`.
     """
 
@@ -81,7 +81,7 @@ class Work:
 
     @property
     def survey(self) -> Survey | None:
-        """Of the first pass, if it is done.
+        """Results of the first pass, `None` if it is not done.
 
         Raises:
             InputError: its file is damaged.
@@ -106,7 +106,7 @@ class Work:
 
     @property
     def buckets(self) -> list[Bucket]:
-        """What is coded together, in the order of the file; known after the second pass."""
+        """Buckets in the order of the file; known after the second pass."""
         parts = [(place, part) for place, count in enumerate(self.state["counts"]) if count for part in slices(count)]
         return [Bucket(number, place, part.start, part.stop) for number, (place, part) in enumerate(parts)]
 

@@ -1,4 +1,4 @@
-"""Who codes the buckets: this process, several of this machine, or those of a Dask cluster."""
+"""Workers that code the buckets: this process, several of this machine, or those of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def code_here(folder: Path, buckets: Sequence[Bucket], coding: Coding, workers: 
 
     Args:
         folder: the working folder.
-        buckets: that are not done.
-        coding: what was decided.
-        workers: processes; 1: none beside this one.
+        buckets: the buckets that are not done.
+        coding: the decisions that all buckets share.
+        workers: number of processes; 1: only this one.
 
     Raises:
-        CsplatError: as of `code_bucket`.
+        CsplatError: as in `code_bucket`.
         OSError: likewise; or a process was killed.
     """
     for bucket, _ in each_apart(_code, (folder, coding), buckets, workers):
@@ -42,12 +42,12 @@ def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: Coding, add
     Dask runs again what a lost worker had begun.
 
     Args:
-        folder, buckets, coding: as of `code_here`.
-        address: of the scheduler.
+        folder, buckets, coding: as in `code_here`.
+        address: address of the scheduler.
 
     Raises:
         InputError: `dask.distributed` is not installed.
-        CsplatError: as of `code_bucket`.
+        CsplatError: as in `code_bucket`.
         OSError: likewise; or the scheduler does not answer.
     """
     try:
