@@ -26,10 +26,10 @@ HEAD_SIZE = 512
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
 _NO_SPLATS = "no scene of splats"
-_PLY_HEADER_SIZE = 1 << 16  # bytes in which the words of a compressed PLY stand
-_KSPLAT_HEAD = 44  # bytes of its header that say something; the others are 0
+_PLY_HEADER_SIZE = 1 << 16  # bytes that hold the words of a compressed PLY
+_KSPLAT_HEAD = 44  # bytes of its header that carry information; the others are 0
 _SPLAT_ROW_SIZE = 32
-_MANIFESTS = {"meta.json", "lod-meta.json"}  # of SOG
+_MANIFESTS = {"meta.json", "lod-meta.json"}  # names of SOG's manifests
 _PLY, _CSPLAT = "ply", "csplat"
 
 
@@ -38,11 +38,11 @@ class Kind:
     """A kind of file.
 
     Attributes:
-        name: of the format, as `csplat formats` has it; of what csplat does not read, any other.
+        name: id of the format, as `csplat formats` lists it; for formats that csplat does not read, any other name.
         title: as people write it: `SPZ 4`.
-        suffixes: of file names, the usual one first; with their dots, in small letters.
-        matches: whether a file is one by its content: its path, and its first bytes (none of a folder).
-        remedy: what helps, in words that follow the title and a comma; "" where csplat has a reader.
+        suffixes: suffixes of file names, the usual one first; with their dots, in lower case.
+        matches: tells from the path and the first bytes (empty for a folder) if a file has this format.
+        remedy: what the user can do, in words that follow the title and a comma; "" if csplat has a reader.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Kind:
 
     @property
     def is_scene(self) -> bool:
-        """Whether it holds splats, read by csplat or not."""
+        """True if the format holds splats, read by csplat or not."""
         return not self.remedy or self.remedy.startswith(_NOT_READ)
 
 
@@ -96,9 +96,9 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
     """Build the error for a file that a reader does not take: what it is, and what helps.
 
     Args:
-        path: of it.
-        head: as of `by_content`.
-        wanted: name of the only format that the reader takes; "": it takes all that csplat reads.
+        path: path of the file.
+        head: as in `by_content`.
+        wanted: name of the only format that the reader takes; "" if it takes all that csplat reads.
     """
     if path.is_dir() and wanted and not by_content(path, head):
         return InputError(f"{path.name} is a folder, wanted a {KINDS[wanted].title}")
@@ -157,7 +157,7 @@ def _is_spz(_path: Path, head: bytes) -> bool:
 
 
 def _is_gzip(path: Path, head: bytes) -> bool:
-    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # of that its reader says what is wrong
+    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # its reader reports what is wrong with it
 
 
 def _is_ksplat(_path: Path, head: bytes) -> bool:
@@ -188,7 +188,7 @@ def _names_in_zip(path: Path) -> list[str] | None:
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.namelist()
-    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # of broken archives
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # the archive is damaged
         return None
 
 
@@ -201,7 +201,7 @@ def _is_tileset(path: Path, head: bytes) -> bool:
 
 
 def _is_json(_path: Path, head: bytes) -> bool:
-    """Whether it is text that begins as JSON; a brace alone may be a byte of anything."""
+    """Return True if the content is text that begins as JSON; a lone brace may be a byte of anything."""
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     return text[:1] in (b"{", b"[") and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
 

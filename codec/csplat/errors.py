@@ -1,4 +1,4 @@
-"""What can go wrong, one class for each party at fault.
+"""Exceptions, one class for each party at fault.
 
 | class | at fault | what helps |
 |---|---|---|
@@ -29,8 +29,8 @@ class CsplatError(Exception):
     """Base of every error that csplat raises on purpose.
 
     Attributes:
-        code: what went wrong, constant across versions and languages (`E_CRC`).
-        path: the file that was read when it went wrong, as the caller named it; `None` where that is not known.
+        code: short constant string for the kind of error, the same in all versions and languages (`E_CRC`).
+        path: path of the file that was being read, as the caller named it; `None` if it is not known.
     """
 
     code: str = "E_CSPLAT"
@@ -40,7 +40,7 @@ class CsplatError(Exception):
 class FormatError(CsplatError):
     """A file breaks a clause of the format.
 
-    `str()` says what, where, by which clause, what was found and what was wanted:
+    `str()` gives the code, the offset, the clause, the value found and the value expected:
     `E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081`.
 
     Args:
@@ -48,9 +48,9 @@ class FormatError(CsplatError):
         offset: byte of the file where the offending field begins; `None` where no single byte is
             to blame.
         clause: id of the clause that is broken, `CRC-1`.
-        detail: text after the colon, for what `found` and `wanted` cannot say.
-        found: what the file holds.
-        wanted: what the clause asks for.
+        detail: text after the colon, if `found` and `wanted` are not enough.
+        found: value in the file.
+        wanted: value that the clause requires.
     """
 
     def __init__(
@@ -77,10 +77,10 @@ class UnsupportedError(CsplatError):
     """A file asks for a feature that this decoder does not have.
 
     Args:
-        feature: what is asked for, `version 0.7`.
+        feature: name of the feature that the file requires, `version 0.7`.
         code: error code of the registry.
-        offset: byte of the file that asks for it, if known.
-        clause: id of the clause that says so, if there is one.
+        offset: offset in the file of the bytes that ask for it, if known.
+        clause: id of the clause that specifies this, if there is one.
     """
 
     def __init__(
@@ -105,11 +105,11 @@ class LimitError(CsplatError):
 
     Args:
         limit: name of the limit, `max_splats`.
-        wanted: how much the file asks for.
-        allowed: how much the caller allows.
+        wanted: amount that the file asks for.
+        allowed: amount that the caller allows.
         code: error code of the registry.
-        offset: byte of the file that asks for it, if known.
-        clause: id of the clause that says so, if there is one.
+        offset: offset in the file of the bytes that ask for it, if known.
+        clause: id of the clause that specifies this, if there is one.
     """
 
     def __init__(
@@ -135,10 +135,10 @@ class LimitError(CsplatError):
 
 
 class InputError(CsplatError):
-    """What the caller handed in cannot be used: a PLY, an array, an option.
+    """The caller's data cannot be used: a PLY, an array, an option.
 
     Args:
-        message: one line that says what is wrong and, where there is one, what helps.
+        message: one line that states what is wrong and, if there is one, the remedy.
     """
 
     code = "E_INPUT"
@@ -151,7 +151,7 @@ class StoreError(CsplatError):
     """The store that a file lies in did not give its bytes: a server without parts, a lost connection, another file.
 
     Args:
-        message: one line that names the file and says what came instead.
+        message: one line that names the file and states what arrived instead.
     """
 
     code = "E_STORE"
@@ -175,9 +175,9 @@ def missing(error: ModuleNotFoundError, package: str | None = None, *, extra: st
     """One line for a package that a plain install leaves out.
 
     Args:
-        error: of its import.
-        package: its name, where that is not the module's.
-        extra: what brings it.
+        error: error raised by its import.
+        package: name of the package, if it is not the module's.
+        extra: extra of csplat that installs it.
     """
     return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 

@@ -27,14 +27,14 @@ _MB = 1e6
 
 
 class BinaryWriter(Protocol):
-    """What `open(path, "wb")` and `io.BytesIO` give."""
+    """A binary file open for writing, such as `open(path, "wb")` or `io.BytesIO`."""
 
     def write(self, data: bytes | memoryview, /) -> object:
         """Take some bytes."""
         ...
 
 
-#: Byte order marks, and the encoding that each stands for; UTF-32's begin with UTF-16's.
+#: Byte order marks, and the encoding of each; UTF-32's begin with UTF-16's.
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -80,9 +80,9 @@ def check_room(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> 
     """Refuse work that a disk has no room for.
 
     Args:
-        folder: on the disk.
-        wanted_bytes: that the work will write.
-        what: while what they are wanted, in words.
+        folder: a folder on the disk.
+        wanted_bytes: bytes that the work will write.
+        what: the work that needs them, in words.
 
     Raises:
         InputError: the disk has fewer free.
@@ -100,8 +100,8 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
     """Give the path of a file that can be read twice. What is none is copied into a temporary one first.
 
     Args:
-        file: a path; a binary file, read from where it stands; or bytes. Named pipes are copied, too.
-        name: of the copy, for messages; else that of the binary file, or "data".
+        file: a path; a binary file, read from its current position; or bytes. Named pipes are copied, too.
+        name: name of the copy, for messages; by default that of the binary file, or "data".
 
     Raises:
         InputError: it is none of these, or a file of text.
@@ -140,7 +140,7 @@ def _parts(file: Any) -> Iterator[memoryview]:
 
 @contextmanager
 def _named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Say in errors which file could not be written: writing itself does not."""
+    """Make errors name the file that could not be written: writing itself does not."""
     try:
         yield
     except OSError as error:
@@ -155,7 +155,7 @@ def opened_for_writing(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[
 
     Raises:
         InputError: it is neither.
-        OSError: as of `atomic_writer`.
+        OSError: as in `atomic_writer`.
     """
     if isinstance(file, (str, os.PathLike)):
         with atomic_writer(file) as stream:
@@ -174,8 +174,8 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
     error; a symbolic link keeps pointing where it points. Devices and pipes are written directly.
 
     Args:
-        path: where the file shall be.
-        replace: whether an existing file is replaced; if not, one that came meanwhile stays, too.
+        path: path of the file to write.
+        replace: replace an existing file; if False, a file that was created meanwhile is kept, too.
 
     Yields:
         A binary file object, positioned at 0.
@@ -203,7 +203,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         with suppress(FileNotFoundError):
             temporary.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # what failed is the file, in the words of whoever asked for it
+            error.filename = os.fspath(path)  # the file that failed, under the name that the caller used
         raise
 
 
@@ -228,7 +228,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     """Read one array from a .npy file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         most_bytes: larger files are mapped into memory; `None`: none are.
 
     Raises:

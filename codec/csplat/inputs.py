@@ -1,4 +1,4 @@
-"""What a file may be handed in as, what may come in its place, and a file of the disk as bytes."""
+"""Input files: the forms they may be passed in, content that comes in their place, and files on disk as bytes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _XML = (b"<?xml", b"<error")
 
 
 class BinaryFile(Protocol):
-    """What `open(path, "rb")`, `io.BytesIO` and `gzip.open` give: it is read from where it stands to its end."""
+    """A binary file such as `open(path, "rb")`, `io.BytesIO` or `gzip.open`, read from its position to its end."""
 
     def read(self, size: int = -1, /) -> bytes:
-        """So many bytes, or all that are left."""
+        """Return up to `size` bytes, or all that are left."""
         ...
 
 
@@ -45,7 +45,7 @@ def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
 
 
 def stand_in(head: bytes) -> str:
-    """Name what came in place of a file, whatever file was wanted; "" where the content gives no sign of that.
+    """Name the content that came in place of a file, whatever file was expected; "" if there is no sign of that.
 
     Args:
         head: the first bytes of the file, 64 or more where it has them.
@@ -65,10 +65,10 @@ def stand_in(head: bytes) -> str:
 
 
 class LetGo:
-    """Keeps a mapped file from filling the memory of who goes through it. Owns how much was read since the last time.
+    """Releases pages of a memory-mapped file during a sequential read. Owns the count of bytes since the last release.
 
-    What was read counts as memory of the process until the machine is short of it; let go of, it is read again when it
-    is wanted again. Bytes in memory stay as they are.
+    Pages that were read count as memory of the process until the machine is short of it; released pages are read again
+    when they are needed again. Bytes in memory stay as they are.
 
     Args:
         view: the file.
@@ -78,7 +78,7 @@ class LetGo:
     def __init__(self, view: memoryview, step_bytes: int = 1 << 25) -> None:
         known = hasattr(mmap, "madvise") and hasattr(mmaps, "MADV_DONTNEED")
         file = view.obj if known and isinstance(view.obj, mmap) else None
-        # What somebody may have written there is nowhere else.
+        # A writable mapping may hold changes that are nowhere else.
         self._file = file if file is not None and memoryview(file).readonly else None
         self._read_bytes, self._step_bytes = 0, step_bytes
 

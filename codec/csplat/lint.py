@@ -1,4 +1,4 @@
-"""What is wrong with the columns of a splat PLY and the values of other formats, and the repairs that are safe.
+"""Problems with the columns of a splat PLY and with the values of other formats, and the repairs that are safe.
 
 A finding is one of three things. A *note* is ordinary variation: nothing is lost, nothing looks
 different. A *repair* changes or drops something, safely, and is reported; `strict` refuses it. An
@@ -83,8 +83,8 @@ _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 #: What CloudCompare puts before the names of scalar fields (PlyFilter.cpp), and 3dgsconverter, which prepares files for
 #: it, before that.
 _PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
-#: Colours in place of f_dc, as ns-export of nerfstudio writes them; the other names are those that three.js'
-#: PLYLoader and Brush take for the same.
+#: Colours in place of f_dc, as ns-export of nerfstudio writes them; the other names are the equivalents that three.js'
+#: PLYLoader and Brush accept.
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 #: By the type of a colour, the value that is 1.
 _COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
@@ -105,11 +105,11 @@ class Finding:
     """One thing that lint noticed.
 
     Attributes:
-        id: of the table above, constant across versions.
-        count: how many splats, columns, elements or bytes are concerned.
-        text: one line, which says what was found and what becomes of it.
+        id: id in the table above, constant across versions.
+        count: number of splats, columns, elements or bytes concerned.
+        text: one line that states what was found and what becomes of it.
         kind: `note`, `repair` or `error`.
-        usual: trained scenes are like that: worth a word to who asks for all there is alone.
+        usual: trained scenes usually have it: reported only to callers that ask for all findings.
     """
 
     id: str
@@ -120,7 +120,7 @@ class Finding:
 
     @property
     def repairable(self) -> bool:
-        """Whether reading goes on."""
+        """True if reading can go on."""
         return self.kind != "error"
 
     def __str__(self) -> str:
@@ -129,7 +129,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Columns:
-    """Which column of a PLY is what. Names are given in the order of the model's last axis.
+    """Meaning of the columns of a PLY. Names are given in the order of the model's last axis.
 
     Attributes:
         means, scales, quats, sh0: names of the columns; `scales` has two names for discs.
@@ -137,8 +137,8 @@ class Columns:
         opacity: name of the column of logits.
         normals: three names, or none.
         extra: everything else.
-        double: whether positions have more than float32 holds.
-        colour_range: where `sh0` are red, green and blue, the value that is 1; 0 where they are coefficients.
+        double: True if positions have more precision than float32 holds.
+        colour_range: if `sh0` are red, green and blue, the value that is 1; 0 if they are coefficients.
         filter_3d: name of the column of standard deviations of Mip-Splatting's 3D filter, or "".
     """
 
@@ -163,7 +163,7 @@ def find_columns(
     Args:
         dtype: structured, one field per scalar property, in the order of the file.
         keep_extra: extra columns will be kept: they are no finding then.
-        sh_degree: highest SH band wanted; `None`: all, of at most degree 3.
+        sh_degree: highest SH band to read; `None`: all, up to degree 3.
         elements: names of the other elements of the file, for messages.
 
     Returns:
@@ -217,7 +217,7 @@ def find_columns(
 
 
 def dropped_columns(names: Sequence[str]) -> Finding:
-    """Say which columns are dropped that splats do not have, and what a scene that has them may be."""
+    """Report the columns that are dropped because splats lack them, and what a scene with them may be."""
     meaning = _meaning(names)
     text = f"columns {', '.join(names)} are no property of splats: dropped"
     text += "" if meaning is None else f"; the file holds {meaning}"
@@ -256,7 +256,7 @@ class _Names:
         return found[0] if found else ""
 
     def findings(self) -> list[Finding]:
-        """What was found under other names."""
+        """Return the findings about columns under other names."""
         found = []
         if self._ambiguous:
             text = f"{'; '.join(self._ambiguous[:_NAMED])}: rename one of them"
@@ -277,7 +277,7 @@ def _some(words: Sequence[str]) -> str:
 
 
 def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, Finding]:
-    """The value of a colour that is 1, and what to say of it."""
+    """Return the value of a colour that is 1, and the finding about it."""
     named = f"{', '.join(colours[:2])} and {colours[2]}"
     kinds = {dtype[name].str[1:] for name in colours}
     largest = _COLOUR_RANGES.get(kinds.pop(), 0.0) if len(kinds) == 1 else 0.0
@@ -290,7 +290,7 @@ def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, 
 
 
 def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
-    """Say that columns hold integers, of which nobody knows what values they stand for."""
+    """Report columns that hold integers, whose meaning is unknown."""
     found = [name for group in groups for name in group if name and dtype[name].kind != "f"]
     if not found:
         return None
@@ -311,7 +311,7 @@ def float_columns(names: Sequence[str]) -> list[str]:
 
 
 def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> str:
-    """Say which columns are missing, and what the file seems to be."""
+    """List the missing columns, and describe what the file seems to be."""
     text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
     shown = f"it has {_some(names.all)}" if names.all else "it has no columns"
     if (meaning := _meaning(names.all)) is not None:
@@ -330,7 +330,7 @@ def _meaning(names: Sequence[str]) -> str | None:
 
 
 def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
-    """The columns of all bands, those of the bands that are wanted, and what is to be said of them."""
+    """Return the columns of all bands, the columns of the bands to read, and the finding about them."""
     numbers = sorted(int(match[1]) for name in names.plain if (match := _REST.fullmatch(name)))
     count = len(numbers)
     if numbers != list(range(count)):
@@ -358,7 +358,7 @@ def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], t
 
 
 def too_many_bands(degree: int) -> str:
-    """Say of a file that it has more SH bands than a model, and how to read it without them."""
+    """Report that a file has more SH bands than a model, and how to read it without them."""
     bands = f"band {degree}" if degree == MAX_SH_DEGREE + 1 else f"bands {MAX_SH_DEGREE + 1} to {degree}"
     return (
         f"SH degree {degree}, expected at most {MAX_SH_DEGREE}: --sh-degree {MAX_SH_DEGREE} of csplat encode, convert,"

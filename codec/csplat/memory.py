@@ -1,4 +1,4 @@
-"""How much memory there is."""
+"""Available memory."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 __all__ = ["available_bytes", "default_bytes"]
 
-_SHARE = 0.5  # of what is free: others want some, too
-_UNKNOWN = 4 << 30  # where the system does not say
+_SHARE = 0.5  # share of the free memory: other programs need some, too
+_UNKNOWN = 4 << 30  # bytes, if the system does not report it
 _LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -27,7 +27,7 @@ def available_bytes() -> int:
 
 
 def default_bytes() -> int:
-    """What a command takes that is not told: half of what is free."""
+    """Return the memory that a command uses by default: half of what is free."""
     return int(_SHARE * available_bytes())
 
 

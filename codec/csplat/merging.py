@@ -32,7 +32,7 @@ from csplat.scene import Scene
 
 __all__ = ["Merged", "merge"]
 
-#: What must not differ, for it says how all splats of a file are to be shown: words for it, and the field.
+#: Fields that must be equal, because they determine how all splats of a file are shown: words for each, and its name.
 _FACTS = (
     ("axes", "coordinate_system"),
     ("a unit in metres", "unit_metres"),
@@ -43,14 +43,14 @@ _FACTS = (
 
 @dataclass(frozen=True)
 class Merged:
-    """What became of several files.
+    """Result of merging several files.
 
     Attributes:
         splat_count: splats of the file.
         tile_count: its tiles.
         size: its bytes.
-        why: the reason for which the scenes were decoded and coded again; empty where tiles were copied.
-        dropped: extra columns that not all of them had, where they were coded again.
+        why: the reason why the scenes were decoded and coded again; empty if tiles were copied.
+        dropped: extra columns that not all of them had, if they were coded again.
     """
 
     splat_count: int
@@ -74,16 +74,16 @@ def merge(
     degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
     steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
     are decoded and coded again together, as `csplat.large.encode_scene` does it, which costs quality once more;
-    `Merged.why` says why. What waits for its turn lies in temporary files.
+    `Merged.why` gives the reason. Pending data is kept in temporary files.
 
-    Metadata and cameras are kept as far as all files have the same. What one file leaves open, axes or unit, another
-    one may say. Copied files state no errors and no options: nobody has measured the whole.
+    Metadata and cameras are kept as far as all files have the same. If one file leaves axes or unit open, another
+    one may specify them. Copied files declare no errors and no options: nobody has measured the whole.
 
     Args:
-        files: as of `csplat.open`, two or more.
+        files: as in `csplat.open`, two or more.
         output: a path, which the file takes when it is complete, replacing an older one; or an open binary file.
-        options: of the encoder, where scenes are coded again; by default the preset "balanced" and extra columns.
-        storage: as of `csplat.open`, of all files.
+        options: options of the encoder, if scenes are coded again; by default the preset "balanced" and extra columns.
+        storage: as in `csplat.open`, for all files.
         codebooks_max: with more than these together, scenes are coded again; a file can have no more than the default.
 
     Examples:
@@ -131,10 +131,10 @@ def merge(
 
 
 def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str]) -> None:
-    """Refuse scenes that cannot stand beside each other.
+    """Refuse scenes that contradict each other.
 
     Raises:
-        InputError: two files say different things.
+        InputError: two files have different values.
     """
     said = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
     for value, name in said[1:]:
@@ -150,7 +150,7 @@ def _text(value: Any) -> str:
 
 
 def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
-    """Why tiles of one file would mean something else in the other; nothing where they would not."""
+    """Return why tiles of one file would mean something else in the other; "" if they would not."""
     first, name = fields[0], names[0]
     for other, its in zip(fields[1:], names[1:], strict=True):
         if other.sh_degree != first.sh_degree:
@@ -206,7 +206,7 @@ def _coded_again(
 
 
 def _facts(scenes: Sequence[SplatFile]) -> SplatModel:
-    """What the scenes are together, without splats: about one origin, with the columns that all have."""
+    """Return a model without splats for the scenes together: one origin, and the columns that all have."""
     headers = [scene.header for scene in scenes]
     origins = np.array([header.origin for header in headers])
     x, y, z = map(float, (origins.min(axis=0) + origins.max(axis=0)) / 2.0)  # float32 is finest about it

@@ -65,10 +65,10 @@ class SplatModel:
         origin: what to add to `means`, three float64, scene units. A scene at geographic
             coordinates keeps its float32 precision this way.
         means_double: [N, 3] float64, the centres as the source has them, origin included, where
-            `means` are these less the origin, rounded; `None` where `origin` and `means` say all.
+            `means` are these less the origin, rounded; `None` if `origin` and `means` are exact.
         coordinate_system: `"unspecified"`, or the directions of +x, +y and +z for a person who
             looks at the scene, as three letters of R/L, U/D and F/B: `"RDF"`.
-        unit_metres: length of one scene unit in metres; `None` where it is not known.
+        unit_metres: length of one scene unit in metres; `None` if it is not known.
         antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
         flat: splats are discs (2DGS): the third, smallest scale means nothing.
         cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
@@ -131,11 +131,11 @@ class SplatModel:
         return f"SplatModel({len(self)} splats, sh_degree={self.sh_degree})"
 
     def _repr_html_(self) -> str | None:
-        """What a notebook shows of it: a picture that can be turned; `None`, its `repr`, where the tools are absent."""
+        """Return a scene that can be turned, for a notebook; `None`, for its `repr`, if empty or without the tools."""
         if not len(self):
             return None
         try:
-            # By its name: nothing of this package knows the tools, which stand on it.
+            # Imported by name: nothing in this package depends on the tools, which depend on it.
             notebook = import_module("csplat_tools.present.notebook")
         except ModuleNotFoundError:
             return None
@@ -213,8 +213,8 @@ def sh_degree_of(coefficient_count: int) -> int:
 def normalise_quats(quats: NDArray[Any]) -> F32:
     """Bring quaternions to unit length; a zero quaternion becomes the identity.
 
-    Those that are unit already, as nearly as float32 can say, stay as they are, bit for bit: so
-    doing it twice changes nothing. Huge and denormal ones are no special case in float64.
+    Quaternions that are unit already, as nearly as float32 can represent, stay as they are, bit for
+    bit: so doing it twice changes nothing. Huge and denormal ones are no special case in float64.
 
     Args:
         quats: [N, 4] float32, w x y z, finite, of any length.

@@ -1,4 +1,4 @@
-"""A file that is read in parts, from wherever it lies: what stands in front of it first, then what is wanted."""
+"""A file that is read in parts, from disk, memory or a URL: first its header and index, then the parts requested."""
 
 from __future__ import annotations
 
@@ -93,12 +93,12 @@ class SplatFile:
 
     @property
     def requests(self) -> int:
-        """How often the store was asked, once for the size of a file at a URL."""
+        """Number of requests to the store, including one for the size of a file at a URL."""
         return self._store.requests
 
     @property
     def bytes_read(self) -> int:
-        """How many bytes the store gave."""
+        """Number of bytes that the store returned."""
         return self._store.bytes_read
 
     @cached_property
@@ -108,7 +108,7 @@ class SplatFile:
 
     @cached_property
     def metadata(self) -> dict[str, Any] | None:
-        """What the META chunk holds, `None` where there is none; read when it is first asked for."""
+        """Content of the META chunk, `None` if there is none; read on first access."""
         with self._store.telling():
             window = self.window()
             window.fetch(self._chunks(_spec.CHUNK_METADATA))
@@ -116,7 +116,7 @@ class SplatFile:
 
     @cached_property
     def cameras(self) -> list[dict[str, Any]] | None:
-        """What the CAMS chunk holds, `None` where there is none; read when it is first asked for."""
+        """Content of the CAMS chunk, `None` if there is none; read on first access."""
         with self._store.telling():
             window = self.window()
             window.fetch(self._chunks(_spec.CHUNK_CAMERAS))
@@ -131,9 +131,9 @@ class SplatFile:
         """Decode tile by tile, in memory for the codebooks, a tile and some megabytes of the file.
 
         Args:
-            box: tiles that touch it, whole; all where it is left out. Two corners, x, y, z each, in any order;
+            box: tiles that touch it, whole; all if it is left out. Two corners, x, y, z each, in any order;
                 scene units, relative to the origin.
-            sh_degree: highest SH band wanted: others are not read; all where it is left out.
+            sh_degree: highest SH band to read; all if it is left out.
 
         Raises:
             InputError: an argument is at fault, or no tile touches the box.
@@ -157,9 +157,9 @@ class SplatFile:
         """Decode a part, or all.
 
         Args:
-            box: as of `tiles`.
-            tiles: places of the tiles wanted, in the order wanted; not with a box.
-            sh_degree: as of `tiles`.
+            box: as in `tiles`.
+            tiles: places of the tiles to decode, in the order requested; not with a box.
+            sh_degree: as in `tiles`.
 
         Examples:
             >>> import csplat
@@ -211,7 +211,7 @@ class SplatFile:
                 yield tile
             side = []
         with self._store.telling():
-            next(decoded, None)  # of a scene without tiles, all that there is to be checked
+            next(decoded, None)  # a scene without tiles still has chunks to check
 
     def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
         return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
@@ -221,9 +221,9 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
     """Open a file to read parts of it: header and index are read, nothing else.
 
     Args:
-        file: a path; a URL that fsspec knows (`https://…`, `s3://…`; wants the extra `remote`); an open binary file,
+        file: a path; a URL that fsspec knows (`https://…`, `s3://…`; requires the extra `remote`); an open binary file,
             which is read to its end; or bytes.
-        limits: as of `decode`, for each part.
+        limits: as in `decode`, for each part.
         storage: options of fsspec's file system of the URL: `{"endpoint_url": …, "anon": True}`.
 
     Examples:
@@ -234,7 +234,7 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
         1000 (1000, 0, 3)
 
     Raises:
-        FormatError, UnsupportedError: as of `read_header`, or the file is shorter or longer than it says.
+        FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header states.
         InputError: the file is none of these; storage options for what is no URL; the extra is not installed.
         StoreError: a server does not answer, gives no parts of files (HTTP Range), or not all of one; or the file
             has changed since it was opened. Nothing of what was asked for is returned then.
@@ -257,15 +257,15 @@ def extract(
 ) -> Part:
     """Cut the tiles whose boxes touch a box out of a file, into a file of their own.
 
-    Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Stated errors
-    and what the encoder says of its work are left out: they are about the whole. So are chunks of unknown types. Read
-    are header, index and what is copied, written in memory for some megabytes.
+    Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Declared
+    errors and the encoder's record of its options are left out: they are about the whole. So are chunks of unknown
+    types. Only header, index and the copied data are read; some megabytes at a time are held in memory.
 
     Args:
-        file: as of `open`.
+        file: as in `open`.
         box: two corners, x, y, z each, in any order; scene units, as the means: relative to the origin.
         output: a path, which the part takes when it is complete, replacing an older file; or an open binary file.
-        storage: as of `open`.
+        storage: as in `open`.
 
     Examples:
         >>> import csplat
@@ -274,16 +274,16 @@ def extract(
         True
 
     Raises:
-        InputError: six finite numbers are wanted; or no tile touches the box.
+        InputError: the box is not six finite numbers; or no tile touches the box.
         FormatError: a clause on header, index, or the chunks that are copied is broken.
-        UnsupportedError, StoreError, OSError: as of `open`; or the output cannot be written.
+        UnsupportedError, StoreError, OSError: as in `open`; or the output cannot be written.
     """
     with open(file, storage=storage) as opened:
         return opened.extract(box, output)
 
 
 def _read_head(store: Store, window: Window) -> bytes:
-    """Read what stands in front of the chunks, and as much behind it as came along."""
+    """Read the data before the first chunk, and any data after it that came in the same request."""
     first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
     head = read_file_header(window.view)
@@ -295,7 +295,7 @@ def _read_head(store: Store, window: Window) -> bytes:
 
 
 def _side(job: Job) -> list[tuple[int, int]]:
-    """What is read beside tiles: their codebooks; of all of a file, everything, which is checked."""
+    """Return the ranges to read besides tiles: their codebooks; or, for a whole file, everything, to check it."""
     records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
     return [(record.offset, record.size) for record in records]
 

@@ -25,10 +25,10 @@ _ALL = 1 << 26  # bytes of all files that are fetched together
 
 @dataclass(frozen=True)
 class Part:
-    """What was cut out of a file.
+    """Result of cutting a part out of a file.
 
     Attributes:
-        tiles: which tiles of the file it has.
+        tiles: places of its tiles in the file.
         splat_count: its splats.
         size: its bytes.
     """
@@ -41,7 +41,7 @@ class Part:
 def write_part(
     window: Window, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
 ) -> Part:
-    """Write some tiles of a file as a file of their own, as `csplat.extract` says.
+    """Write some tiles of a file as a file of their own, for `csplat.extract`.
 
     Args:
         window: the file.
@@ -73,8 +73,8 @@ class InTurn:
 
     Args:
         window: the file; what was fetched into it is forgotten in the end.
-        records: of the chunks, as they are wanted.
-        files: how many are read by turns.
+        records: records of the chunks, in the order they are taken.
+        files: number of files that are read by turns.
     """
 
     def __init__(self, window: Window, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
@@ -84,7 +84,7 @@ class InTurn:
         self._here = range(0)
 
     def take(self, place: int, beside: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
-        """See to it that the window has a chunk, perhaps the next ones, and others beside; return its record."""
+        """Make sure that the window holds a chunk, perhaps the next ones, and `beside`; return its record."""
         if place not in self._here:
             stop, size = place + 1, self._records[place].size
             while stop < len(self._records) and size + self._records[stop].size <= self._batch:
@@ -115,7 +115,7 @@ class TileCopies:
 
         Args:
             tile: its record.
-            changed: by layer, what stands in the place of the file's.
+            changed: by layer, payloads that replace the file's.
         """
         layers: dict[int, Payload] = dict(changed or {})
         for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
@@ -128,7 +128,7 @@ class TileCopies:
         )  # fmt: skip
 
     def begin(self, beside: Sequence[_spec.DirectoryRecord]) -> None:
-        """Once all tiles are known, read the first chunks, and others beside, which are looked at before any tile."""
+        """Once all tiles are known, read the first chunks, and `beside`, which is needed before any tile."""
         self._turn[0].take(0, beside)
 
     @cached_property
@@ -156,13 +156,13 @@ def chunk_payload(window: Window, record: _spec.DirectoryRecord | _spec.LayerRec
 def scene_fields(
     window: Window, header: SceneHeader, tables: Container[int], chunks: Sequence[FileChunk]
 ) -> SceneFields:
-    """What a file says of the scene, with other chunks.
+    """Return the scene fields of a file, with other chunks.
 
     Args:
         window: the file's header and index.
         header: the same, read.
         tables: ids of the codebooks that are used.
-        chunks: beside the tiles.
+        chunks: chunks in addition to the tiles.
     """
     head = _spec.unpack_index_head(window.view, _spec.HEADER_SIZE)
     at = _spec.HEADER_SIZE + head.head_size + head.attribute_count * head.attribute_size

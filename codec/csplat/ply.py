@@ -4,8 +4,8 @@ PLY has no place for what a scene needs beyond its columns, so it goes into head
 `csplat origin X Y Z` (x, y, z are relative to it), `csplat absolute_origin X Y Z` (x, y, z are
 absolute, in doubles), `csplat coordinate_system RDF`, `csplat up X Y Z`, `csplat unit_metres U`,
 `csplat licence TEXT`, `csplat training {JSON}` and `csplat view {JSON}` (what the scene was trained on and where it is
-shown from first, as `csplat.training` has them in the metadata). That it is antialiased or flat stands in the words of
-others, `SplatRenderMode: mip` or `2dgs`.
+shown from first, as `csplat.training` has them in the metadata). Antialiased and flat scenes are marked in the words of
+other programs, `SplatRenderMode: mip` or `2dgs`.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
     """Find out what is wrong with a PLY of splats, without refusing it.
 
     Args:
-        file: as of `read_ply`.
-        sh_degree: as of `read_ply`.
+        file: as in `read_ply`.
+        sh_degree: as in `read_ply`.
 
     Returns:
         Findings in the order of reading; the last one is an error where `read_ply` would refuse.
@@ -134,12 +134,12 @@ _Placed = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin, m
 
 
 class _Survey(NamedTuple):
-    """What belongs to all splats.
+    """Facts about all splats of a file together.
 
     Attributes:
-        kept: how many there are without those that are dropped.
+        kept: splats without those that are dropped.
         thinnest: the smallest scale.
-        placed: of positions in doubles all of them, in their places.
+        placed: for positions in doubles, all of them, in their places.
     """
 
     kept: int

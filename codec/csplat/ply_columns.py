@@ -44,12 +44,12 @@ LOGIT_OF_1 = 20.0
 #: scale of the file.
 _FLAT_SCALE_STEP = 4.605170
 
-_HUGE_LOG = 88.0  # standard deviations beyond leave float32
+_HUGE_LOG = 88.0  # standard deviations beyond this exponent overflow float32
 _HUGE_COLOUR = 1e6
-_USUAL_LENGTHS = (1e-3, 1e3)  # of rotations: they grow and shrink while a scene is trained
-_LARGEST_COLOUR = 16.0  # of red, green and blue as floats, where 1 is white: beyond they are counted to 255
+_USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions: they grow and shrink while a scene is trained
+_LARGEST_COLOUR = 16.0  # red, green and blue as floats, where 1 is white: larger values are taken as 0 to 255
 _LOOKED_AT = 4096  # rows that tell half floats from integers
-_FEW = 16  # splats: what holds for fewer may hold by chance
+_FEW = 16  # splats: a property of fewer may be chance
 _TINY = 1e-30  # above 0
 _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
 
@@ -75,12 +75,12 @@ _NOTHING = (math.inf, -math.inf)
 
 @dataclass
 class Counts:
-    """What was noticed in rows, to be added to."""
+    """Counts and ranges of what was noticed in rows, updated block by block."""
 
     nonfinite: int = 0
     zero_quats: int = 0
     unnormalised: int = 0
-    quat_lengths: tuple[float, float] = (math.inf, 0.0)  # of those that are not 0
+    quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, without those that are 0
     infinite_logits: int = 0
     normals: int = 0
     huge: int = 0
@@ -88,7 +88,7 @@ class Counts:
     opacities: tuple[float, float] = _NOTHING  # as the file has them: least and largest
     scales: tuple[float, float] = _NOTHING
     colours: tuple[float, float] = _NOTHING
-    colour_range: float = 0.0  # as of `Columns`
+    colour_range: float = 0.0  # as in `Columns`
 
 
 def gather(
@@ -106,11 +106,11 @@ def gather(
     Args:
         blocks: the rows in order, `count` in all.
         count: N.
-        dtype: of the blocks.
-        columns: which column is what.
+        dtype: dtype of the blocks.
+        columns: meaning of the columns.
         keep_extra: keep `columns.extra` too.
-        counts: what is noticed and repaired is added to it.
-        thinnest: the smallest scale of all discs, where these are not all of them.
+        counts: updated with what is noticed and repaired.
+        thinnest: the smallest scale of all discs, if these are not all of them.
 
     Returns:
         Arrays of the splats that were kept.
@@ -119,7 +119,7 @@ def gather(
     counts = Counts() if counts is None else counts
     counts.colour_range = columns.colour_range
     at = 0
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is found below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow of float32 is found below
         for rows in blocks:
             part = _part(out, slice(at, at + len(rows)))
             _copy(rows, columns, part)
@@ -139,8 +139,8 @@ def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
     are: integers in place of floats are refused by `csplat.lint`.
 
     Args:
-        rows: of the file.
-        findings: that they are half floats is appended.
+        rows: rows of the file.
+        findings: a finding is appended if they are half floats.
     """
     dtype = rows.dtype
     floats = float_columns(dtype.names or ())
@@ -266,12 +266,12 @@ def _nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
 
 
 def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) -> int:
-    """Repair a block in place; its first rows are those that are kept. Returns how many.
+    """Repair a block in place, moving the rows that are kept to the front. Return how many are kept.
 
     Args:
         part: the block, as the file has it.
-        columns: which column is what.
-        counts: what is noticed is added to it.
+        columns: meaning of the columns.
+        counts: updated with what is noticed.
         widths: [n] standard deviations of the 3D filter, scene units; `None`: there is none.
     """
     scale_count = len(columns.scales)
@@ -361,7 +361,7 @@ def _repair_quats(quats: F32, counts: Counts) -> None:
 
 
 def findings_of(counts: Counts, count: int) -> list[Finding]:
-    """What was noticed in so many rows."""
+    """Return the findings about what was noticed in `count` rows."""
     nonfinite = f"{counted(counts.nonfinite, 'splat')} with NaN or infinity"
     findings = [
         Finding("nonfinite-rows", counts.nonfinite, f"{nonfinite}: dropped", "repair")
@@ -411,7 +411,7 @@ def findings_of(counts: Counts, count: int) -> list[Finding]:
 
 
 def _suspicions(counts: Counts, kept: int) -> list[Finding]:
-    """Say what holds for all splats, and for those of no trained scene: values after their activation."""
+    """Report properties that all splats share but no trained scene has: values after their activation."""
     found = []
     colours = counts.colours
     if counts.colour_range == 1.0 and kept and colours[1] > _LARGEST_COLOUR:

@@ -1,4 +1,4 @@
-"""What a scene is beyond its columns, as comment lines of a PLY header."""
+"""Scene metadata beyond the columns, as comment lines of a PLY header."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
-#: ns-export of nerfstudio says which axis points up; Brush writes the same of every scene, whatever is up in it.
+#: ns-export of nerfstudio names the axis that points up; Brush writes the same for every scene, whatever is up in it.
 _VERTICAL_AXIS = re.compile(r"vertical axis:\s*([+-]?)([xyz])", re.IGNORECASE)
 _SAYS_NOTHING = "exported from brush"
-#: How Brush and splat-transform say `antialiased` (mip) and `flat` (2dgs), and Postshot the former, in lower case.
+#: Words of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs). Postshot has the former, in lower case.
 _MODES: dict[tuple[str, ...], str] = {
     ("splatrendermode:", "default"): "",
     ("splatrendermode:", "mip"): "antialiased",
@@ -34,14 +34,14 @@ _MODES: dict[tuple[str, ...], str] = {
 
 @dataclass
 class SceneFacts:
-    """What comments say about a scene; defaults where they say nothing.
+    """Scene metadata from comments; defaults for what they leave out.
 
     Attributes:
-        origin: `None` where no comment names one.
+        origin: `None` if no comment names one.
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
         metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`; `view`.
-        findings: what was understood of the words of other programs.
+        findings: what was understood from the comments of other programs.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -54,7 +54,7 @@ class SceneFacts:
     findings: list[Finding] = field(default_factory=list)
 
     def fields(self) -> dict[str, Any]:
-        """What a `SplatModel` takes of it as it is: all but the origin."""
+        """Return the fields that a `SplatModel` takes unchanged: all but the origin."""
         names = ("coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
         return {name: getattr(self, name) for name in names}
 
@@ -91,7 +91,7 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
 
 
 def _set_vertical_axis(facts: SceneFacts, comments: Sequence[str]) -> Sequence[str]:
-    """Take over which axis is up, where nothing else says it; return the comments that say nothing more."""
+    """Take the up axis from a comment if nothing else names it; return the comments that carry other information."""
     if not comments:
         return ()
     directions = set()
@@ -189,7 +189,7 @@ def _training(comment: str) -> TrainedOn:
 
 
 def _view(comment: str) -> dict[str, Any]:
-    """A camera, which only those look into who show the scene."""
+    """Parse a camera, which only viewers of the scene use."""
     said = _json(comment)
     if not isinstance(said, dict) or not _is_json(said):
         raise _misunderstood(comment, "wanted an object of finite numbers")
@@ -205,7 +205,7 @@ def _is_json(said: object) -> bool:
 
 
 def _json(comment: str) -> object:
-    """What follows two words, which may hold spaces that count."""
+    """Parse the JSON after the first two words, in which spaces count."""
     try:
         return json.loads("".join(comment.split(None, 2)[2:]))
     except RecursionError:

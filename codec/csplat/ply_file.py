@@ -23,22 +23,22 @@ from csplat.ply_text import regular_rows
 
 __all__ = ["Content", "blocks_of", "parse"]
 
-_FRAME = "delta_vertex_"  # of Brush: what later moments add to the first
-#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and what its programs read alone.
+_FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
+#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
-_EARLY_END = "early end-of-file"  # of plyfile
+_EARLY_END = "early end-of-file"  # message of plyfile
 _SHOWN = 40  # characters of a word in a message
 
 
 class Content(NamedTuple):
-    """What a PLY of splats holds.
+    """Contents of a PLY of splats.
 
     Attributes:
         rows: scalar columns of the splats.
         comments: lines of the header.
-        elements: names of the other elements, of which nothing is kept.
+        elements: names of the other elements, which are all dropped.
     """
 
     rows: Rows
@@ -50,8 +50,8 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
     """Let plyfile parse a file.
 
     Args:
-        path: of the file.
-        findings: what is noticed is appended.
+        path: path of the file.
+        findings: anything noticed is appended.
 
     Returns:
         Its content; `None` where the findings hold an error.
@@ -92,13 +92,13 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
 
 
 def _read_again(path: Path, header: Header, findings: list[Finding], error: Any) -> Any:
-    """Read a file that plyfile could not read as it is; `None`: it is refused, and the findings say why.
+    """Read a file that plyfile could not read as it is; `None`: it is refused, and the findings give the reason.
 
     Args:
-        path: of the file.
-        header: of it.
-        findings: what is noticed is appended.
-        error: what plyfile said.
+        path: path of the file.
+        header: its header.
+        findings: anything noticed is appended.
+        error: the error that plyfile raised.
     """
     if not header.is_text or error.message == _EARLY_END:
         present, declared = error.row or 0, error.element.count
@@ -120,7 +120,7 @@ def _read_again(path: Path, header: Header, findings: list[Finding], error: Any)
 
 
 def _row_finding(error: Any, rows: list[list[str]], header: Header) -> Finding:
-    """Say which value of a row of text is wrong."""
+    """Report which value of a row of text is wrong."""
     name, row, said = error.element.name, error.row or 0, error.message
     at = [element.name for element in header.elements].index(name)
     element, before = header.elements[at], sum(one.count for one in header.elements[:at])
@@ -133,7 +133,7 @@ def _row_finding(error: Any, rows: list[list[str]], header: Header) -> Finding:
 
 
 def _other_findings(others: list[Any]) -> list[Finding]:
-    """Say what becomes of elements that are no splats."""
+    """Report what becomes of elements that are no splats."""
     if not others:
         return []
     names = [element.name for element in others]
@@ -184,9 +184,9 @@ def blocks_of(path: Path, rows: Rows, most: int | None = None) -> Iterator[Rows]
     """Rows in blocks. Those of a memory map are read instead: aligned, and not resident twice.
 
     Args:
-        path: of the file.
+        path: path of the file.
         rows: as `parse` gives them.
-        most: rows of a block; `None`: as many as stay in the cache.
+        most: rows of a block; `None`: the number that stays in the cache.
     """
     step = most or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
     if not isinstance(rows, np.memmap):

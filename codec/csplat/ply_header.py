@@ -21,10 +21,10 @@ ELEMENT = "vertex"
 
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
 _MAX_SIZE = 1 << 20
-_MARK = b"\xef\xbb\xbf"  # of UTF-8
-_WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # of UTF-16
+_MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
+_WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
-_FREE_TEXT = (b"comment", b"obj_info")  # keywords that what follows belongs to, spaces and all
+_FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text, spaces included
 
 
 @dataclass
@@ -32,8 +32,8 @@ class Element:
     """An element as a header declares it.
 
     Attributes:
-        name: of it.
-        count: rows; 0 where the header has no number.
+        name: name of the element.
+        count: number of rows; 0 if the header has no number.
         properties: names of the properties.
         has_lists: one of the properties is a list.
     """
@@ -50,9 +50,9 @@ class Header:
 
     Attributes:
         start: bytes of the file before it.
-        text: as long as it is in the file, up to and including the line `end_header`; ASCII.
+        text: the header up to and including the line `end_header`, with the same length as in the file; ASCII.
         is_text: the rows are numbers in ASCII.
-        elements: what it declares.
+        elements: elements that it declares.
     """
 
     start: int
@@ -62,7 +62,7 @@ class Header:
 
     @property
     def end(self) -> int:
-        """Where the rows begin in the file."""
+        """Offset in the file where the rows begin."""
         return self.start + len(self.text)
 
 
@@ -70,8 +70,8 @@ def read_header(path: Path, findings: list[Finding]) -> Header:
     """Read the header of a PLY.
 
     Args:
-        path: of the file.
-        findings: what is noticed is appended.
+        path: path of the file.
+        findings: anything noticed is appended.
 
     Raises:
         InputError: not a PLY of columns, or one without an end of its header.
@@ -108,7 +108,7 @@ def read_header(path: Path, findings: list[Finding]) -> Header:
 
 
 def _as_plyfile_takes_it(raw: bytes) -> tuple[bytes, list[str]]:
-    """Rewrite a header in the same number of bytes, and say what was unusual; as it is where nothing was."""
+    """Rewrite a header in the same number of bytes, and list what was unusual; return it unchanged if nothing was."""
     first_end = _LINE_END.search(raw)
     assert first_end is not None, "there is a line end_header"
     end = first_end[0]

@@ -1,4 +1,4 @@
-"""Where a PLY's positions are measured from."""
+"""The origin that a PLY's positions are measured from."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def relative_to_origin(means: NDArray[Any], facts: SceneFacts) -> tuple[F32, tup
 
     Args:
         means: [N, 3] x, y, z as the file has them, float32 or float64.
-        facts: what the comments of the file say about an origin.
+        facts: metadata from the comments of the file, with their origin.
 
     Returns:
         [N, 3] float32 and three float64, in scene units; and the positions in doubles, where float32 does not hold

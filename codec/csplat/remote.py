@@ -18,9 +18,9 @@ from csplat.stores import Disk, Memory, Store
 __all__ = ["is_url", "store_of"]
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
-#: File systems of servers that may send all of a file where a part is asked for.
+#: File systems of servers that may send all of a file when a part is requested.
 _WEB = {"http", "https"}
-#: What stores say of a version of a file, under the names that fsspec's file systems have for it.
+#: Fields that identify a version of a file, under the names that fsspec's file systems use.
 _VERSION = (
     "size", "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "created", "VersionId",
     "generation",
@@ -29,7 +29,7 @@ _STATUS = {401: errno.EACCES, 403: errno.EACCES, 404: errno.ENOENT, 410: errno.E
 
 
 def is_url(file: object) -> bool:
-    """Whether a file is named by a URL, `s3://bucket/scene.csplat`, and not by a path."""
+    """Return True if a file is named by a URL, `s3://bucket/scene.csplat`, and not by a path."""
     return isinstance(file, str) and _URL.match(file) is not None
 
 
@@ -76,12 +76,12 @@ class _Remote(Store):
         while not self._proved and len(parts) < len(ranges):
             parts.append(self._careful(*ranges[len(parts)]))
         rest = ranges[len(parts) :]
-        # Of file systems without coroutines, files are opened, which would read more than is asked for.
+        # File systems without coroutines open files, which would read more than is requested.
         how = {} if self._fs.async_impl else {"cache_type": "none"}
         starts, stops = [start for start, _ in rest], [stop for _, stop in rest]
         try:
             found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **how)
-        except Exception as error:  # noqa: BLE001  # what a store raises is whatever its library raises
+        except Exception as error:  # noqa: BLE001  # stores raise whatever their libraries raise
             raise self._failure(error) from None
         for one in found:
             if isinstance(one, BaseException):
@@ -115,11 +115,11 @@ class _Remote(Store):
         return any(self._info.get(name) != now.get(name) for name in _VERSION)
 
     def _failure(self, error: BaseException) -> Exception:
-        """What is raised for what fsspec raises."""
+        """Return the exception to raise for one that fsspec raised."""
         if isinstance(error, ModuleNotFoundError):
             return missing(error, extra="remote")
         if self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None:
-            error = error.__cause__  # whatever went wrong, "not found" is what comes of it
+            error = error.__cause__  # fsspec raises "not found" for any failure; this is its cause
         status = getattr(error, "status", 0)
         number = _STATUS.get(status, 0)
         if isinstance(error, FileNotFoundError):
@@ -127,7 +127,7 @@ class _Remote(Store):
         elif isinstance(error, PermissionError):
             number = errno.EACCES
         if number:
-            return OSError(number, os.strerror(number), self._shown)  # of the class that the number has
+            return OSError(number, os.strerror(number), self._shown)  # gives the subclass that belongs to the number
         said = f"HTTP status {status}" if status else str(error)  # aiohttp would add the address, secrets too
         return StoreError(f"{self._shown}: {' '.join(said.split()) or type(error).__name__}")
 

@@ -1,4 +1,4 @@
-"""Where a file lies, and parts of it."""
+"""Files in memory, on disk or at a URL, read in parts."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ __all__ = ["Disk", "Memory", "RequestSizes", "Store", "Window"]
 
 @dataclass(frozen=True)
 class RequestSizes:
-    """How a file is asked for.
+    """Sizes and number of requests for a file.
 
     Attributes:
         first: bytes of the first request: the index of a scene of some twenty million splats.
-        batch: bytes of tiles that are fetched together where tiles come one after the other.
-        gap: bytes between two parts that are read along: they take less time than a request of their own.
-        request: bytes of one request at most.
-        at_once: requests that are under way together.
+        batch: bytes of tiles that are fetched together if tiles are read one after the other.
+        gap: bytes between two parts that are read along with them: they take less time than a separate request.
+        request: bytes of one request, at most.
+        at_once: requests that run concurrently.
     """
 
     first: int = 1 << 16
@@ -41,9 +41,9 @@ class Store:
     """A file that is read in parts.
 
     Attributes:
-        name: what it is called in messages; of a URL without passwords and signatures; empty where it has none.
-        size: its bytes.
-        requests: how often the store was asked, for its size too.
+        name: name in messages; for a URL, without passwords and signatures; empty if it has none.
+        size: size of the file in bytes.
+        requests: number of requests to the store, including those for its size.
         bytes_read: bytes that it gave.
         sizes: how it is asked; may be replaced before the first request.
     """
@@ -77,11 +77,11 @@ class Store:
         return parts
 
     def changed(self) -> str:
-        """What is to be said where the file is another one than when it was opened; else nothing."""
+        """Return a message if the file is not the one that was opened; otherwise ""."""
         return f"{self.name} has changed while it was read: open it again" if self._is_other() else ""
 
     def _fault(self, said: str) -> StoreError:
-        """What is raised where something else came: that the file is another one explains it."""
+        """Return the error for unexpected data, which a changed file would explain."""
         try:
             return StoreError(self.changed() or said)
         except (StoreError, OSError):
@@ -89,7 +89,7 @@ class Store:
 
     @contextmanager
     def telling(self) -> Iterator[None]:
-        """Say in errors which file they are about, and whether the file is at fault, or is another one by now."""
+        """Name the file in errors, and report whether it is at fault or has changed since it was opened."""
         try:
             yield
         except CsplatError as error:
@@ -121,7 +121,7 @@ class Memory(Store):
 
 
 class Disk(Store):
-    """A file of this machine. It is not mapped: whoever cuts it short while it is read must not end the program."""
+    """A file on this machine. It is not mapped: a process that truncates it during a read must not end the program."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
@@ -160,7 +160,7 @@ class Window:
             self._pages = Pages(store.size) if store.size else None
         except (OSError, OverflowError):
             raise LimitError("address space of this machine", store.size) from None
-        # Of an array, so that nobody takes it for a mapped file, which can be read again once it is let go of.
+        # An array's memory is not taken for a mapped file, whose pages can be released and read again.
         self.view = np.frombuffer(self._pages.buffer if self._pages else bytearray(), np.uint8).data
         self.view[: len(head)] = head
 
@@ -208,7 +208,7 @@ def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, 
 
 
 def _missing(ranges: Iterable[tuple[int, int]], held: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """What of ranges is in none of others, which are in order."""
+    """Yield the parts of `ranges` that are in none of `held`, which is sorted."""
     for start, stop in ranges:
         for first, end in held:
             if start < end and first < stop:

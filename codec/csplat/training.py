@@ -1,4 +1,4 @@
-"""What a scene was trained on, as far as later pictures of it depend on that (spec 5.4).
+"""Record of a scene's training, as far as later renders of it depend on that (spec 5.4).
 
 Its training may leave one of its cameras, too, under `VIEW`: from there a viewer shows the scene first.
 """
@@ -14,7 +14,7 @@ from csplat.errors import InputError
 
 __all__ = ["TRAINING", "VIEW", "TrainedOn"]
 
-#: The keys of the metadata under which they stand.
+#: Keys of the metadata for the training and the first view.
 TRAINING = "training"
 VIEW = "view"
 
@@ -24,14 +24,14 @@ _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """What whoever compares a scene with its photographs has to do as its training did.
+    """Settings of the training that a comparison of the scene with its photographs has to repeat.
 
     Attributes:
         background: red, green, blue behind the splats, 0..1.
-        test_every: every so-manieth photograph was held out, 0 for none; `None`: the set names those itself.
+        test_every: every Nth photograph was held out, 0 for none; `None`: the data set names them itself.
         size: width and height that the photographs were scaled to, pixels; `None`: they were not.
         near: near plane of the cameras, scene units; `None`: not known.
-        images: COLMAP sets: the folder of pictures; `None`: the reader chose.
+        images: for COLMAP sets, the folder of images; `None`: the reader chose.
     """
 
     background: tuple[float, float, float]
@@ -42,7 +42,7 @@ class TrainedOn:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> TrainedOn | None:
-        """What a scene's metadata says; `None` where it says nothing, or nothing that can be understood."""
+        """Return the record in a scene's metadata; `None` if it has none, or none that can be understood."""
         try:
             return cls.from_json(metadata[TRAINING]) if TRAINING in metadata else None
         except InputError:
@@ -68,7 +68,7 @@ class TrainedOn:
         return cls((red, green, blue), every, None if size is None else (size[0], size[1]), near, images)
 
     def as_json(self) -> dict[str, Any]:
-        """What goes into the metadata, without what is not known."""
+        """Return the JSON for the metadata, without unknown values."""
         said: dict[str, Any] = {"background": list(self.background)}
         for name in ("test_every", "near", "images"):
             if getattr(self, name) is not None:

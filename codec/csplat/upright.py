@@ -1,7 +1,7 @@
-"""Which way is up in a scene, and how it says so (spec 5.4).
+"""The up direction of a scene, and how the scene states it (spec 5.4).
 
-The axes of a scene say where +x, +y and +z point; they can say up only along one of these. The member `up` of the
-metadata names any direction, and comes before them.
+The axes of a scene specify where +x, +y and +z point; they can name up only along one of these. The member `up` of the
+metadata names any direction, and takes precedence over them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["UP", "Direction", "unit_up", "up_of", "up_of_axes", "with_up"]
 
 Direction = tuple[float, float, float]
 
-#: The key of the metadata under which it stands.
+#: The key of the metadata for the up direction.
 UP = "up"
 
 _DIGITS = 6  # a millionth of a radian: the same text on machines whose last bits differ
@@ -27,10 +27,10 @@ _CONTRADICTS = math.cos(math.radians(45.0))  # beyond that angle another letter 
 
 
 def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> Direction | None:
-    """The direction that is up by what a scene says; `None` where it says nothing, or nothing that is understood.
+    """Return the direction that is up according to a scene; `None` if it has none, or none that is understood.
 
     Args:
-        metadata: of the scene; its `up` comes first.
+        metadata: metadata of the scene; its `up` comes first.
         coordinate_system: as in `SplatModel`.
     """
     try:
@@ -62,7 +62,7 @@ def unit_up(values: object) -> Direction:
         if largest > 0.0:
             parts = [value / largest for value in numbers]  # squares of large ones are infinite
             length = math.hypot(*parts)
-            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # what it said stays as it is
+            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # the stored value stays as it is
             x, y, z = (round(part / length, _DIGITS) + 0.0 for part in parts)
             return x, y, z
     raise InputError(f"{UP} is {values!r}, wanted three finite numbers, not all 0")
