@@ -1,4 +1,4 @@
-"""What goes into the renderer and what comes out: splats, pictures, gradients."""
+"""Inputs and outputs of the renderer: splats, renders, gradients."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 
 class HasSplats(Protocol):
-    """What can be rendered: a `SplatModel`, a `Splats`, or anything with these arrays."""
+    """Anything that can be rendered: a `SplatModel`, a `Splats`, or any object with these arrays."""
 
     @property
     def means(self) -> Array: ...  # noqa: D102 - as in Splats
@@ -76,12 +76,12 @@ class RenderResult:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Which splats a picture shows.
+    """Splats that a render shows.
 
     Attributes:
-        near: [N] float32, depths, by which splats are sorted; 0 for what is not drawn.
-        tiles: [N] integers, how many tiles of the picture each may touch; 0 likewise.
-        ignored: how many splats hold NaN or infinity.
+        near: [N] float32, depths, by which splats are sorted; 0 for splats that are not drawn.
+        tiles: [N] integers, number of the render's tiles that each may touch; 0 likewise.
+        ignored: number of splats that hold NaN or infinity.
     """
 
     near: Array

@@ -106,7 +106,7 @@ def _span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> 
     high = min(tile_y * TILE + TILE, box[j, 3]) - 0.5 - py
     widest = extent[j, 3]
     slope, half, flat = extent[j, 0], extent[j, 1], extent[j, 2]
-    # Where the ellipse is widest within this row of tiles: to the right, to the left.
+    # The heights within this row of tiles where the ellipse reaches farthest: to the right, to the left.
     dy = low if widest < low else (high if widest > high else widest)
     t = 1.0 - (dy * flat) * (dy * flat)
     right = dy * slope + half * math.sqrt(t if t > 0.0 else 0.0)
@@ -255,7 +255,7 @@ def fill_tiles(
 
 @kernel
 def record_offsets(depth: Any, touched: Any, offsets: Any) -> None:
-    """Where the gradient records of each splat begin: the prefix sum of the tiles that each touches."""
+    """Write the index of each splat's first gradient record: the prefix sum of the tiles that each touches."""
     total = 0
     for i in range(len(depth)):
         offsets[i] = total

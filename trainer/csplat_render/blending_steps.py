@@ -1,4 +1,4 @@
-"""What all loops over the pixels of a tile share: a batch of its splats, alpha at a pixel, and the way through it.
+"""Steps of all loops over the pixels of a tile: a batch of its splats, alpha at a pixel, and the order of pixels.
 
 A splat's exponent is rewritten for each tile, in float64, as one polynomial of x for each row: so float32
 is enough for the pixels, however far away the centre of the splat lies. That is done for a batch
@@ -48,8 +48,8 @@ HALF = 0.5 * TILE
 _LOG2E = math.log2(math.e)
 _CACHE_LINE = 64  # bytes
 
-# Where a splat has alpha >= 1/255 the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
-# pixel, and changes by at most 1/0.3 per pixel: a tile whose centre says more than this sees nothing.
+# If a splat has alpha >= 1/255, the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
+# pixel, and changes by at most 1/0.3 per pixel: a tile whose centre has more than this shows nothing.
 _STEEPEST = 1e3
 _DEEPEST = -1e4
 
@@ -178,7 +178,7 @@ def gather(
     batch: Any,
     rows: Any,
 ) -> None:
-    """Write what the loop over pixels wants to know of some splats in a tile.
+    """Write the numbers of some splats in a tile that the loop over pixels needs.
 
     Args:
         ids: see `blend`, as shape and box.
@@ -236,7 +236,7 @@ def narrow_rows(count: int, batch: Any, rows: Any) -> None:
 
 @spliced
 def numbers_of(batch: Any, j: int, first: int) -> tuple[Any, ...]:
-    """What a batch holds of a splat: both coefficients by row, from row `first` on; the others, see `gather`."""
+    """Return a splat's numbers in a batch: both coefficients by row, from row `first` on; the others as in `gather`."""
     splat = batch[j]
     row0, row1 = splat[ROW0 + first :], splat[ROW1 + first :]
     return row0, row1, splat[THEN], splat[THEN + 1], splat[THEN + 2], splat[THEN + 3], splat[THEN + 4], splat[THEN + 5]
@@ -248,12 +248,12 @@ def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap
 
     Args:
         x: position in the row.
-        c0: of the exponent of 2 in this row, as the next two: constant.
-        c1: linear.
-        a: quadratic.
+        c0: constant coefficient of the exponent of 2 in this row.
+        c1: linear coefficient.
+        a: quadratic coefficient.
         o: opacity.
-        alpha_min: what is less is 0.
-        alpha_cap: and what is more is this.
+        alpha_min: smaller values become 0.
+        alpha_cap: larger values become this.
         zero: 0, of the dtype of the pixels.
     """
     full = o * fast_exp2(min((a * x + c1) * x + c0, zero))

@@ -16,18 +16,18 @@ __all__ = ["DEFAULT_NEAR", "MAX_IMAGE_SIZE", "Camera", "check_last_row"]
 
 F64 = NDArray[np.float64]
 
-#: Distance of the near plane in scene units where a camera does not say otherwise.
+#: Distance of the near plane in scene units, if a camera does not specify it.
 DEFAULT_NEAR = 0.2
 
 #: Largest width and height of a picture, in pixels.
 MAX_IMAGE_SIZE = 1 << 15
 
-_ROTATION_TOLERANCE = 1e-3  # of the entries of R Rᵀ − 1; camera files hold few digits
+_ROTATION_TOLERANCE = 1e-3  # in the entries of R Rᵀ − 1; camera files hold few digits
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera: where it stands, how it looks, how large its picture is.
+    """A pinhole camera: its pose, its intrinsics, and the size of its image.
 
     A point p of the world has camera coordinates c = viewmat · p (x to the right, y down, z
     forward) and falls on the picture at K · c / c_z, in pixels; the centre of the first pixel lies
@@ -65,7 +65,7 @@ class Camera:
 
     @property
     def position(self) -> F64:
-        """Where the camera stands, in world coordinates, [3]."""
+        """Position of the camera in world coordinates, [3]."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), np.float64)
 
     def to_json(self) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class Camera:
             entry: K, viewmat, W, H and, where they are not the defaults, near and image.
 
         Raises:
-            InputError: a key is missing or a value is not what `Camera` wants.
+            InputError: a key is missing or a value is not valid for `Camera`.
         """
         if not isinstance(entry, Mapping):
             raise InputError(f"a camera is a {type(entry).__name__}, wanted an object with K, viewmat, W and H")
@@ -106,7 +106,7 @@ def check_last_row(pose: F64, name: str) -> None:
 
     Args:
         pose: [4, 4].
-        name: of the field, and where it stands.
+        name: name of the field and its place in the file.
 
     Raises:
         InputError: its last row is not 0 0 0 1.

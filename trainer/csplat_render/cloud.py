@@ -1,7 +1,7 @@
 """A scene as a cloud of surface points: where it lies, how large it is, how much of a picture it fills.
 
 Choosing cameras needs hundreds of rough pictures, not exact ones. Splats are replaced by points
-drawn from their Gaussians; each point stands for a share of its splat's optical depth times the area
+drawn from their Gaussians; each point represents a share of its splat's optical depth times the area
 that the splat shows on average. Binned into the cells of a coarse picture the points tell, within a
 few per cent, how much is covered and what hides what.
 
@@ -41,11 +41,11 @@ _MAX_LOG_SCALE = 60.0  # beyond, squares of squares overflow
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points that stand for a scene's surface.
+    """Points that represent a scene's surface.
 
     Attributes:
         points: [P, 3] float64, drawn from the splats' Gaussians, relative to the model's origin.
-        masses: [P] float64, optical depth × area that a point stands for, square scene units.
+        masses: [P] float64, optical depth × area that a point represents, square scene units.
         sizes: [P] float64, square root of the area of the splat it was drawn from, scene units.
     """
 
@@ -81,8 +81,8 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
     Args:
         model: the scene, at least one splat.
         count: how many points.
-        rng: where the random numbers come from.
-        every: how many splats of the scene each of the model's stands for.
+        rng: source of random numbers.
+        every: number of the scene's splats that each of the model's represents.
 
     Returns:
         `count` points. Splats are drawn in proportion to the square root of their mass, so that few
@@ -108,12 +108,12 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
 
 
 def cover(cloud: Cloud, camera: Camera, cell: int = 10) -> float:
-    """How much of a picture the scene covers, 0 to 1.
+    """Return the fraction of an image that the scene covers, 0 to 1.
 
     Args:
         cloud: the scene.
         camera: the camera.
-        cell: side of the coarse picture's cells, pixels.
+        cell: side of the coarse image's cells, pixels.
     """
     cells, _, depths, _ = _project(cloud, camera, cell)
     sums = np.bincount(cells, depths, _cell_count(camera, cell))
@@ -121,15 +121,15 @@ def cover(cloud: Cloud, camera: Camera, cell: int = 10) -> float:
 
 
 def detail(cloud: Cloud, camera: Camera, nearest: float, cell: int = 20, fine: float = 4.0) -> float:
-    """How much of a picture shows fine splats with nothing before them, 0 to 1.
+    """Return the fraction of an image that shows fine splats with nothing before them, 0 to 1.
 
     Views that no photograph was taken from show large, smeared splats, or a wall from behind.
 
     Args:
         cloud: the scene.
         camera: the camera.
-        nearest: what lies nearer than this hides without showing detail; scene units.
-        cell: side of the coarse picture's cells, pixels.
+        nearest: distance below which splats hide others without showing detail; scene units.
+        cell: side of the coarse image's cells, pixels.
         fine: splats of this size and less count fully, larger ones in proportion; pixels.
     """
     cells, z, depths, sizes = _project(cloud, camera, cell)
@@ -158,12 +158,12 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
     Args:
         values: [N], at least one.
         weights: [N], not negative, not all 0.
-        at: which quantiles, 0 to 1.
+        at: positions of the quantiles, 0 to 1.
 
     Returns:
         One value for each of `at`.
     """
-    values, weights = values[weights > 0.0], weights[weights > 0.0]  # the others have no say between neighbours
+    values, weights = values[weights > 0.0], weights[weights > 0.0]  # weight 0 must not affect neighbours
     order = np.argsort(values, kind="stable")
     sums = np.cumsum(weights[order])
     result: F64 = np.interp(np.array(at) * sums[-1], sums, values[order])

@@ -1,7 +1,7 @@
-"""What each splat is to the pictures of a scene: sums over pixels per splat, without any matrix being built.
+"""Contribution of each splat to the renders of a scene: sums over pixels per splat, without building any matrix.
 
 A `DrawnView` is one view of fixed splats, projected and sorted into tiles, with nothing kept but the splats that it
-shows. Two questions are put to it: what the removal of each splat would change, and what pictures follow from other
+shows. It answers two questions: what the removal of each splat would change, and what renders follow from other
 colours, with the way back from pixels to colours.
 """
 
@@ -29,7 +29,7 @@ __all__ = ["Contributions"]
 # Colours are taken for no brighter: squares of their differences, summed over a tile, stay within float32.
 _BRIGHTEST = 1e15
 
-# Of an exponent, for rounding: far from the centre of a splat it is a small difference of large numbers, at most 1e4.
+# Allowance for rounding of an exponent: far from a splat's centre it is a small difference of large numbers, up to 1e4.
 _MARGIN = 0.05
 
 
@@ -57,7 +57,7 @@ class Contributions(Rasteriser):
             splats: the scene.
             camera: the view.
             antialiased: scale opacities by what the dilation added.
-            basis: whether spherical harmonics by splat are wanted for what is asked of the view.
+            basis: True if the view needs spherical harmonics by splat.
 
         Raises:
             LimitError: there are too many pairs of splat and tile.
@@ -99,7 +99,7 @@ class Contributions(Rasteriser):
             starts=starts.copy(),
             ids=np.take(place, self._buffers["ids"]),
             slots=self._buffers["slots"].copy(),
-            first=np.append(offsets[rows], offsets[-1]),  # what is not drawn has no records
+            first=np.append(offsets[rows], offsets[-1]),  # splats that are not drawn have no records
             width=width,
             height=height,
         )
@@ -114,7 +114,7 @@ class Contributions(Rasteriser):
         background: Array,
         reference: Array | None = None,
     ) -> Array:
-        """Add what one view says of every splat to the totals of a scene.
+        """Add one view's sums for every splat to the totals of a scene.
 
         Args:
             drawn: the view, its shape holding the splats' colours.
@@ -124,7 +124,7 @@ class Contributions(Rasteriser):
             bands: [N, d] float64, added to: squared change of the picture if its band 1, … d were zero; [N, 0] for
                 views without a basis.
             background: [3], behind everything.
-            reference: [H, W, 3], the picture that is wanted; None for this one.
+            reference: [H, W, 3], the image to compare with; None for this render.
 
         Returns:
             [H, W, 3], the picture.
@@ -155,7 +155,7 @@ class Contributions(Rasteriser):
             coefficients: [N, B, 3] float32.
             active: [V, 3] bool, which colours take part.
             gradient: [N, B, 3] float32, added to: sum over pixels of w · Y_k · (picture − reference).
-            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not wanted.
+            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not needed.
             offset: ½ for pictures of splats, 0 for differences of such pictures.
             background: [3].
             reference: [H, W, 3]; None for black.

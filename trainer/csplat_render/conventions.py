@@ -60,7 +60,7 @@ MODES: tuple[Mode, ...] = ("exact", "standard", "fast")
 
 @dataclass(frozen=True)
 class Settings:
-    """What a mode changes: what is too faint to draw, and when a pixel is finished."""
+    """Thresholds of a mode: the smallest alpha that is drawn, and the transmittance at which a pixel is finished."""
 
     alpha_min: float
     transmittance_min: float
@@ -85,7 +85,7 @@ def settings_of(mode: str) -> Settings:
 
 
 def view_vector(camera: Camera) -> NDArray[np.float64]:
-    """What the kernels want to know about a camera, in one row.
+    """Return the numbers of a camera that the kernels need, in one row.
 
     Returns:
         [24] float64: rotation (9, row by row), translation, fx, fy, cx, cy, near plane, smallest

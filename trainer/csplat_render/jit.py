@@ -81,7 +81,7 @@ def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 @dataclass(frozen=True, eq=False)
 class ParallelKernel(Generic[P]):
-    """A function that every thread calls once; its first two arguments, which callers leave out, say which it is.
+    """A function that every thread calls once; callers leave out its first two arguments, lane and number of lanes.
 
     Threads of Python run it, not numba's `prange`: that compiles a kernel four times over, as the function that was
     written, as two wrappers, and as part of their caller. A call costs 10 µs more, and compiling half as much.
@@ -94,12 +94,12 @@ class ParallelKernel(Generic[P]):
 
     @property
     def signatures(self) -> list[Any]:
-        """What it was compiled for."""
+        """Signatures that it was compiled for."""
         signatures: list[Any] = self.compiled.signatures
         return signatures
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
-        """Run it on as many threads as `thread_count` says, on one where arrays are small; returns when all have."""
+        """Run it on as many threads as `thread_count` sets, on one if arrays are small; return when all are done."""
         assert not named
         with LOCK:
             _threads.run(self.compiled, arguments)
@@ -109,7 +109,7 @@ class _Disjoint(compiler.Compiler):  # type: ignore[misc]  # numba's types are t
     """Compiles kernels whose arrays do not overlap: without that many a loop is not vectorised."""
 
     def define_pipelines(self) -> Any:
-        """What numba asks for; the flags are this one compilation's."""
+        """Return numba's pipelines for this compilation, with its noalias flag set."""
         self.state.flags.noalias = True
         return super().define_pipelines()
 
@@ -157,11 +157,11 @@ def on_compiling(call: Callable[[], object]) -> Iterator[None]:
 
 
 def is_cached(kernel: Any) -> bool:
-    """Whether numba holds a kernel compiled, from now or from another time."""
+    """Return True if numba holds the kernel compiled, in this process or in its cache."""
     compiled = getattr(kernel, "compiled", kernel)
     if compiled.signatures:
         return True
-    # What has no public name: the index of the cache, empty where the source is newer than it.
+    # There is no public name for it: the index of the cache, empty if the source is newer.
     load = getattr(getattr(compiled._cache, "_cache_file", None), "_load_index", None)  # noqa: SLF001
     return load is not None and bool(load())
 
@@ -210,13 +210,13 @@ def python(compiled: Callable[P, R]) -> Callable[P, R]:
 
 
 def available_threads() -> int:
-    """How many threads there are for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
+    """Return the number of threads for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
     return int(numba.config.NUMBA_NUM_THREADS)
 
 
 @contextmanager
 def thread_count(threads: int | None) -> Iterator[int]:
-    """Run kernels on so many threads, one caller at a time: a thread that waits inside for another one that calls a
+    """Run kernels on this many threads, one caller at a time: a thread that waits inside for another one that calls a
     kernel waits for ever.
 
     Args:
@@ -281,7 +281,7 @@ class _Helper:
 
 
 class _Threads:
-    """The threads that run kernels, beside the one that calls them. Owns them, and how many are wanted."""
+    """The threads that run kernels, in addition to the calling one. Owns them and the number of threads to use."""
 
     def __init__(self) -> None:
         self.wanted: int | None = None
@@ -324,7 +324,7 @@ class _Threads:
 
 
 def _bytes_of(arguments: tuple[Any, ...]) -> int:
-    """Of all arrays."""
+    """Return the size of all arrays together."""
     return sum(one.nbytes for one in arguments if isinstance(one, np.ndarray))
 
 

@@ -1,6 +1,6 @@
-"""`Judge`: the one way to say how good a scene looks, against a source's renders or against photographs.
+"""`Judge`: the only scorer of renders, against a source's renders or against photographs.
 
-Whoever judges holds views, and what each ought to look like. What PSNR means stands in `metrics`.
+A `Judge` holds views and the reference image of each. The definition of PSNR is in `metrics`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["Drawable", "Judge", "Look", "OnView", "renderer"]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-#: Is shown each view: its number, what is wanted and what is seen, [H, W, 3] in 0..1.
+#: Called for each view with its number, the reference image and the render, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 
 
@@ -34,7 +34,7 @@ class Drawable(Protocol):
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """What cameras are relative to."""
+        """The point that cameras are relative to."""
         ...
 
     def renderer(
@@ -46,13 +46,13 @@ class Drawable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a view ought to look like.
+    """The reference image of a view.
 
     Attributes:
         picture: [H, W, 3] floats.
-        covered: [H, W], which pixels show more than the background; `None`: not known.
+        covered: [H, W], True for pixels that show more than the background; `None`: not known.
         ignored: splats that it does not show because they hold NaN or infinities.
-        counts: [H, W], which pixels count; `None`: all of them.
+        counts: [H, W], True for pixels that count; `None`: all of them.
     """
 
     picture: F32
@@ -63,16 +63,16 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Views and what they ought to look like.
+    """Views and their reference images.
 
     Attributes:
         cameras: the views, at least one.
-        looks: what each is to look like, or what makes that when its turn comes.
+        looks: the reference image of each view, or a function that makes it on demand.
         background: red, green, blue behind everything.
-        mode: of the renderer.
-        threads: how many; `None` for all. No score depends on it.
-        origin: what the cameras are relative to; `None`: the origin of whatever is judged.
-        pixels: how many count in each view; `None`: all of them.
+        mode: mode of the renderer.
+        threads: number of threads; `None` for all. No score depends on it.
+        origin: point that the cameras are relative to; `None`: the origin of the scene that is scored.
+        pixels: number of pixels that count in each view; `None`: all of them.
 
     Raises:
         InputError: there is no view, or not one look for each.
@@ -104,14 +104,14 @@ class Judge:
         kept_bytes: int = 1 << 30,
         progress: Callable[[str, float], None] | None = None,
     ) -> Judge:
-        """Judge by what the source looks like.
+        """Score against renders of the source.
 
         Args:
             source: the scene that others are compared with.
-            cameras: where to stand, relative to the source's origin.
+            cameras: cameras of the views, relative to the source's origin.
             background, mode, threads: see above.
-            kept_bytes: of the source's renders; if they are more, they are made anew for each scene.
-            progress: is told how much of it is drawn.
+            kept_bytes: limit on the size of the source's renders; larger ones are rendered again for each scene.
+            progress: called with the fraction that is drawn.
         """
         draw = renderer(source, background, mode=mode, threads=threads)
         looks: list[Look | Callable[[], Look]] = [partial(_rendered, draw, camera) for camera in cameras]
@@ -126,7 +126,7 @@ class Judge:
         return cls(cameras, looks, background, mode, threads, source.origin)
 
     def look(self, number: int) -> Look:
-        """What a view ought to look like."""
+        """Return the reference image of a view."""
         look = self.looks[number]
         return look if isinstance(look, Look) else look()
 
@@ -156,7 +156,7 @@ class Judge:
     def score(
         self, number: int, seen: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
     ) -> metrics.ViewScore:
-        """Score what is seen in a view, [H, W, 3], whoever made it."""
+        """Score a render of a view, [H, W, 3], from any renderer."""
         look = self.look(number)
         image = self.cameras[number].image
         return metrics.score_view(
@@ -176,10 +176,10 @@ class Judge:
 
         Args:
             model: the scene. Its origin may be another one than that of the cameras.
-            ssim: whether to compute it; it takes about as long as rendering.
-            lpips: computes it, if wanted.
-            on_view: is shown the pictures.
-            progress: is told how much is done.
+            ssim: compute SSIM; it takes about as long as rendering.
+            lpips: the LPIPS distance, if it is needed.
+            on_view: called with the images of each view.
+            progress: called with the fraction done.
         """
         draw, each, ignored = self._renderer(model), [], 0
         for number, camera in enumerate(self.cameras):
@@ -208,17 +208,17 @@ class Judge:
 def renderer(
     model: SplatModel | Drawable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
-    """What draws a scene from camera after camera, and keeps its memory in between.
+    """Return a function that draws a scene from camera after camera, and keeps its memory in between.
 
     Args:
         model: the scene. The cameras are relative to its origin.
         background: red, green, blue behind everything.
         mode: `exact`, `standard` or `fast`.
-        threads: how many; `None` for all.
+        threads: number of threads; `None` for all.
     """
     if not isinstance(model, SplatModel):
         return model.renderer(background, mode=mode, threads=threads)
-    # numba takes a second to import: those who want the classes alone do not wait for it.
+    # numba takes a second to import: code that needs only the classes does not wait for it.
     from csplat_render.rasterise import Rasteriser
     from csplat_render.twin import render_exact
 

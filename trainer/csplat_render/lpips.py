@@ -50,7 +50,7 @@ _LAYERS = (
     ((3, 3, 384, 256), 1, 1, False),
     ((3, 3, 256, 256), 1, 1, False),
 )
-_TORCH_INDEX = (0, 3, 6, 8, 10)  # of AlexNet's convolutions among torchvision's `features`
+_TORCH_INDEX = (0, 3, 6, 8, 10)  # indices of AlexNet's convolutions among torchvision's `features`
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Lpips:
         kernels: [height, width, in, out] each, float32.
         biases: [out] each.
         heads: [out] each, the weights of the differences of a layer's channels.
-        source: where they came from.
+        source: origin of the weights, for messages.
     """
 
     kernels: tuple[F32, ...]
@@ -147,7 +147,7 @@ def _read(path: Path) -> Lpips:
     parts = [[file[name.format(i)] for i in count] for name in names]
     if any(array.dtype.kind != "f" for part in parts for array in part):
         file.refuse("its arrays hold no real numbers")
-    with np.errstate(over="ignore"):  # what is beyond float32 is refused as not finite
+    with np.errstate(over="ignore"):  # values beyond float32 are refused as not finite
         kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
     return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
@@ -201,7 +201,7 @@ def _heads_path() -> Path | None:
 
 
 def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
-    """What AlexNet sees after each of its five convolutions, [h, w, channels] each."""
+    """Return the features after each of AlexNet's five convolutions, [h, w, channels] each."""
     from csplat_render.convolving import convolve  # numba takes a second to import
 
     x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE

@@ -1,13 +1,13 @@
-"""How alike two pictures are: PSNR, SSIM, pooled over views.
+"""Similarity of two images: PSNR, SSIM, pooled over views.
 
-Conventions, which a number means nothing without:
+Conventions, without which a number means nothing:
 
-* Pictures are clipped to [0, 1] and compared in float64; the peak is 1.
+* Images are clipped to [0, 1] and compared in float64; the peak is 1.
 * `psnr` of several views is one PSNR of the squared error pooled over views, pixels and channels;
   `psnr_mean` is the mean of the views' PSNRs, which is what papers print. Both end at 99 dB.
 * Over *covered* pixels only counts where the reference's alpha is at least `COVERED_ALPHA`: a plain
-  background that both pictures share inflates the PSNR of an object, a white one no less than a
-  black one, by 3 dB where half of the picture is empty.
+  background that both images share inflates the PSNR of an object, a white one no less than a
+  black one, by 3 dB if half of the image is empty.
 * SSIM is INRIA's: a Gaussian window of 11×11, σ 1.5, zeros beyond the border, C1 = 0.01²,
   C2 = 0.03², mean over all pixels and channels. (Wang's original leaves the border out; scikit-image
   does so too.)
@@ -44,29 +44,29 @@ __all__ = [
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-#: Decibels that stand for "no difference".
+#: Decibels for images without any difference.
 PSNR_CAP = 99.0
 
 #: A pixel counts as covered from this alpha on.
 COVERED_ALPHA = 0.5
 
 
-#: A distance of two pictures, [H, W, 3] in 0..1: what was wanted and what is seen.
+#: A distance between two images, [H, W, 3] in 0..1: the reference and the render.
 Distance = Callable[[F32, F32], float]
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How alike two pictures of one view are.
+    """Similarity of two images of one view.
 
     Attributes:
         image: name of the camera's photograph, if it has one.
-        pixels: of the picture that count.
+        pixels: number of pixels that count.
         mse: mean squared error over these and channels.
         psnr: the same in dB.
-        covered_mse: over covered pixels only; `None` where cover is not known or 0.
-        cover: share of the pixels that are covered; `None` where not known.
-        ssim, lpips: `None` where they were not asked for.
+        covered_mse: over covered pixels only; `None` if cover is not known or 0.
+        cover: share of the pixels that are covered; `None` if not known.
+        ssim, lpips: `None` if they were not requested.
     """
 
     image: str | None
@@ -81,17 +81,17 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Scores:
-    """How alike two sets of pictures are.
+    """Similarity of two sets of images.
 
     Attributes:
         each: the views, one by one.
         psnr: dB, of the error pooled over all views.
         psnr_mean: dB, mean of the views'.
         psnr_worst: dB, the lowest of the views'.
-        worst_view: which one that was, from 0.
-        ssim, lpips: means of the views'; `None` where they were not asked for.
-        psnr_covered: dB, pooled over covered pixels only; `None` where cover is not known or 0.
-        cover: share of the pixels that are covered, over all views; `None` where not known.
+        worst_view: index of that view, from 0.
+        ssim, lpips: means of the views'; `None` if they were not requested.
+        psnr_covered: dB, pooled over covered pixels only; `None` if cover is not known or 0.
+        cover: share of the pixels that are covered, over all views; `None` if not known.
         ignored: splats of the scene that were not drawn because they hold NaN or infinities.
     """
 
@@ -135,7 +135,7 @@ class Scores:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """What is said of all views together, and how many they are, JSON-compatible."""
+        """Return the scores over all views, and the number of views, JSON-compatible."""
         names = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "psnr_covered", "cover")
         return {"views": len(self.each), **{name: getattr(self, name) for name in names}}
 
@@ -153,14 +153,14 @@ def score_view(
     """Score a picture.
 
     Args:
-        wanted: [H, W, 3], floating.
-        seen: [H, W, 3], floating.
-        covered: [H, W], which pixels of what is wanted are covered; `None`: not known.
-        counts: [H, W], which pixels count, at least one: SSIM and LPIPS take the others for wanted as they are
-            seen. `None`: all.
+        wanted: [H, W, 3], floating: the reference.
+        seen: [H, W, 3], floating: the render.
+        covered: [H, W], True for covered pixels of the reference; `None`: not known.
+        counts: [H, W], True for pixels that count, at least one: for the others, SSIM and LPIPS take the render
+            for the reference. `None`: all.
         image: name of the photograph.
-        with_ssim: whether to compute it; it takes about as long as rendering.
-        lpips: computes it, if wanted.
+        with_ssim: compute SSIM; it takes about as long as rendering.
+        lpips: the LPIPS distance, if it is needed.
 
     Raises:
         InputError: the pictures cannot be compared.

@@ -1,11 +1,11 @@
 """Paths of a camera for a film, closed, so that a film that repeats does not jump.
 
 An *object* is circled about the direction that is up, or seems to be (`standing`), from as far away as shows all of it.
-Inside *surroundings* a circle would lead through walls. Where cameras are known, a path leads along them and looks as
-they do; where the scene says from where it is shown first, it sways around that place; else it is the longest arc, of
-several distances and heights, from which fine splats are to be seen, there and back.
+Inside *surroundings* a circle would lead through walls. If cameras are known, a path leads along them and looks as
+they do; if the scene specifies its first view, the path sways around that; else it is the longest arc, of several
+distances and heights, from which fine splats are visible, there and back.
 
-These cameras judge nothing: `virtual.virtual_cameras` are those of `psnr`.
+These cameras are not used for scoring: `virtual.virtual_cameras` are those of `psnr`.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ __all__ = ["orbit_cameras"]
 B = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 
-ELEVATION = 20.0  # degrees above the horizon, of an object
-_MARGIN = 0.08  # of half a picture, around an object
+ELEVATION = 20.0  # degrees above the horizon, for objects
+_MARGIN = 0.08  # fraction of half an image, left free around an object
 _POINTS = 16_000
-_SHOWN = 0.999  # of the points of an object lie inside of each picture: the rest is haze
-_CELL = 0.1  # extents; what has a gap of a cell and more around it is another part
+_SHOWN = 0.999  # fraction of an object's points that lie inside each image: the rest is haze
+_CELL = 0.1  # extents; a part is separated from others by a gap of at least a cell
 _CELLS = 36  # each way from the centre
-_PART = 0.02  # of the surface: parts that have less are floaters
-_BODY = 0.5  # of the surface: what has no parts that hold so much is all shown
+_PART = 0.02  # fraction of the surface: smaller parts are floaters
+_BODY = 0.5  # fraction of the surface: if no parts hold this much, the whole scene is shown
 _TURNS = 24  # directions that are tried
-_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # of what is looked at, of an object's height above its middle
+_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # look-at points that are tried above an object's middle, per its height
 
 _ARC_POINTS = 12_000
 _ARC_ELEVATIONS = (5.0, 20.0, 40.0)
 _ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
-_GOOD = 0.85  # of the detail of the best view: below, an arc had better end
+_GOOD = 0.85  # fraction of the best view's detail below which an arc ends
 _ARC_MIN = 10.0  # degrees each way
 
 _SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees each way, around a view that is known
-_FLATTENED = 0.3  # of a swing: so far it goes up and down
-_NEAREST_MIDDLE = 0.3  # extents: what is looked at is no nearer to a view
+_FLATTENED = 0.3  # vertical part of a swing, as a fraction of it
+_NEAREST_MIDDLE = 0.3  # extents; the look-at point is no nearer to a view
 
-_REACH = 0.35  # of the longer half-axis of the ellipse: how far cameras have a say about a place of the path
-_EASE = 0.04  # of the path: over so much of it directions are smoothed
+_REACH = 0.35  # fraction of the ellipse's longer half-axis: how far cameras influence the path
+_EASE = 0.04  # fraction of the path over which directions are smoothed
 
 
 def orbit_cameras(
@@ -140,7 +140,7 @@ def _touching(first: int, filled: B) -> B:
 
 
 def _whole(body: F64, frame: Frame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
-    """What to look at, and from how far away, so that an object is inside of all pictures around it."""
+    """Return a point to look at and a distance, so that an object is inside all images around it."""
     up = frame.up
     first, second = direction(up, 0.0, 0.0), direction(up, 90.0, 0.0)
     sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
@@ -167,7 +167,7 @@ def _whole(body: F64, frame: Frame, elevation: float, K: F64, width: int, height
 
 
 def _first_view(model: SplatModel) -> Camera | None:
-    """From where a scene is shown first, if it says so in a way that is understood."""
+    """Return the camera that a scene is shown from first; `None` if it specifies none that is understood."""
     try:
         return Camera.from_json(model.metadata[VIEW]) if VIEW in model.metadata else None
     except InputError:
@@ -234,7 +234,7 @@ def _towards(
 
 
 def _beside(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
-    """A path beside cameras that were given.
+    """Return a path next to the given cameras.
 
     Its plan is the ellipse that lies as the cameras do. Each of its places moves to the mean of the cameras around it,
     and looks where they look on the mean.
@@ -252,7 +252,7 @@ def _beside(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -
     flat = positions - middle
     flat = flat - _along(flat, above)[:, None] * above
     values, axes = np.linalg.eigh(np.mean(flat[:, :, None] * flat[:, None, :], axis=0))
-    halves = np.sqrt(2.0 * np.maximum(values[1:], 0.0))  # of the points on an ellipse these are its half-axes
+    halves = np.sqrt(2.0 * np.maximum(values[1:], 0.0))  # for points on an ellipse, these are its half-axes
     angles = 2.0 * np.pi * np.arange(count) / count
     plan = np.cos(angles)[:, None] * halves[1] * axes[:, 2] + np.sin(angles)[:, None] * halves[0] * axes[:, 1]
     gaps = np.sum((plan[:, None, :] - flat[None, :, :]) ** 2, axis=2)
@@ -278,6 +278,6 @@ def _smooth(rows: F64) -> F64:
 
 
 def _along(rows: F64, axis: F64) -> F64:
-    """How far rows [N, 3] lie along an axis; no BLAS: the same on any machine's threads."""
+    """Return the positions of rows [N, 3] along an axis; no BLAS: the same for any number of threads."""
     result: F64 = np.sum(rows * axis, axis=1)
     return result

@@ -112,7 +112,7 @@ def direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
 
 @inline
 def finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> bool:
-    """Whether everything but the colour of a splat is finite."""
+    """Return True if everything but the colour of a splat is finite."""
     total = opacities[i] - opacities[i]  # NaN or infinity less itself is NaN
     total += (means[i, 0] - means[i, 0]) + (means[i, 1] - means[i, 1]) + (means[i, 2] - means[i, 2])
     total += (scales[i, 0] - scales[i, 0]) + (scales[i, 1] - scales[i, 1]) + (scales[i, 2] - scales[i, 2])
@@ -123,7 +123,7 @@ def finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any) ->
 
 @inline
 def finite_colour(i: int, sh0: Any, shN: Any, higher: int) -> bool:
-    """Whether the coefficients of a splat that are used are finite."""
+    """Return True if the coefficients of a splat that are used are finite."""
     total = (sh0[i, 0] - sh0[i, 0]) + (sh0[i, 1] - sh0[i, 1]) + (sh0[i, 2] - sh0[i, 2])
     for k in range(higher):
         total += (shN[i, k, 0] - shN[i, k, 0]) + (shN[i, k, 1] - shN[i, k, 1]) + (shN[i, k, 2] - shN[i, k, 2])
@@ -132,7 +132,7 @@ def finite_colour(i: int, sh0: Any, shN: Any, higher: int) -> bool:
 
 @inline
 def beyond(at: float, size: int, squared_reach: float) -> bool:
-    """Whether something around `at` ends more than half a pixel outside of 0 to size."""
+    """Return True if an extent around `at` ends more than half a pixel outside of 0 to `size`."""
     distance = max(-at, at - size) - 1.0
     return bool(distance > 0.0 and distance * distance > squared_reach)
 
@@ -169,12 +169,12 @@ def project(
         opacities: [N], alpha.
         sh0: [N, 3].
         shN: [N, K, 3], K at least (degree + 1)**2 - 1.
-        degree: of the spherical harmonics that are evaluated.
+        degree: degree of the spherical harmonics that are evaluated.
         view: [24], see `view_vector`.
-        width: of the picture.
-        height: of the picture.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
         antialiased: compensate the dilation.
-        alpha_min: what is too faint to draw.
+        alpha_min: smallest alpha that is drawn.
         shape: [N, 10] float64, written for splats in view: centre x and y, inverse covariance a
             b c, opacity, red, green, blue, depth.
         extent: [N, 6] float64, written, of the ellipse of `alpha_min`: how far the middle of its

@@ -42,7 +42,7 @@ _LARGE = 1 << 16  # tiles
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """What `backward` needs to know of the last `forward`."""
+    """State of the last `forward` that `backward` needs."""
 
     splats: Splats
     view: Array
@@ -63,10 +63,10 @@ class Rasteriser:
     Args:
         mode: `standard`, or `fast`: leaves out alpha below 1.5/255 and what shines through with less
             than 1/255: a sixth of the time, for errors of 40 to 52 dB on trained scenes.
-        dtype: of pixels and gradients, float32 or float64 (which is for tests). Projection is in
+        dtype: dtype of pixels and gradients, float32 or float64 (which is for tests). Projection is in
             float64 in any case.
-        gradients: whether `backward` will be called; without it `forward` is a little faster.
-        threads: how many; None for all.
+        gradients: True if `backward` will be called; without it `forward` is a little faster.
+        threads: number of threads; None for all.
 
     Raises:
         InputError: the mode or the dtype does not exist.
@@ -106,8 +106,8 @@ class Rasteriser:
         picture is that of all splats, bit for bit.
 
         Args:
-            splats: what to render; arrays of another dtype are converted.
-            camera: from where.
+            splats: the splats to render; arrays of another dtype are converted.
+            camera: the camera to render from.
             background: red, green, blue behind everything.
             antialiased: scale opacities by what the dilation of 0.3 pixels added (mip-splatting).
             sh_degree: highest degree of the spherical harmonics; None for all there are.
@@ -118,7 +118,7 @@ class Rasteriser:
             The picture, in new arrays; of a slice what there is of it so far, and the slice's own counts.
 
         Raises:
-            InputError: shapes do not fit together; or `backward` would want all slices.
+            InputError: shapes do not fit together; or `backward` would need all slices.
             LimitError: there are more than `MAX_INTERSECTIONS`.
         """
         arrays = _checked(splats, self.dtype)
@@ -156,7 +156,7 @@ class Rasteriser:
         return state
 
     def seen(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> Seen:
-        """Say which splats a picture would show, and how near they are; the arguments are those of `forward`."""
+        """Return the splats that a render would show, and their depths; the arguments are those of `forward`."""
         arrays = _checked(splats, self.dtype)
         degree = _checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.threads):

@@ -1,4 +1,4 @@
-"""What the removal of each splat would change: the exact leave-one-out error of all splats in one pass over views.
+"""Effect of removing each splat: the exact leave-one-out error of all splats in one pass over views.
 
 Exact for each splat alone, with everything else in place. Two things that the rasteriser decides by comparison are held
 fast: a pixel that was finished stays so, though without a splat in front of it it might have shown more of what is
@@ -38,8 +38,8 @@ class Removal:
         bands: [N, d] float64, squared change of the pictures if the splat's SH band 1, … d were zero; [N, 0] where
             that was not asked.
         value_count: pixels times channels of all views.
-        product: [N] float64, the change times what the pictures have too much of the wanted ones: removal adds
-            `error + 2 · product` to the squared error of the pictures. `None` where the pictures themselves are wanted.
+        product: [N] float64, the change times the excess of the renders over the references: removal adds
+            `error + 2 · product` to the squared error. `None` if the renders themselves are the references.
     """
 
     error: Array
@@ -86,13 +86,13 @@ def measure_removal(
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue behind everything.
-        bands: whether what SH bands are worth is wanted, too.
-        references: the wanted pictures, [H, W, 3] each; None for those of the scene itself.
-        on_picture: is shown each picture, [H, W, 3], and its number.
-        dtype: of pixels, float32 or float64 (which is for tests).
-        transmittance_min: when a pixel is finished; 0 for never.
-        threads: how many; None for all. The result does not depend on it.
-        progress: is told how much is done.
+        bands: measure the effect of SH bands, too.
+        references: the reference images, [H, W, 3] each; None for renders of the scene itself.
+        on_picture: called with the number of each render and the render, [H, W, 3].
+        dtype: dtype of pixels, float32 or float64 (which is for tests).
+        transmittance_min: transmittance at which a pixel is finished; 0 for never.
+        threads: number of threads; None for all. The result does not depend on it.
+        progress: called with the stage and the fraction done.
 
     Raises:
         InputError: there is no camera, or there are not as many references.
@@ -131,9 +131,9 @@ def removal_exact(
     Args:
         model: the scene.
         cameras: the views.
-        rows: which splats are to be measured.
+        rows: the splats to measure.
         background: red, green, blue behind everything.
-        transmittance_min: when a pixel is finished; 0 for never, which is what the pass is exact for.
+        transmittance_min: transmittance at which a pixel is finished; 0 for never, which is what the pass is exact for.
 
     Returns:
         Squared change of the pictures, one number per row of `rows`, float64.

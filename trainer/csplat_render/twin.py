@@ -38,7 +38,7 @@ _CHUNK = 64  # splats that are evaluated at all pixels at a time
 
 @dataclass
 class Decisions:
-    """What the comparisons of one picture decided; handed to `render_exact` again, it is not asked anew."""
+    """Recorded outcomes of a render's comparisons; `render_exact` reuses them if they are passed in again."""
 
     order: Array | None = None
     masks: list[Array] = field(default_factory=list)
@@ -70,8 +70,8 @@ def render_exact(
     """Render a picture as `Rasteriser.forward` does, from the equations.
 
     Args:
-        splats: what to render.
-        camera: from where.
+        splats: the splats to render.
+        camera: the camera to render from.
         background: red, green, blue behind everything.
         antialiased: scale opacities by what the dilation added.
         sh_degree: highest degree of the spherical harmonics; None for all there are.

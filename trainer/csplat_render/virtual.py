@@ -1,8 +1,8 @@
 """Virtual cameras around a scene that has none: the cameras of `psnr`.
 
-Two kinds of scene are told apart by where their surface lies. An *object* is seen from outside,
-from all sides and slightly to steeply above, so near that it covers at least half of each picture.
-*Surroundings* reach much farther than their dense middle; cameras stand around or inside of that
+Two kinds of scene are distinguished by where their surface lies. An *object* is seen from outside,
+from all sides and slightly to steeply above, so near that it covers at least half of each image.
+*Surroundings* reach much farther than their dense middle; cameras are placed around or inside of that
 middle, where nothing close by hides it.
 
 Distances are part of what a PSNR means (the same error scores 33, 39 and 48 dB from one, two and
@@ -67,20 +67,20 @@ _OBJECT_ELEVATIONS = (5.0, 25.0, 50.0)
 _SURROUNDING_ELEVATIONS = (3.0, 15.0, 35.0)
 _PROMISING = 4  # directions in which a camera comes nearer to an object
 _TARGET_OFFSET = 0.05  # objects are looked at this far from their centre, at most, in extents
-_CLEAR_RADIUS = 0.32  # of the distance from the centre: next to nothing so near to a camera is wanted
-_CLEAR_SHARE = 0.01  # of an object's surface, that may lie there
+_CLEAR_RADIUS = 0.32  # fraction of the distance from the centre: hardly anything may be so near to a camera
+_CLEAR_SHARE = 0.01  # fraction of an object's surface that may lie there
 _NEAR = 0.05  # near plane in extents, DEFAULT_NEAR at most
 _FAR_REACH = 4.0  # times the distance within which half the opacity lies: no object's surface
-_FAR_SHARE = 0.02  # of the surface; with more than that beyond, a scene is no object
+_FAR_SHARE = 0.02  # fraction of the surface; with more than that beyond, a scene is no object
 _FLAT = 0.6  # an extent this much shorter than the next one points up
-_GOOD_DETAIL = 0.65  # of the best view's
+_GOOD_DETAIL = 0.65  # fraction of the best view's detail
 _AZIMUTH_STEP = 15.0  # degrees
 _POINTS = 60_000
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where a scene lies.
+    """Position, extent, up direction and kind of a scene.
 
     Attributes:
         kind: `"object"` or `"surrounding"`.
@@ -103,7 +103,7 @@ class Frame:
 
 
 def scene_frame(model: SplatModel) -> Frame:
-    """Where a scene lies, how large it is, which way is up and of which kind it is.
+    """Return the centre of a scene, its extent, its up direction and its kind.
 
     A scene without splats is an object of extent 1 at the origin.
     """
@@ -126,7 +126,7 @@ def scene_frame(model: SplatModel) -> Frame:
 
 
 def is_clear(frame: Frame, cloud: Cloud, camera: Camera) -> bool:
-    """Whether next to nothing of a scene is so near to a camera that it would show it as fog, or from inside."""
+    """Return True if hardly any of a scene is so near to a camera that it would show it as fog, or from inside."""
     radius = _CLEAR_RADIUS * float(np.linalg.norm(camera.position - frame.centre))
     return share_within(cloud, camera.position, radius) <= _CLEAR_SHARE
 
@@ -142,7 +142,7 @@ def virtual_cameras(
         width: pixels.
         height: pixels.
         seed: decides where around the scene the cameras begin, and what exactly they look at.
-        every: how many splats of the scene each of the model's stands for.
+        every: number of the scene's splats that each of the model's represents.
 
     Returns:
         `count` cameras, the same for the same arguments. An object covers at least half of each
@@ -206,7 +206,7 @@ def _object_view(views: _Views, cloud: Cloud, angles: list[tuple[float, float]],
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
         if highest * (highest_at / distance) ** 2 < 0.8 * needed:
-            continue  # what covers this little from farther away does not from here
+            continue  # the cover from farther away shows that this distance does not suffice either
         covers = []
         for angle in angles:
             camera = views.at(*angle, distance, offset)
@@ -223,7 +223,7 @@ def _object_view(views: _Views, cloud: Cloud, angles: list[tuple[float, float]],
 
 
 def _in_surroundings(views: _Views, cloud: Cloud, count: int, begin: float) -> list[Camera]:
-    """Of the views that show fine detail those that lie farthest apart."""
+    """Choose, among the views that show fine detail, those that lie farthest apart."""
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
     cameras = [views.at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
@@ -252,7 +252,7 @@ def far_apart(points: F64, first: int, count: int) -> list[int]:
 
 
 def _up(model: SplatModel, half: F64) -> F64:
-    """Which way is up: what the scene says; the short axis of a flat one; else −y, as in a PLY."""
+    """Return the up direction: the scene's own; else the short axis of a flat scene; else −y, as in a PLY."""
     said = up_of(model.metadata, model.coordinate_system)
     if said is not None:
         named: F64 = np.array(said)

@@ -1,4 +1,4 @@
-"""The first call of a kernel compiles it, which takes seconds: do it now, and say so."""
+"""Compile kernels ahead of their first call, which would take seconds, and announce it."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def warm_up(
 
     Args:
         announce: called with one line if anything has to be compiled, and with another at its end.
-        gradients: the backward pass of the renderer too.
-        simplify: what `measure_removal` runs.
-        ssim: what `metrics.ssim` runs.
-        lpips: what `lpips.Lpips` runs.
-        others: are called; each compiles kernels that are not the renderer's.
-        dtype: of pixels and gradients, see `Rasteriser`; the other groups have one each.
+        gradients: compile the renderer's backward pass too.
+        simplify: compile the kernels of `measure_removal`.
+        ssim: compile the kernels of `metrics.ssim`.
+        lpips: compile the kernels of `lpips.Lpips`.
+        others: functions to call; each compiles kernels that are not the renderer's.
+        dtype: dtype of pixels and gradients, see `Rasteriser`; the other groups have one each.
 
     Returns:
         Seconds that it took.
@@ -75,7 +75,7 @@ def warm_up(
 
 
 def is_compiled() -> bool:
-    """Whether pictures can be drawn at once: the kernels that project splats and blend them need no compiling."""
+    """Return True if renders can start at once: the kernels that project splats and blend them need no compiling."""
     return all(map(is_cached, (project, blend)))
 
 
